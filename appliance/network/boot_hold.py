@@ -103,6 +103,7 @@ class BootHold:
             IptablesBackend(host, (Chain.HOLD,)),
         )
         self._since = unit_runs / "since"  # seconds since the boot, a clock that is never set
+        self._in_force = unit_runs / "in-force"  # exists from `put` until `lift`
         self._unit_runs = unit_runs
         self._armed = state / "armed.json"
 
@@ -110,11 +111,19 @@ class BootHold:
     def is_present(self) -> bool:
         return self._unit_runs.is_dir()
 
-    def put(self) -> None:
-        """Hold, if armed. Raises `FirewallError`; without a working back end, nothing is held."""
+    def is_intact(self) -> bool:
+        """Return whether the rules are as `put` or `lift` left them: another program may have flushed them."""
+        return not self._in_force.exists() or any(map(_holds, self._backends))
+
+    def put(self) -> bool:
+        """Hold, if armed; return whether other machines were held before, and another program had removed the rules.
+
+        Raises `FirewallError`; without a working back end, nothing is held.
+        """
         held = self._held()
         if held is None:
-            return
+            return False
+        removed = not self.is_intact()
         own = 0 if held.own_seconds is None else held.own_seconds - int(self._seconds_so_far())
         reasons = []
         for backend in self._backends:
@@ -123,7 +132,9 @@ class BootHold:
             except FirewallError as error:
                 reasons.append(f"{backend.name}: {error}")
             else:
-                return
+                with contextlib.suppress(OSError):
+                    self._in_force.touch()
+                return removed
         raise FirewallError(f"other machines are not held off: {'; '.join(reasons)}")
 
     def lift(self) -> bool:
@@ -138,6 +149,7 @@ class BootHold:
         own = None if held is None else held.own_seconds
         lapsed = own is not None and self._since.exists() and self._seconds_so_far() > own
         self._since.unlink(missing_ok=True)
+        self._in_force.unlink(missing_ok=True)
         reasons = []
         for backend in self._backends:
             try:

@@ -44,6 +44,20 @@ def node_sockets(namespace: Namespace, ports: Iterable[int], master_port: int) -
     return {port: one for one in found.values() for port in sorted(one.listening & wanted)}
 
 
+def is_node(process: NodeSockets) -> bool:
+    """Return whether a process looks like a ROS node: it is connected to a master, or was started for ROS."""
+    if process.master_address:
+        return True
+    place = Path("/proc", str(process.pid))
+    with suppress(OSError):
+        words = (place / "cmdline").read_bytes().split(b"\0")
+        if any(word.startswith((b"__name:=", b"__master:=")) for word in words):
+            return True
+        settings = (place / "environ").read_bytes().split(b"\0")
+        return any(setting.startswith((b"ROS_MASTER_URI=", b"ROS_PACKAGE_PATH=")) for setting in settings)
+    return False
+
+
 def user_of(pid: int) -> str:
     """Return the name of a process's user, or its number; empty if the process has ended."""
     try:

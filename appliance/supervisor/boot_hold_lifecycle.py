@@ -1,11 +1,17 @@
 """Put, lift and arm the boot hold around a run of the appliance. A hold that fails is logged, and ends nothing."""
 
+import math
+
 import structlog
 
+from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.configuration.settings import Settings
 from appliance.network.boot_hold import BootHold, HeldPorts
 from appliance.network.close_ports import local_port_range
 from appliance.network.namespaces import Namespace, NetworkError
+
+_LOOK_SECONDS = 5.0
 
 log = structlog.get_logger()
 
@@ -16,6 +22,8 @@ class HoldAround:
     def __init__(self, settings: Settings, *, used: bool, link: str, hold: BootHold | None = None) -> None:
         self._hold = hold or BootHold(Namespace.own())
         self._ports: HeldPorts | None = None
+        self._looked_at = -math.inf
+        self._removed = 0
         if (
             used
             and settings.isolation != "none"
@@ -28,17 +36,28 @@ class HoldAround:
 
     def put(self) -> None:
         if self._ports is not None:
+            self._looked_at = clock.now()
             try:
-                self._hold.put()
+                if self._hold.put():
+                    self._removed += 1
+                    log.critical("another program removed the boot hold: it is in force again")
             except (NetworkError, OSError) as error:
                 log.error(
                     "other machines are not held off while the appliance does not serve", error=str(error)
                 )
 
+    def keep(self) -> None:
+        """Restore the hold if another program has removed its rules; looks every five seconds at most."""
+        if self._ports is not None and clock.now() - self._looked_at >= _LOOK_SECONDS:
+            self._looked_at = clock.now()
+            if not self._hold.is_intact():
+                self.put()
+
     def served(self) -> str:
         """Lift and arm the hold.
 
-        Return an alarm if it is not lifted, or if the robot's own programs started without the appliance.
+        Return an alarm if it is not lifted, if another program had removed its rules, or if the robot's own programs
+        started without the appliance.
         """
         if not self._hold.is_present:
             return ""
@@ -52,6 +71,11 @@ class HoldAround:
             self._hold.arm(self._ports)
         except OSError as error:
             log.error("the hold of the next boot keeps its last settings", error=str(error))
+        if self._removed and not trouble:
+            trouble = (
+                f"another program removed the boot hold {counted(self._removed, 'time')}, such as `nft flush ruleset`:"
+                " until it was restored, other machines could reach the robot's master and nodes past the appliance"
+            )
         if trouble or not lapsed or self._ports is None or self._ports.own_seconds is None:
             return trouble
         return (

@@ -24,6 +24,9 @@ class MachineWork(Protocol):
     def left_alone(self) -> tuple[str, ...]:
         """Return the control groups of the robot's own masters."""
 
+    def end(self) -> None:
+        """Note that the appliance ends by an order, not because of a failure."""
+
     def carry_out(self, robot_side: Isolation, work: str, terms: Terms) -> Found:
         """Carry out a piece of work, and return what was found. Raises `NetworkError`, `ValueError`."""
 
@@ -39,6 +42,9 @@ class NoMachineWork:
 
     def left_alone(self) -> tuple[str, ...]:
         return ()
+
+    def end(self) -> None:
+        pass
 
     def carry_out(self, _robot_side: Isolation, work: str, _terms: Terms) -> Found:
         raise ValueError(f"no feature does {work[:40]!r} on the machine")

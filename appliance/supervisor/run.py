@@ -137,7 +137,7 @@ def _run(
         hold.put()
         admin = state.open_admin_socket()
         with closing(admin):
-            listeners = _listeners(settings, isolation, manager, admin)
+            listeners = _listeners(settings, isolation, manager, admin, hold)
             if listeners is None:
                 return
             try:
@@ -166,16 +166,21 @@ def _run(
 
 
 def _listeners(
-    settings: Settings, isolation: NoIsolation, manager: ServiceManager, admin: socket.socket
+    settings: Settings,
+    isolation: NoIsolation,
+    manager: ServiceManager,
+    admin: socket.socket,
+    hold: HoldAround,
 ) -> dict[str, socket.socket] | None:
     """Build the isolation, and return the appliance's listeners; None if a signal ended the wait for a port."""
-    build = partial(_build, settings, isolation)
+    build = partial(_build, settings, isolation, hold)
     if manager.is_present or settings.isolation == "container":
         return built_when_free(build, manager, admin)
     return build()
 
 
-def _build(settings: Settings, isolation: NoIsolation) -> dict[str, socket.socket]:
+def _build(settings: Settings, isolation: NoIsolation, hold: HoldAround) -> dict[str, socket.socket]:
+    hold.keep()
     if settings.isolation != "netns":
         require_free(*settings.listen_address)  # before the firewall is built, which takes a second
     isolation.build()
@@ -243,6 +248,12 @@ def _listener(settings: Settings) -> socket.socket | None:
     return listener
 
 
+async def _keep(hold: HoldAround, supervisor: Supervisor) -> None:
+    while not supervisor.is_ready:
+        hold.keep()
+        await asyncio.sleep(1.0)
+
+
 def _supervise(
     settings: Settings,
     roles: tuple[Role, ...],
@@ -299,9 +310,11 @@ def _supervise(
             work=work,
         )
         async with manager.watched():
+            keeping = asyncio.create_task(_keep(hold, supervisor))
             try:
                 await supervisor.run()
             finally:
+                keeping.cancel()
                 manager.stopping()
 
     asyncio.run(supervise())

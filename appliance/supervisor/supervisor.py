@@ -196,6 +196,7 @@ class Supervisor:
         """Let control give a graph back that it took over, unless the appliance ends because of a failure."""
         if self.failure is not None or not self.is_ready or not self._work.takes_over():
             return
+        self._work.end()
         self._tell_control(messages.EndAnnounced())
         try:
             async with asyncio.timeout(_AGREED_SECONDS):

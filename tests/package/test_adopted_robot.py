@@ -1,6 +1,11 @@
-"""A robot that boots by systemd is adopted, restarted, booted again, and given back with the package's removal."""
+"""A robot that boots by systemd is adopted, booted in each order, and given back with the package's removal.
+
+`ROSRV_BOOTS` is the number of boots in each order.
+"""
 
 import json
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -8,7 +13,12 @@ import pytest
 from tests.support.booted_debian import BootedDebian, booted_debian
 from tests.support.waiting import eventually
 
-pytestmark = pytest.mark.timeout(3600)  # the system is fetched and the package is built
+pytestmark = pytest.mark.timeout(7200)  # the system is fetched and the package is built
+BOOTS = int(os.environ.get("ROSRV_BOOTS", "1"))
+ORDERS = {
+    "the robot first": {"rosrv": "[Service]\nExecStartPre=/bin/sleep 8\n"},
+    "the appliance first": {"roscore": "[Unit]\nAfter=rosrv.service\n"},
+}
 ENVIRONMENT = "Environment=HOME=/root ROS_MASTER_URI=http://localhost:11311 PYTHONUNBUFFERED=1"
 ROSCORE = f"[Service]\nExecStart=/usr/bin/roscore\n{ENVIRONMENT}\n[Install]\nWantedBy=multi-user.target\n"
 DRIVE = "/usr/bin/rostopic pub --rate 20 /speed std_msgs/Float64 0.5 __name:=drive"
@@ -64,14 +74,15 @@ def test_a_vendors_robot_is_adopted_and_given_back(suite: str, package: Path, tm
         adopted(debian)
         assert debian.run("systemctl", "show", "--property=MainPID", "roscore", "robot") == lives
         the_own_master_restarts(debian)
-        debian.end()
-        debian.boot()
-        adopted(debian)
+        for order, drop_ins in ORDERS.items():
+            for _ in range(BOOTS):
+                boots_adopted(debian, order, drop_ins)
+        the_power_fails_in_the_middle(debian)
         debian.run("systemctl", "restart", "rosrv")
         adopted(debian)
-        debian.run("dpkg", "--remove", "rosrv")
+        removal = debian.run("dpkg", "--remove", "rosrv")
         runs(debian)
-        assert not list(units.glob("*/50-rosrv-adopt.conf"))
+        assert not list(units.glob("*/50-rosrv-adopt.conf")), f"{removal}\n{debian.story()}"
         assert "rosrv" not in debian.run("nft", "list", "tables")
 
 
@@ -83,3 +94,49 @@ def the_own_master_restarts(debian: BootedDebian) -> None:
         "0",
     ]
     assert debian.state("roscore") == debian.state("robot") == "active"
+
+
+def boots_adopted(debian: BootedDebian, order: str, drop_ins: dict[str, str]) -> None:
+    debian.end()
+    files = [debian.root / f"etc/systemd/system/{unit}.service.d/order.conf" for unit in drop_ins]
+    for file, text in zip(files, drop_ins.values(), strict=True):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(text)
+    debian.boot()
+    adopted(debian)
+    states = [debian.state(unit) for unit in ("rosrv", "roscore", "robot")]
+    assert states == ["active"] * 3, f"{order}: {states}\n{debian.story()}"
+    assert debian.run("systemctl", "show", "--property=NRestarts", "--value", "roscore", "robot").split() == [
+        "0",
+        "0",
+    ], order
+    assert "denied" not in debian.shell("rosrv adopt --status"), order
+    for file in files:
+        file.unlink()
+
+
+def the_power_fails_in_the_middle(debian: BootedDebian) -> None:
+    """After the next boot, the graph is where the record wants it, and each node is heard."""
+    for command in ("rosrv release --moving", "rosrv adopt"):
+        for seconds in (0.8, 1.6):
+            debian.begin(command)
+            threading.Event().wait(seconds)
+            debian.cut_power()
+            debian.boot()
+            settled(debian)
+    debian.shell("rosrv adopt")
+    adopted(debian)
+
+
+def settled(debian: BootedDebian) -> None:
+    def is_as_wanted() -> bool:
+        wanted = json.loads((debian.root / "var/lib/rosrv/adopt.json").read_text())["wanted"]
+        said = debian.shell("rosrv adopt --status --json")
+        if wanted:
+            return said.startswith("{") and json.loads(said)["phase"] == "taken"
+        return "nothing is adopted" in debian.shell("rosrv adopt --status") or debian.said().startswith(
+            "waits: "
+        )
+
+    eventually(is_as_wanted, debian.story)
+    runs(debian)

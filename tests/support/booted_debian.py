@@ -4,6 +4,7 @@ The kernel is this machine's; the network is the container's own, with a visitor
 """
 
 import contextlib
+import os
 import shutil
 import signal
 import subprocess
@@ -85,6 +86,19 @@ class BootedDebian:
             self._nspawn.kill()
             self._nspawn.wait()
         self._nspawn = None
+
+    def cut_power(self) -> None:
+        """End all processes at once."""
+        leader = self._leader()
+        assert self._nspawn is not None
+        if leader is not None:
+            os.kill(leader, signal.SIGKILL)
+        self._nspawn.wait(timeout=60)
+        self._nspawn = None
+
+    def begin(self, line: str) -> None:
+        """Start a command of a shell, and do not wait for its end."""
+        self.run("systemd-run", "--quiet", "--collect", "sh", "-c", line)
 
     def run(self, *command: str) -> str:
         """Return the output of a command, both streams, whatever its status; "" before the first process runs."""

@@ -58,7 +58,10 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
     translations: list[str] | None = None
     obstacles: list[str] | None = None
     hold_lapsed: Annotated[
-        str | None, doc("why the robot's own programs may have started without the appliance (`hold: own`)")
+        str | None,
+        doc(
+            "why the robot's own programs may have started without the appliance (`hold: own`), or others were not held"
+        ),
     ] = None
 
 

@@ -44,7 +44,11 @@ class TakeOverReport(msgspec.Struct, frozen=True):
 
 
 class GiveBackReport(msgspec.Struct, frozen=True):
-    """The result of giving the graph back."""
+    """The result of giving the graph back.
+
+    `withheld` counts registrations that no master got, because the one on the robot's port is another one than the
+    recorded one (`withheld_from`).
+    """
 
     nodes: int = 0
     given: int = 0
@@ -53,4 +57,6 @@ class GiveBackReport(msgspec.Struct, frozen=True):
     master: str = ""
     started: bool = False
     failed: list[str] = []
+    withheld: int = 0
+    withheld_from: str = ""
     seconds: float = 0.0

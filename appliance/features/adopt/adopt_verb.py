@@ -20,6 +20,7 @@ from appliance.features.adopt.adopt_answers import AdoptState, TakeOverReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, check_lines
 from appliance.features.adopt.adopt_record import load_record, save_record
 from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.operator_orders import ADOPT, ordered
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus
 from appliance.features.adopt.robot_side import (
     link_address,
@@ -139,7 +140,8 @@ def _wait(port: int, within: float) -> None:
 
 def _adopt(appliance: Appliance, state: Path) -> None:
     try:
-        answer = appliance.ask(AdoptOrder())
+        with ordered(state, ADOPT):
+            answer = appliance.ask(AdoptOrder())
     except NotRunningError:
         _note(state)
         say("noted: the next start takes the graph over: sudo systemctl start rosrv")

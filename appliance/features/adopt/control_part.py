@@ -165,8 +165,8 @@ class AdoptPart:
         async with self._one:
             try:
                 facts = await self._operation.facts()
-                if facts.record.phase is not Phase.FREE:
-                    await self._give()
+                if facts.record.phase is not Phase.FREE and (report := await self._give()).withheld:
+                    log.error("the graph is only partly given back", reason=report.withheld_from)
             except AdoptError as error:
                 log.error("the graph is not given back", reason=str(error))
 

@@ -4,7 +4,7 @@ import ipaddress
 
 import msgspec
 
-from appliance.features.adopt.adopt_record import AdoptRecord
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase
 
 FIRST_PORT = 1024
 """The first port that is cut: smaller ones belong to the machine, whatever a node says."""
@@ -43,7 +43,8 @@ class MachineFacts(msgspec.Struct, frozen=True):
     def foreign_master(self) -> str:
         """Why the present master is not the recorded one; empty if it is, or if there is none."""
         found, record = self.master, self.record
-        if found is None or not record.wanted or found.pid == record.stand_in:
+        adopted = record.wanted or record.phase is not Phase.FREE
+        if found is None or not adopted or found.pid == record.stand_in:
             return ""
         if (found.unit, found.user) == (record.unit, record.user):
             return ""

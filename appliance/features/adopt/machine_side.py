@@ -1,9 +1,17 @@
 """Do the supervisor's part of an adoption: the rules, the end of connections, the robot's own master.
 
 Each piece of work can be repeated: it brings the machine to a state, whatever was done before.
+
+Control orders each step, and is not trusted:
+
+1. An adoption and a release begin with the order of an operator of this machine (`operator_orders.py`).
+2. Nodes reach their own master again after a release, or while the appliance ends in order; else no step leads there.
+3. Connections end only while a graph is taken, a bounded number of times, and only those of processes that look like
+   nodes (`is_node`), to the robot's own master, and to the ports of other machines that control names.
 """
 
 import ipaddress
+import math
 import os
 import pwd
 import re
@@ -21,13 +29,14 @@ import structlog
 from appliance.base import clock
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, load_record, save_record
 from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts, RobotMaster
+from appliance.features.adopt.operator_orders import ADOPT, RELEASE, take_order
 from appliance.network import interfaces
 from appliance.network.cut import RemotePort, end_connections, refuse_no_port, refuse_ports
 from appliance.network.isolation import Isolation
 from appliance.network.listening_sockets import TcpSocket
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.port_holders import port_holder
-from appliance.network.socket_owners import node_sockets, programs_of_unit, user_of
+from appliance.network.socket_owners import is_node, node_sockets, programs_of_unit, user_of
 from appliance.supervisor.machine_work import Found, Terms
 from appliance.supervisor.users import account_of
 
@@ -41,6 +50,8 @@ _LOOKUP_SECONDS = 0.1
 _CALL_SECONDS = 0.25  # of an ordinary service call under way, which is not cut
 _START_SECONDS = 10.0
 _LOOK_SECONDS = 0.05
+_MOST_CUTS = 60  # of one taking, which may begin again after kills of control
+_CUT_AGAIN_SECONDS = 60.0  # of a graph that is taken; until then the ports of the last cut are refused
 
 log = structlog.get_logger()
 
@@ -54,7 +65,9 @@ class AdoptWork:
 
     def __init__(self, state: Path) -> None:
         self._state = state
-        self._took_over = False
+        self._took_over = self._ends = False
+        self._may_undo = False  # an order to adopt that has not succeeded yet
+        self._cuts, self._cut_at = 0, -math.inf
 
     def takes_over(self) -> bool:
         """Return whether an adoption is wanted or not yet undone; then for the rest of this supervisor's life."""
@@ -69,6 +82,9 @@ class AdoptWork:
     def left_alone(self) -> tuple[str, ...]:
         group = load_record(self._state).group
         return (group,) if group else ()
+
+    def end(self) -> None:
+        self._ends = True
 
     def carry_out(self, robot_side: Isolation, work: str, terms: Terms) -> Found:
         steps = {
@@ -111,18 +127,47 @@ class AdoptWork:
     def _want(self, side: Isolation, terms: Terms) -> Found:
         wanted = msgspec.convert(terms["wanted"], bool)
         record = load_record(self._state)
+        if wanted == record.wanted:
+            return {}
         if wanted:
+            self._require(take_order(self._state, ADOPT), "no operator ordered an adoption")
             found = master_of(side.host, _master_port(side))
             record = wanted_record(record, found)
         else:
+            may = self._may_undo or take_order(self._state, RELEASE)
+            self._require(may, "no operator ordered a release")
             record = msgspec.structs.replace(record, wanted=False)
+        self._may_undo = wanted
         save_record(self._state, record)
         self.takes_over()
         return {}
 
     def _phase(self, _side: Isolation, terms: Terms) -> Found:
-        self._note(msgspec.convert(terms["phase"], Phase))
+        phase, record = msgspec.convert(terms["phase"], Phase), load_record(self._state)
+        before = {
+            Phase.TAKING: {*Phase} if record.wanted else set[Phase](),
+            Phase.TAKEN: {Phase.TAKING, Phase.TAKEN} if record.wanted else set[Phase](),
+            Phase.GIVING: set[Phase](),  # only by `withdraw`
+            Phase.GIVEN: {Phase.GIVING, Phase.GIVEN},
+            Phase.FREE: {Phase.GIVEN, Phase.FREE},
+        }
+        self._require(record.phase in before[phase], f"{record.phase} does not become {phase}")
+        if phase is Phase.TAKING and record.phase is not phase:
+            self._cuts = 0
+        if phase is Phase.TAKEN:
+            self._may_undo = False
+        self._note(phase)
         return {}
+
+    @staticmethod
+    def _require(allowed: bool, why: str) -> None:
+        if not allowed:
+            raise ValueError(f"control ordered a step that does not follow from an operator's order: {why}")
+
+    def _require_giving(self) -> None:
+        record = load_record(self._state)
+        self._require(not record.wanted or self._ends, "no release, and no end of the appliance")
+        self._require(record.phase is not Phase.FREE, "nothing is adopted")
 
     def _note(self, phase: Phase) -> None:
         record = load_record(self._state)
@@ -132,11 +177,30 @@ class AdoptWork:
     # --- taking ---
 
     def _forward(self, side: Isolation, _terms: Terms) -> Found:
+        self._require_taking()
         self.takes_over()
         side.forward_master()
         return {}
 
+    def _require_taking(self) -> Phase:
+        record = load_record(self._state)
+        taking = record.wanted and record.phase in {Phase.TAKING, Phase.TAKEN}
+        self._require(taking, "no graph is taken over")
+        return record.phase
+
+    def _may_cut(self, phase: Phase) -> bool:
+        """Return whether connections may end now; False soon after the last cut of a graph that is taken."""
+        if phase is Phase.TAKEN and clock.now() - self._cut_at < _CUT_AGAIN_SECONDS:
+            return False
+        if phase is Phase.TAKING:
+            self._require(self._cuts < _MOST_CUTS, f"more than {_MOST_CUTS} cuts of one adoption")
+            self._cuts += 1
+        self._cut_at = clock.now()
+        return True
+
     def _cut(self, side: Isolation, terms: Terms) -> Found:
+        if not self._may_cut(self._require_taking()):
+            return {"master": 0, "nodes": 0}
         ports = set(_ports(terms.get("ports", [])))
         remote = {
             RemotePort(str(ipaddress.IPv4Address(address)), port)
@@ -145,6 +209,12 @@ class AdoptWork:
         master, appliance = _master_port(side), side.ends[4].appliance
         if any(port < FIRST_PORT or port == master for port in {*ports, *(one.port for one in remote)}):
             raise ValueError("a port of the machine itself is not a port of a node")
+        others = {port for port, one in node_sockets(side.host, ports, master).items() if not is_node(one)}
+        if others:
+            log.warning(
+                "connections of processes that do not look like nodes are not cut", ports=sorted(others)
+            )
+            ports -= others
 
         def of_master(one: TcpSocket) -> bool:
             return one.port == master and one.peer_address != appliance
@@ -165,6 +235,7 @@ class AdoptWork:
 
     def _stand_in(self, side: Isolation, _terms: Terms) -> Found:
         """Have a master on the robot's port: its own, or one that outlives the appliance."""
+        self._require_giving()
         port = _master_port(side)
         if master_of(side.host, port) is not None:
             return {"started": False}
@@ -174,6 +245,7 @@ class AdoptWork:
         return {"started": True}
 
     def _withdraw(self, side: Isolation, _terms: Terms) -> Found:
+        self._require_giving()
         self._note(Phase.GIVING)
         refuse_no_port(
             side.host
@@ -183,6 +255,7 @@ class AdoptWork:
         return {"master": end_connections(side.namespace, lambda one: one.port == master)}
 
     def _leave(self, side: Isolation, _terms: Terms) -> Found:
+        self._require(load_record(self._state).phase is Phase.GIVEN, "the graph is not given back")
         ranges, robot = side.settings.ports, {ends.host for ends in side.ends.values()}
 
         def of_nodes(one: TcpSocket) -> bool:

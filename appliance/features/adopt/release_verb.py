@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -14,12 +15,12 @@ from appliance.cli.connection.target import Appliance, speaks_here
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.standing import NotStandingError, wait_until_standing
 from appliance.features.adopt.adopt_answers import GiveBackReport
-from appliance.features.adopt.adopt_record import load_record
 from appliance.features.adopt.dead_release import release_dead
+from appliance.features.adopt.operator_orders import RELEASE, ordered
 from appliance.features.adopt.requests import ReleaseOrder
-from appliance.features.adopt.robot_side import MASTER_PORT, link_address, remove_drop_in, running_settings
+from appliance.features.adopt.robot_side import MASTER_PORT, link_address, remove_drop_ins, running_settings
 from appliance.network.namespaces import NetworkError
-from rosmop.tool.terminal import say
+from rosmop.tool.terminal import printable, say
 
 _VERB = "rosrv release"
 
@@ -58,15 +59,13 @@ def release(
     if os.geteuid() != 0:
         raise usage_error("the rules and sockets of this machine need root: run it with sudo", verb=_VERB)
     try:
-        record = load_record(state) if not dead else None
         if dead:
             report = asyncio.run(release_dead(state))
         else:
             if not moving:
                 _stand(appliance, within)
-            report = _ordered(appliance)
-        if record is not None:
-            remove_drop_in(record)
+            report = _ordered(appliance, state)
+        remove_drop_ins()
     except NetworkError as error:
         typer.echo(f"{_VERB}: {error}", err=True)
         raise typer.Exit(1) from None
@@ -76,6 +75,15 @@ def release(
     if not report.nodes:
         say("nothing was adopted: the robot's nodes use their own master")
         return
+    if report.withheld:
+        withheld = counted(report.withheld, "registration")
+        text = (
+            f"{_VERB}: {counted(report.nodes, 'node')} keep their topics, but {withheld}"
+            f" and the parameters are not given back: {report.withheld_from}. Stop that master, start the robot's own,"
+            " and restart the robot's nodes"
+        )
+        typer.echo(printable(text), err=True)
+        raise typer.Exit(1)
     say(
         f"released in {report.seconds:g} s: {counted(report.nodes, 'node')} use {report.master or 'their own master'}"
         f" again; {counted(report.given, 'registration')} given back, {report.ended} ended"
@@ -88,9 +96,10 @@ def release(
         say("The appliance runs on without them: sudo systemctl stop rosrv, or rosrv adopt")
 
 
-def _ordered(appliance: Appliance) -> GiveBackReport:
+def _ordered(appliance: Appliance, state: Path) -> GiveBackReport:
     try:
-        answer = appliance.ask(ReleaseOrder())
+        with ordered(state, RELEASE):
+            answer = appliance.ask(ReleaseOrder())
     except NotRunningError as error:
         raise NetworkError(f"{error}. After a crash: rosrv release --dead") from None
     if not answer.ok:

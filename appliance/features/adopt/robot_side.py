@@ -135,14 +135,14 @@ def write_drop_in(record: AdoptRecord) -> Path | None:
     return file
 
 
-def remove_drop_in(record: AdoptRecord) -> None:
-    if not record.unit:
-        return
-    file = drop_in(record.unit)
-    if file.exists():
-        file.unlink()
+def remove_drop_ins() -> None:
+    """Remove the file of `write_drop_in`, also of an adoption that a loss of power ended before its release did."""
+    found = list(_UNITS.glob(f"*.d/{_DROP_IN}"))
+    for file in found:
+        file.unlink(missing_ok=True)
         with suppress(OSError):
             file.parent.rmdir()
+    if found:
         _reload_units()
 
 

@@ -11,6 +11,7 @@ starts in the meantime registers at the master that it still finds.
 3. Only ports of registered nodes are cut, and only ports on which the node's own process listens.
 
 Giving back: silence, a master, registrations, forward no more, registrations once more, tell subscribers, cut, forget.
+Another master than the recorded one gets nothing: nodes keep their topics by RVMaster's own lists.
 
 4. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
 5. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
@@ -370,7 +371,7 @@ class AdoptOperation:
             await self.passed("stand in")
             facts = await self.facts()
             if facts.foreign_master and not started:
-                raise AdoptError(f"the graph is not given to another master: {facts.foreign_master}")
+                return await self._give_topics(facts.foreign_master, began)
             reader = self.reader(facts)
             withdrawn = facts.record.phase is Phase.GIVING  # by a give that a kill ended
             known = None if self.forwards and not withdrawn else MasterGraph()
@@ -380,20 +381,33 @@ class AdoptOperation:
         except (AdoptError, MasterReadError) as error:
             self.speak()
             raise AdoptError(str(error)) from None
-        nodes = [
-            (node, {entry for entry, holder in self.graph.held() if holder is node})
-            for node in self.graph.nodes()
-        ]
+        nodes = self._nodes()
         await self.machine("withdraw")
         await self.passed("withdraw")
         more = await self._give_registrations(reader, known)  # of calls that were under way
         await self.passed("give again")
-        failed = await self._last_word(reader, nodes)
+        failed = await self._last_word(await reader.read(), nodes)
         await self.passed("tell")
         report = GiveBackReport(
             nodes=len(nodes), given=given + more[0], ended=ended + more[1], parameters=parameters,
             master=str(facts.master or ""), started=started, failed=failed, seconds=round(clock.now() - began, 2),
         )  # fmt: skip
+        return await self._forget(report, began)
+
+    def _nodes(self) -> list[tuple[Incarnation, set[Entry]]]:
+        held = list(self.graph.held())
+        return [(node, {entry for entry, holder in held if holder is node}) for node in self.graph.nodes()]
+
+    async def _give_topics(self, foreign: str, began: float) -> GiveBackReport:
+        """Connect the nodes with one another again. The master there may be hostile, so it gets nothing."""
+        nodes = self._nodes()
+        held = {entry: node.api_text for node, entries in nodes for entry in entries}
+        graph = MasterGraph(frozenset(held), nodes={entry[2]: uri for entry, uri in held.items()})
+        await self.machine("withdraw")
+        await self.passed("withdraw")
+        failed = await self._last_word(graph, nodes)
+        await self.passed("tell")
+        report = GiveBackReport(nodes=len(nodes), failed=failed, withheld=len(held), withheld_from=foreign)
         return await self._forget(report, began)
 
     async def _forget(self, report: GiveBackReport, began: float) -> GiveBackReport:
@@ -406,11 +420,16 @@ class AdoptOperation:
         await self.passed("forget")
         await self.machine("phase", phase=Phase.FREE)
         report = msgspec.structs.replace(report, seconds=round(clock.now() - began, 2))
+        use = f"use {report.master or 'their own master'} again"
+        if report.withheld:
+            withheld = counted(report.withheld, "registration")
+            use = f"keep their topics; {withheld} not given back: {report.withheld_from}"
         self.graph.trail.happened(
             "graph released",
-            f"{counted(report.nodes, 'node')} use {report.master or 'their own master'} again",
+            f"{counted(report.nodes, 'node')} {use}",
             nodes=report.nodes,
             given=report.given,
+            withheld=report.withheld or None,
             who=self._who or None,
         )
         self.speak()
@@ -507,14 +526,11 @@ class AdoptOperation:
         await reader.ask_all(calls)
         return len(calls)
 
-    async def _last_word(
-        self, reader: MasterReader, nodes: list[tuple[Incarnation, set[Entry]]]
-    ) -> list[str]:
-        """Send each subscriber the list of the robot's own master; return the nodes that did not take it.
+    async def _last_word(self, graph: MasterGraph, nodes: list[tuple[Incarnation, set[Entry]]]) -> list[str]:
+        """Send each subscriber its list in this graph; return the nodes that did not take it.
 
         A host that does not answer delays only its own nodes, and the whole only for `LAST_WORD_SECONDS`.
         """
-        graph = await reader.read()
         publishers: dict[str, list[str]] = {}
         for kind, topic, name in sorted(graph.entries):
             if kind == PUBLICATION and name in graph.nodes:

@@ -5,12 +5,14 @@ from typing import Literal
 
 import pytest
 
+from appliance.base.clock import using
 from appliance.configuration.settings import FirewallSection, Settings
 from appliance.network import boot_hold
 from appliance.network.boot_hold import BootHold, HeldPorts
 from appliance.network.firewall.backend import FirewallError
 from appliance.network.namespaces import Namespace
 from appliance.supervisor.boot_hold_lifecycle import HoldAround
+from tests.support.virtual_clock import VirtualClock
 
 
 class RecordedHold(BootHold):
@@ -20,11 +22,17 @@ class RecordedHold(BootHold):
         super().__init__(Namespace.own())
         self.calls: list[object] = []
         self._lapsed, self._broken = lapsed, broken
+        self.flushed = False
 
-    def put(self) -> None:
+    def put(self) -> bool:
         self.calls.append("put")
         if self._broken:
             raise FirewallError("no back end works")
+        removed, self.flushed = self.flushed, False
+        return removed
+
+    def is_intact(self) -> bool:
+        return not self.flushed
 
     def lift(self) -> bool:
         self.calls.append("lift")
@@ -120,3 +128,53 @@ def test_only_rules_that_are_in_force_keep_a_hold_from_being_lifted(
     hold = BootHold(Namespace.own(), unit_runs=tmp_path, state=tmp_path)
     with pytest.raises(FirewallError, match="stuck: it is busy") if has_rules else nullcontext():
         hold.lift()
+
+
+def test_rules_that_another_program_removed_are_restored_and_the_start_says_so() -> None:
+    time = VirtualClock()
+    with using(time):
+        hold = RecordedHold()
+        run = around(hold)
+        run.put()
+        hold.flushed = True
+        run.keep()
+        assert hold.calls == ["put"], "it looks every five seconds"
+        time.advance(5.0)
+        run.keep()
+        run.keep()
+        assert hold.calls == ["put", "put"]
+        assert "removed the boot hold 1 time, such as `nft flush ruleset`" in run.served()
+
+
+class _Rules:
+    """A back end whose rules another program may flush."""
+
+    name = "rules"
+
+    def __init__(self) -> None:
+        self.held: tuple[object, ...] = ()
+
+    def install(self, rules: tuple[object, ...]) -> None:
+        self.held = rules
+
+    def remove(self) -> None:
+        self.held = ()
+
+    def counters(self) -> tuple[object, ...]:
+        return self.held
+
+
+def test_a_hold_knows_that_its_rules_were_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = _Rules()
+    monkeypatch.setattr(boot_hold, "NftBackend", lambda *_: rules)
+    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: _Rules())
+    hold = BootHold(Namespace.own(), unit_runs=tmp_path, state=tmp_path)
+    assert not hold.put(), "a hold that is not armed"
+    hold.arm(HeldPorts(11311, 32768, 60999))
+    assert [hold.put(), hold.put(), hold.is_intact()] == [False, False, True]
+    rules.held = ()
+    assert not hold.is_intact()
+    assert hold.put()
+    hold.lift()
+    assert hold.is_intact(), "no hold is wanted"
+    assert not hold.put()

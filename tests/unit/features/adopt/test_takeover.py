@@ -395,6 +395,29 @@ def test_a_robot_without_a_master_gets_one_with_its_whole_graph() -> None:
     require_given(run(story))
 
 
+@pytest.mark.parametrize("ordered", ["release", "stop"])
+def test_a_foreign_master_gets_nothing_and_the_nodes_keep_their_topics(ordered: str) -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.holder = RobotMaster(9, "/tmp/master", "mallory", "")
+        world.master.entries.clear()
+        world.master.nodes.clear()
+        if ordered == "release":
+            world.record = msgspec.structs.replace(world.record, wanted=False)
+        held = len(world.adopted())
+        report = await world.operation.give()
+        assert report.withheld == held > 0
+        assert "user mallory) is not the recorded master" in report.withheld_from
+
+    world = run(story)
+    assert (world.master.entries, world.master.nodes) == (set(), {})
+    assert (world.record.phase, world.forwarded, world.graph.nodes()) == (Phase.FREE, False, [])
+    for node in world.robot.values():
+        for topic in node.subscribes:
+            expected = [one.uri for one in world.robot.values() if topic in one.publishes]
+            assert sorted(node.lists[topic]) == sorted(expected)
+
+
 def test_a_master_that_a_release_has_started_is_known_at_the_next_start() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()

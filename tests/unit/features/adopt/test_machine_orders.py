@@ -1,0 +1,185 @@
+"""Control orders each step on the machine: none that no order of an operator leads to is carried out."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.base.clock import using
+from appliance.features.adopt import machine_side
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
+from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
+from appliance.features.adopt.machine_side import AdoptWork
+from appliance.features.adopt.operator_orders import ADOPT, RELEASE, ordered
+from appliance.network.firewall.firewall_rules import PortRange
+from appliance.network.isolation import Isolation, IsolationSettings, LinkAddresses
+from appliance.network.namespaces import Namespace
+from appliance.network.socket_owners import NodeSockets
+from tests.support.virtual_clock import VirtualClock
+
+MASTER = RobotMaster(7, "/usr/bin/rosmaster", "robot", "roscore.service")
+OPENING = ("stand in", "withdraw", "leave")
+NODE, DATABASE = 40001, 5432
+
+
+@dataclasses.dataclass
+class Machine:
+    state: Path
+    done: list[str]
+    refused: list[set[int]]
+    time: VirtualClock
+    work: AdoptWork
+
+    def order(self, work: str, **terms: object) -> dict[str, object]:
+        side = Isolation(Namespace.own(), IsolationSettings(ports=(PortRange.one(22000),), master=11311))
+        side.ends[4] = LinkAddresses("10.111.0.0/30", "10.111.0.1", "10.111.0.2")
+        return self.work.carry_out(side, work, terms)
+
+    def begin(self, phase: Phase, *, wanted: bool = True) -> None:
+        save_record(self.state, AdoptRecord(wanted=wanted, phase=phase, boot=boot_id()))
+
+    @property
+    def record(self) -> AdoptRecord:
+        return load_record(self.state)
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    (tmp_path / "run").mkdir()
+    done: list[str] = []
+    refused: list[set[int]] = []
+
+    def sockets(_host: object, ports: set[int], _master: int) -> dict[int, NodeSockets]:
+        return {port: NodeSockets(port, frozenset({port}), "") for port in ports}
+
+    def end(*_arguments: object, **_named: object) -> int:
+        done.append("cut")
+        return 1
+
+    monkeypatch.setattr(Isolation, "forward_master", lambda _side: done.append("forward"))
+    monkeypatch.setattr(Isolation, "withdraw_master", lambda _side: done.append("withdraw"))
+    monkeypatch.setattr(machine_side, "master_of", lambda *_: MASTER)
+    monkeypatch.setattr(machine_side, "end_connections", end)
+    monkeypatch.setattr(
+        machine_side, "refuse_ports", lambda _host, _link, ports, _remote: refused.append(set(ports))
+    )
+    monkeypatch.setattr(machine_side, "refuse_no_port", lambda _host: None)
+    monkeypatch.setattr(machine_side, "node_sockets", sockets)
+    monkeypatch.setattr(machine_side, "is_node", lambda one: one.pid != DATABASE)
+    monkeypatch.setattr(machine_side, "_LOOKUP_SECONDS", 0.0)
+    time = VirtualClock()
+    with using(time):
+        yield Machine(tmp_path, done, refused, time, AdoptWork(tmp_path))
+
+
+def test_an_adoption_and_a_release_need_an_operators_order_each(machine: Machine) -> None:
+    with pytest.raises(ValueError, match="no operator ordered an adoption"):
+        machine.order("want", wanted=True)
+    with ordered(machine.state, ADOPT):
+        machine.order("want", wanted=True)
+    assert (machine.record.wanted, machine.record.unit) == (True, "roscore.service")
+    for phase in (Phase.TAKING, Phase.TAKEN):
+        machine.order("phase", phase=phase)
+    with pytest.raises(ValueError, match="no operator ordered a release"):
+        machine.order("want", wanted=False)
+    with ordered(machine.state, RELEASE):
+        machine.order("want", wanted=False)
+    assert not machine.record.wanted
+
+
+def test_an_order_is_used_once_and_for_two_minutes(machine: Machine) -> None:
+    machine.begin(Phase.TAKEN)
+    with ordered(machine.state, RELEASE):
+        machine.time.advance(121.0)
+        with pytest.raises(ValueError, match="no operator"):
+            machine.order("want", wanted=False)
+    with ordered(machine.state, RELEASE):
+        machine.order("want", wanted=False)
+        machine.begin(Phase.TAKEN)
+        with pytest.raises(ValueError, match="no operator"):
+            machine.order("want", wanted=False)
+    with ordered(machine.state, ADOPT), pytest.raises(ValueError, match="no operator"):
+        machine.order("want", wanted=False)
+
+
+def test_an_adoption_that_fails_is_undone_without_another_order(machine: Machine) -> None:
+    with ordered(machine.state, ADOPT):
+        machine.order("want", wanted=True)
+    machine.order("phase", phase=Phase.TAKING)
+    machine.order("want", wanted=False)
+    machine.order("withdraw")
+    assert machine.done[0] == "withdraw"
+
+
+@pytest.mark.parametrize("step", OPENING)
+@pytest.mark.parametrize("phase", [Phase.FREE, Phase.TAKING, Phase.TAKEN])
+def test_no_step_opens_an_adopted_robot(machine: Machine, step: str, phase: Phase) -> None:
+    machine.begin(phase)
+    with pytest.raises(ValueError, match="does not follow from an operator"):
+        machine.order(step)
+    assert machine.done == []
+    assert machine.record.phase is phase
+
+
+def test_no_phase_is_skipped_on_the_way_to_the_own_master(machine: Machine) -> None:
+    for phase in (Phase.FREE, Phase.GIVING, Phase.GIVEN):
+        machine.begin(Phase.TAKEN)
+        with pytest.raises(ValueError, match="taken does not become"):
+            machine.order("phase", phase=phase)
+
+
+@pytest.mark.parametrize("way", ["release", "end"])
+def test_a_release_and_an_ordered_end_open_it(machine: Machine, way: str) -> None:
+    machine.begin(Phase.TAKEN, wanted=way == "end")
+    if way == "end":
+        machine.work.end()
+    machine.order("stand in")
+    machine.order("withdraw")
+    for phase in (Phase.GIVEN, Phase.FREE):
+        machine.order("phase", phase=phase)
+    assert machine.record.phase is Phase.FREE
+
+
+@pytest.mark.parametrize(
+    ("phase", "wanted"), [(Phase.FREE, True), (Phase.GIVING, False), (Phase.TAKEN, False)]
+)
+def test_no_connection_ends_except_while_a_graph_is_taken(
+    machine: Machine, phase: Phase, wanted: bool
+) -> None:
+    machine.begin(phase, wanted=wanted)
+    for step in ("cut", "forward"):
+        with pytest.raises(ValueError, match="no graph is taken over"):
+            machine.order(step, ports=[NODE])
+    assert machine.done == []
+
+
+def test_only_ports_of_processes_that_look_like_nodes_are_cut(machine: Machine) -> None:
+    machine.begin(Phase.TAKING)
+    machine.order("cut", ports=[NODE, DATABASE])
+    assert machine.refused == [{NODE}]
+
+
+def test_the_cuts_of_a_taking_and_of_a_taken_graph_are_bounded(machine: Machine) -> None:
+    machine.begin(Phase.TAKING)
+    for _ in range(60):
+        machine.order("cut", ports=[NODE])
+    with pytest.raises(ValueError, match="more than 60 cuts"):
+        machine.order("cut", ports=[NODE])
+    machine.order("phase", phase=Phase.TAKEN)
+    before = len(machine.refused)
+    assert machine.order("cut", ports=[NODE]) == {"master": 0, "nodes": 0}, "the last cut still refuses"
+    machine.time.advance(60.0)
+    assert machine.order("cut", ports=[NODE]) == {"master": 1, "nodes": 1}
+    assert len(machine.refused) == before + 1
+
+
+def test_a_foreign_master_is_foreign_until_the_graph_is_given_back() -> None:
+    facts = MachineFacts(
+        AdoptRecord(phase=Phase.TAKEN, unit="roscore.service", user="robot", program="/usr/bin/rosmaster"), "", "",
+        master=msgspec.structs.replace(MASTER, user="mallory"),
+    )  # fmt: skip
+    assert "user mallory) is not the recorded master" in facts.foreign_master
+    free = msgspec.structs.replace(facts, record=msgspec.structs.replace(facts.record, phase=Phase.FREE))
+    assert free.foreign_master == ""
