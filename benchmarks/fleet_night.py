@@ -212,7 +212,7 @@ class _Night:
         robot = await self._free_robot()
         async with robot.lock:
             seconds = self._chance.uniform(0.5, 0.9) * (self._seconds - _PLANTED_SECONDS - self._now)
-            self._say("switched off in order", robot=robot.name, minutes=round(seconds / 60))
+            self._say("shut down cleanly", robot=robot.name, minutes=round(seconds / 60))
             self._reachable.pop(robot.name)
             await robot.switch_off()
             await asyncio.sleep(seconds)

@@ -80,7 +80,7 @@ class MessageLayout:
     """The layout of a message. `size` is None if it varies; `minimum` is the size of the shortest message.
 
     `places` finds items by path (`pose.position.x`). Elements of an array are in the layout of the array.
-    `characters` counts those of `MAX_CHARACTERS`.
+    `characters` is the length of all paths, limited by `MAX_CHARACTERS`.
     """
 
     parts: tuple[Part, ...]

@@ -28,8 +28,6 @@ class ClockSource(Protocol):
 
 
 class SystemClock:
-    """The clocks of the operating system."""
-
     now_ns = staticmethod(time.monotonic_ns)
     wall_ns = staticmethod(time.time_ns)
 

@@ -34,7 +34,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool], host: str = "") -> Iterator[None]:
-    """Run an order in the block; `given_up()` returns whether its client, at this address, stopped waiting."""
+    """Run the block as an order that its client can give up; `given_up()` returns whether it has."""
     order = _Order(given_up, host)
     before = _PRESENT.set(order)
     try:

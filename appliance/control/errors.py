@@ -14,7 +14,7 @@ class UnavailableError(Exception):
 
 
 class StateError(Exception):
-    """A file of the state cannot be used; the text names the file, the reason and the remedy."""
+    """A file of the state cannot be used; the message names the file, the reason and the remedy."""
 
 
 class TokenRefusedError(Exception):

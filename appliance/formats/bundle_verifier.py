@@ -291,7 +291,7 @@ class Verifier:
                 self.findings.append(f"{name!a}: was changed")
 
     def look_at_proof(self) -> None:
-        """Check rule 2: the proof."""
+        """Check rule 2: the export's record in the log has the hash of the manifest."""
         (record,) = self.records("proof.json")
         if record["event"] != "evidence exported":
             self.findings.append("proof.json: is not a record of an export")

@@ -6,8 +6,6 @@ from appliance.hosts.host_table import HostRefusedError
 
 
 class TunnelHosts:
-    """The hosts in tunnels."""
-
     _text = ""
 
     @property
@@ -15,7 +13,7 @@ class TunnelHosts:
         return self._text
 
     async def take_bundle(self, text: str, who: str) -> object:
-        """Take the hosts of a bundle; an empty string stands for the file. Raises `HostRefusedError`."""
+        """Take the hosts of a bundle; with an empty string, go back to `hosts.yaml`. Raises `HostRefusedError`."""
         del who
         if text.strip():
             raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")

@@ -178,7 +178,7 @@ def _key(parts: Sequence[str]) -> str:
 def measure(value: Value) -> tuple[int, int]:
     """Return the approximate bytes that a value takes on the wire, and its depth (0: no array or struct).
 
-    A large value is fast, because it is measured level by level. Raises `ProtocolError` for `<nil/>`.
+    Runs in linear time, level by level. Raises `ProtocolError` for `<nil/>`.
     """
     if type(value) in _NUMBERS:
         return _VALUE, 0

@@ -24,8 +24,6 @@ log = logging.getLogger("rosrv")
 
 
 class ProcessActivity:
-    """The progress of a process."""
-
     def __init__(self, pid: int) -> None:
         self._stat = Path("/proc", str(pid), "stat")
         self._seen: tuple[str, ...] = ()

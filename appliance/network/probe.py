@@ -38,8 +38,6 @@ for family, address in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
 class ConnectOutcome(StrEnum):
-    """The outcome of an attempt to connect."""
-
     REACHED = "reached"
     REFUSED = "refused"
     TIMED_OUT = "timed out"
@@ -49,8 +47,6 @@ class ConnectOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class ConnectAttempt:
-    """One attempt to connect."""
-
     address: str
     outcome: ConnectOutcome
     detail: str = ""
@@ -58,8 +54,6 @@ class ConnectAttempt:
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """The result of a probe."""
-
     port: int
     uid: int
     attempts: tuple[ConnectAttempt, ...]

@@ -19,8 +19,6 @@ _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 
 @dataclass(frozen=True, slots=True)
 class Word(Place):
-    """A word of the text."""
-
     text: str = ""
 
 

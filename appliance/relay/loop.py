@@ -193,7 +193,7 @@ class EventLoop:
             found.direct += epoll is self._epoll
 
     def change(self, descriptor: int, events: int) -> None:
-        """Wait for other events; errors and hang-ups are always reported."""
+        """Change the events to wait for; errors and hang-ups are always reported."""
         watched = self._watched[descriptor]
         watched.epoll.modify(descriptor, events)
         if watched.payer is not None:

@@ -24,8 +24,6 @@ _MOST_MOVED = 64  # the most idle connections that one search moves
 
 
 class Stage(StrEnum):
-    """The stage of a connection."""
-
     IDLE = "idle"
 
     UNFINISHED = "unfinished"

@@ -47,7 +47,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class AllocationPlan:
-    """The relays of files and resources, and the moves."""
+    """Which relay runs each file and each topic or service, and what has to move."""
 
     files: Mapping[str, int] = field(default_factory=dict)
     resources: Mapping[Resource, int] = field(default_factory=dict)

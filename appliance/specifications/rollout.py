@@ -28,8 +28,6 @@ _SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
 
 
 class Relays(Protocol):
-    """The interface to the relays."""
-
     def send(self, message: Message, relay: int) -> bool:
         """Send a message; return False if the relay is not connected."""
 

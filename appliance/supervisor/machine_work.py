@@ -13,8 +13,6 @@ Found: TypeAlias = dict[str, object]
 
 
 class MachineWork(Protocol):
-    """The work of one feature."""
-
     def takes_over(self) -> bool:
         """Return whether the robot's own ROS master may run beside the appliance, which takes over its graph."""
 

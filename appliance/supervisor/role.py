@@ -63,56 +63,46 @@ class ExternalProgram:
 
 @dataclass(frozen=True)
 class Role:
-    """One row of the table of processes.
-
-    `most` processes may run (None: one for each relay), after the role `after` is ready; with `stands_by`, even while
-    this appliance is passive. `listens`: the supervisor keeps the listening sockets. `on_demand`: control requests
-    the start, and exit status 0 is not followed by a restart. `asks`: the supervisor checks a program without a
-    lifeline over HTTP. `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles
-    are stopped last.
-
-    The group of the user `readable_by` may read files of `part`; a role that reads them has this user as `group`.
-    `secret` is a file that the role's user may not read: the last argument of `entry` is its descriptor or None.
-    `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`. With
-    `nice_if_busy`, a running process has `nice` only while tasks wait for a processor. `slice_ns` is the length of its
-    turns if it may not have its niceness (0: the kernel's). `receiver` is the only
-    other machine that the user can reach. `memory` names a function (`module:function`) that gets the sections and the
-    number of relays, and makes the memory that they share, or returns None.
-    """
+    """One row of the table of processes."""
 
     name: str
     user: str
-    part: str
+    part: str  # its folder in the state directory
     entry: str | None = None
     program: Callable[[Facts], ExternalProgram] | None = None
     path: Callable[[Facts], Path] | None = None
     indexed: bool = False
-    most: int | None = None
+    most: int | None = None  # processes that may run; None: one for each relay
     links: tuple[str, ...] = ()
     network: bool = True
-    asks: bool = False
-    after: str | None = None
-    outlives_control: bool = False
+    asks: bool = False  # the supervisor checks it over HTTP, because the program has no lifeline
+    after: str | None = None  # starts when this role is ready
+    outlives_control: bool = False  # stopped last
     outlives_takeover: bool = False
-    stands_by: bool = False
+    stands_by: bool = False  # also runs while this appliance is passive
     files: int = 1024
-    readable_by: str | None = None
-    listens: bool = False
-    dispensable: bool = False
-    on_demand: bool = False
+    readable_by: str | None = None  # the group of this user may read files of `part`
+    listens: bool = False  # the supervisor keeps the listening sockets
+    dispensable: bool = False  # the other roles continue when this role cannot serve
+    on_demand: bool = False  # control requests the start; exit status 0 causes no restart
     capabilities: tuple[str, ...] = ()
-    group: str | None = None
+    group: str | None = None  # the `readable_by` of the files that it reads
     secret: Callable[[Facts], Path | None] | None = None
-    inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
-    ended_early: int = 0
+    """A file that the role's user may not read: the last argument of `entry` is its descriptor or None."""
+    inputs: Callable[[Facts], tuple[Path, ...]] = (
+        lambda _facts: ()
+    )  # files of the operator; the supervisor opens them
+    ended_early: int = 0  # `oom_score_adj`
     nice: int = 0
-    nice_if_busy: bool = False
-    slice_ns: int = 0
+    nice_if_busy: bool = False  # `nice` holds only while tasks wait for a processor
+    slice_ns: int = 0  # length of its turns without the right to `nice`; 0: the kernel's
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
     paired: bool = False
     configured: Callable[[Sections], bool] = lambda _sections: True
     receiver: Callable[[Sections], RemoteReceiver | None] = lambda _sections: None
+    """The only other machine that the user can reach."""
     memory: str = ""
+    """`module:function`: it makes the relays' shared memory from the sections and the number of relays, or None."""
 
     @property
     def serves_robot(self) -> bool:

@@ -125,7 +125,7 @@ class ClientConnections:
 
     def established(self, number: int, robot: str | None) -> bool:
         connection = self._open.get(number)
-        if connection is None:  # it made room for another one
+        if connection is None:  # it was closed to admit another connection
             return False
         if connection.due is not None:
             connection.due.cancel()

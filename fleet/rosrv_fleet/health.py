@@ -16,7 +16,7 @@ class RobotState(msgspec.Struct, frozen=True, kw_only=True):
     """A robot's newest segment (log, number, seconds since its arrival), and its problems.
 
     `heard_seconds` has the time since each appliance was heard. The robot is silent if one of them is, or `off` if one
-    was switched off in order and none is silent. `gaps` and `forks` are counted up to 1,000.
+    was shut down cleanly and none is silent. `gaps` and `forks` are counted up to 1,000.
     """
 
     name: str

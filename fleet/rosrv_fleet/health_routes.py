@@ -59,9 +59,7 @@ class RobotMetrics(MetricSource):
         age = gauge("segment_age_seconds", "seconds since the robot's newest segment arrived")
         ends = gauge("certificate_seconds", "seconds until the robot's certificate ends")
         silent = gauge("robot_silent", "1 while an appliance of the robot was not heard for silent_seconds")
-        off = gauge(
-            "robot_off", "1 while an appliance of the robot is switched off in order, and none is silent"
-        )
+        off = gauge("robot_off", "1 while an appliance of the robot is shut down cleanly, and none is silent")
         heard = GaugeMetricFamily(
             "rosrv_fleet_heard_seconds",
             "seconds since an appliance pushed a segment or stated that nothing waits",

@@ -81,8 +81,8 @@ class Invitations:
     def using(self, token: str, request: bytes) -> Iterator[PendingRobot]:
         """Mark the token as used by this request, and yield the robot that it invites.
 
-        The yielded `request` is empty unless the robot repeats its request. If the block raises `EnrolmentError`, the
-        token can be used again. Raise `InvalidInvitationError` if the token is not valid.
+        `request` of the yielded robot is set only if it sent the same request before. If the block raises
+        `EnrolmentError`, the token can be used again. Raise `InvalidInvitationError` if the token is not valid.
         """
         digest = hashlib.sha256(request).hexdigest()
         with changing(self._folder):

@@ -1,6 +1,6 @@
 """Note when each appliance of a robot was last heard: when it pushed a segment, or reported that it had none to push.
 
-An appliance that is switched off in order reports this. The files, of which the modification time and the content are
+An appliance that is shut down cleanly reports this. The files, of which the modification time and the content are
 read, survive restarts, and commands see them. Silence is measured on the monotonic clock, so that a correction of the
 collector's clock makes no robot silent, and hides none.
 """
@@ -45,7 +45,7 @@ class RobotPresence:
             os.utime(file, ns=(now, now))
 
     def off(self, robot: Robot) -> set[str]:
-        """Return the appliances of a robot that were switched off in order, and were not heard since."""
+        """Return the appliances of a robot that were shut down cleanly, and were not heard since."""
         signs = {name: self.last(robot.name, name) for name in robot.connecting}
         return {name for name, sign in signs.items() if sign is not None and sign.off}
 

@@ -108,7 +108,7 @@ class Robots:
         self._robots, self.unreadable = robots, unreadable
 
     def accepted_since(self, fingerprint: str) -> float:
-        """Return the monotonic time since which a certificate was accepted by this process."""
+        """Return when this process first accepted a certificate, in monotonic seconds."""
         return self._since.get(fingerprint, clock.now())
 
     def with_certificate(self, der: bytes) -> Robot | None:

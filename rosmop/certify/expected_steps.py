@@ -33,8 +33,6 @@ class StepCase:
 
 @dataclass
 class ExpectedResult:
-    """The expected result of a walk."""
-
     states: States
     position: int = 0
     effects: list[tuple[int, int]] = field(default_factory=list)

@@ -8,8 +8,6 @@ FAIL = "fail"
 
 
 class StateMachineFollower:
-    """Follows a machine; a state is its name."""
-
     def __init__(self, formula: str, events: Sequence[str]) -> None:
         self._moves: dict[str, dict[str, str]] = {}
         self._default: dict[str, str] = {}

@@ -50,7 +50,7 @@ _FRAME = bytes(range(7, 23))
 
 
 class StepDiffersError(Exception):
-    """The steps of the module differ from the automaton; the text has the place."""
+    """The steps of the module differ from the automaton; the message says where."""
 
 
 def check_steps(compiled: Compiled, module: WasmModule) -> int:

@@ -65,15 +65,11 @@ class Lvalue:
 
 @dataclass(frozen=True)
 class VariableLvalue(Lvalue):
-    """A variable."""
-
     variable: Variable
 
 
 @dataclass(frozen=True)
 class ElementLvalue(Lvalue):
-    """An element of a vector."""
-
     base: Value
     index: Expression
     site: int
@@ -81,8 +77,6 @@ class ElementLvalue(Lvalue):
 
 @dataclass(frozen=True)
 class CharacterLvalue(Lvalue):
-    """A character of a string."""
-
     base: Value
     index: Expression
     site: int
@@ -90,8 +84,6 @@ class CharacterLvalue(Lvalue):
 
 @dataclass(frozen=True)
 class FieldLvalue(Lvalue):
-    """A field of a message."""
-
     base: Value
     slot: int
 

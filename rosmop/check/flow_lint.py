@@ -101,8 +101,6 @@ class _Batch(NamedTuple):
 
 
 class SpecificationFlow:
-    """The flow of one specification."""
-
     def __init__(self, shared: CompilationContext, code: SpecificationCode, work: FlowWork) -> None:
         self.code = code
         self._work = work

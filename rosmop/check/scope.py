@@ -53,8 +53,6 @@ class ConstantReference:
 
 @dataclass(eq=False)
 class SpecificationNames:
-    """The names that one specification declares."""
-
     name: str
     context: str
     variables: dict[str, Variable] = field(default_factory=dict)

@@ -17,8 +17,6 @@ from rosmop.types import value_types
 
 
 class Arguments:
-    """The arguments of a call."""
-
     def __init__(
         self,
         scope: FunctionScope,

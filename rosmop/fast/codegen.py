@@ -110,8 +110,6 @@ MOST_SAFE = 1024
 
 @dataclass(frozen=True)
 class WasmFunction:
-    """A function of the module."""
-
     number: int
     parameters: tuple[int, ...]
     result: int

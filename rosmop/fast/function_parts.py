@@ -36,7 +36,7 @@ ELSEWHERE = 8
 
 
 class FunctionBuilder(ABC):
-    """Writes a function, such as an event or handler (`answers`); `context` names the budget that pays for it."""
+    """Writes a function, such as an event or handler (`answers`); its steps are charged to the budget `context`."""
 
     def __init__(
         self, layout: MemoryLayout, parameters: Mapping[str, int], context: str, *, answers: bool

@@ -32,7 +32,7 @@ def line_of(text: str, number: int) -> str:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A finding for the author of a specification; the text names the remedy."""
+    """A finding for the author of a specification; the message names the remedy."""
 
     position: Position
     severity: Severity

@@ -28,8 +28,6 @@ _REGULAR = 8.0  # usual gaps; a topic with a longer pause is not regular
 
 @dataclass(frozen=True)
 class CandidateSupport:
-    """The evidence for a candidate."""
-
     messages: int
     seconds: float
     recordings: int

@@ -167,7 +167,7 @@ class _Learner:
         return part.number, part.began, part.ended, place * self._each, self._each, chosen
 
     def _pass(self, steps: Sequence[AnyStep], nothing: Facts) -> tuple[Any, Any]:
-        trained: Any = nothing  # of the kind of the pass
+        trained: Any = nothing  # the type of facts that this pass collects
         held_out: Any = nothing
         waiting = [step for step in steps if step.recording not in self._failed]
         for place, facts in self._run(waiting):

@@ -8,7 +8,7 @@ Received = tuple[str, int, bytes]  # topic, nanoseconds, the bytes of the fields
 
 
 class LearningError(Exception):
-    """Nothing can be learnt; the text names the recordings and the reason."""
+    """Nothing can be learnt; the message names the recordings and the reason."""
 
 
 class RecordingFacts(Protocol):
@@ -29,8 +29,6 @@ class RecordingFacts(Protocol):
 
 
 class RecordingSource(RecordingFacts, Protocol):
-    """A recording with its messages."""
-
     def messages(self) -> Iterator[Received]:
         """Yield messages in order of time; each call starts again."""
 

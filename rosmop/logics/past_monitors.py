@@ -381,8 +381,6 @@ class SinceWindow:
 
 
 class PastRun(UntimedRun):
-    """A run of a past formula."""
-
     __slots__ = ("_residues", "now", "values")
 
     def __init__(self, folded: FoldedProgram, time_ns: int) -> None:

@@ -130,7 +130,7 @@ class Loops:
 def loop_conditions(
     form: Sequence[Cut], module: Sequence[Cut], ended: Term, left: Term
 ) -> Iterator[tuple[str, Term]]:
-    """Yield the conditions that must not hold. Raises `NotProvedError`.
+    """Yield the conditions that z3 must refute. Raises `NotProvedError`.
 
     `ended` holds if the form faulted or uses something unknown, `left` if the module left the message to
     Python.

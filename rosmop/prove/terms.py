@@ -34,7 +34,7 @@ class TextTerm:
 
 
 class NotProvedError(Exception):
-    """An event about which nothing is known; the text gives the reason."""
+    """An event about which nothing is known; the message gives the reason."""
 
 
 class _Mixed:

@@ -27,7 +27,7 @@ _DAMAGE = (
 
 
 class RecordingError(Exception):
-    """A recording cannot be used. The text names the recording and the reason."""
+    """A recording cannot be used. The message names the recording and the reason."""
 
 
 def ros_type(name: str) -> str:

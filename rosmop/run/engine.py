@@ -396,7 +396,7 @@ class MonitorSet:
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
-        """Whether nothing is due, no monitor waits for its first message, and none has failed to start."""
+        """Return whether the fast lane may take the next batch."""
         return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
     def monitor(self, name: str) -> MonitorInstance:

@@ -15,8 +15,6 @@ MESSAGE_FUEL = FUEL_PER_SECOND // 100
 
 
 class BatchResult(NamedTuple):
-    """The result of one batch."""
-
     position: int
     """The offset of the first message that was not processed."""
     run: int

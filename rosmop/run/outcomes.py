@@ -197,7 +197,7 @@ class Outcome:
 
 
 class Margin(NamedTuple):
-    """The two sides of a comparison when they were closest, while it was true (`holds`) or while it was false.
+    """How close a comparison came to changing its result; `holds`: while it was true.
 
     `number` counts the monitor's comparisons in the order of the text. `threshold` is the constant side, 0 or 1.
     """

@@ -101,8 +101,6 @@ class _Known:
 
 
 class Slices:
-    """All slices of one specification."""
-
     def __init__(
         self,
         code: SpecificationCode,

@@ -13,8 +13,6 @@ from rosmop.form.findings import Position
 
 @dataclass(frozen=True)
 class SyntaxNode:
-    """A node of the tree."""
-
     position: Position = field(compare=False)
 
 
@@ -77,8 +75,6 @@ class NumberLiteral(Expression):
 
 @dataclass(frozen=True)
 class StringLiteral(Expression):
-    """A string literal."""
-
     value: bytes
 
 
@@ -418,8 +414,6 @@ class EventDefinition(SyntaxNode):
 
 @dataclass(frozen=True)
 class FunctionDefinition(SyntaxNode):
-    """A helper function."""
-
     type: TypeName | None
     name: str
     parameters: tuple[ParameterDeclaration, ...]
@@ -512,7 +506,7 @@ class TypedSafe(SyntaxNode):
 
 @dataclass(frozen=True)
 class GivenItems(InitializerList):
-    """The items of a table that operators set. The identity of a state is without them, so the state stays."""
+    """The items of a table that operators set. A change of them keeps the state."""
 
     items: tuple[Expression, ...] = field(compare=False)
 

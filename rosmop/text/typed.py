@@ -67,8 +67,6 @@ def _unknown_presets(typed: tree.TypedFile) -> Iterable[Diagnostic]:
 
 @dataclass
 class _Maker:
-    """Makes one specification."""
-
     typed: tree.TypedFile
     written: tree.Specification | tree.TypedSpecification
     preset: tree.PresetStatement | None

@@ -14,7 +14,7 @@ BUFFER_BYTES = 1 << 19
 
 
 class NodeCallError(RosError):
-    """A call of the master, a node or a service has no usable result. The text names the call and the reason."""
+    """A call of the master, a node or a service has no usable result. The message names the call and the reason."""
 
 
 class PeerUnreachableError(NodeCallError):
@@ -78,7 +78,7 @@ class NodeNetwork(Protocol):
 
 
 class SourceNetwork:
-    """The network of this machine, used from one of its addresses."""
+    """Open connections and listeners from one local address."""
 
     def __init__(self, source: str) -> None:
         self.source = source

@@ -42,7 +42,7 @@ _STYLE_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
 
 class ModuleError(Exception):
-    """The modules cannot be joined; the text names the file and, where known, the line."""
+    """The modules cannot be joined; the message names the file and, where known, the line."""
 
 
 class _Token(NamedTuple):

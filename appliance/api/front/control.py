@@ -45,7 +45,7 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """Control does not serve a request; the text gives the client the reason.
+    """Control does not serve a request; the message gives the client the reason.
 
     `active` is the address of the active appliance, if this one is the standby.
     """
@@ -161,7 +161,7 @@ class ControlLink:
         return answer
 
     async def hand_over(self, name: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        """Return the status, and the reason for refusing the WebSocket. Raises `ControlAwayError`."""
+        """Pass a WebSocket to a door; return the HTTP status and the reason of a denial. Raises `ControlAwayError`."""
         if self.paused:
             raise ControlAwayError(self.paused)
         try:

@@ -135,7 +135,7 @@ class ChainWriter:
         return sequence, digest, last_id
 
     def seal(self, time: int, report: Callable[[Checkpoint], AuditRecord]) -> None:
-        """Store a checkpoint of the chain so far, and its record, which is the next of the chain."""
+        """Append a checkpoint of the chain, then a record of it."""
         number, removed = self.checkpoint_number + 1, self._first_sequence() - 1
         checkpoint = Checkpoint(
             self.log_id, number, self.sequence, self.hash.hex(), time, self._checkpoint_hash, removed

@@ -491,7 +491,7 @@ class OwnServiceCalled(Message):
 
 
 class OwnServiceAnswered(Message):
-    """A text for the client; `repeats`: calls of the same host in the next second get it too."""
+    """Answer a client. If `repeats`, calls of its host in the next second get the same answer."""
 
     number: int
     success: bool

@@ -29,8 +29,6 @@ _REFUSALS_OF_A_ROBOT = (
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """The endpoints."""
-
     places: NodePorts
     addresses: AdvertisedAddresses
     relay: RelayControl

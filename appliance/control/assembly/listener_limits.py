@@ -31,8 +31,6 @@ from roswire.xmlrpc import XmlRpcLimits, build_fault
 
 
 class ListenerLimits:
-    """The limits and connections of all listeners."""
-
     def __init__(
         self,
         settings: Settings,

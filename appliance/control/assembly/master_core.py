@@ -23,8 +23,6 @@ from roswire.parameter_tree import Tree
 
 @dataclass(frozen=True, slots=True)
 class MasterCore:
-    """The core of RVMaster."""
-
     policy: Callable[[], Policy]
     registry: Registry
     watchlist: Watchlist

@@ -154,7 +154,7 @@ class Policies(Revisions[RevisionRow]):
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        The author of the revision is always `disk`.
+        The revision is recorded as loaded from disk; its note names who ordered it.
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self._changing(request.expected):
@@ -375,7 +375,7 @@ def surroundings(
     holders: Mapping[str, Address],
     approved: frozenset[Approval],
 ) -> PolicyContext:
-    """Return all that is known beside a policy's text, as one value, which no later change of an owner reaches."""
+    """Return a snapshot of the facts, beside its source, that a policy decides with."""
     return PolicyContext(
         dict(hosts),
         robot,

@@ -26,8 +26,6 @@ WAIT_SECONDS = 120.0
 
 
 class ApprovalState(StrEnum):
-    """The state of an entry."""
-
     WAITS = "waits"
     APPROVED = "approved"
     REFUSED = "refused"

@@ -66,8 +66,6 @@ class _Slot:
 
 
 class DoorProcesses:
-    """The processes of all doors."""
-
     def __init__(
         self,
         core: Core,

@@ -89,8 +89,6 @@ class _Door:
 
 
 class DoorProcess:
-    """The process of one door."""
-
     def __init__(self, lifeline_fd: int) -> None:
         self._child = Child(
             Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),

@@ -40,8 +40,6 @@ class SeenService:
 
 @dataclass(frozen=True, slots=True)
 class DoorSurroundings:
-    """The surroundings of a door."""
-
     graph: VisibleGraph
     topics: Sequence[SeenTopic]
     services: Sequence[SeenService]

@@ -6,7 +6,7 @@
 4. On each new connection the collector reports what it has: it may have been restored from a backup.
 5. If the log was restored from a copy, pushing continues from the last checkpoint that log and collector share.
 6. While nothing waits, the robot reports so every minute, because a robot without records is not silent. When it is
-   switched off in order, it reports that as well, unless pushing fails.
+   shut down cleanly, it reports that as well, unless pushing fails.
 """
 
 import contextlib

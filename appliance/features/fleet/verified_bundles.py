@@ -35,7 +35,7 @@ _UNFINISHED = "tmp*"  # the names that the TUF library gives to files that it ha
 
 
 class BundleRejectedError(Exception):
-    """The collector's metadata or bundle are not accepted; the text has the reason."""
+    """The collector's metadata or bundle are not accepted; the message has the reason."""
 
 
 class BundleTooEarlyError(Exception):

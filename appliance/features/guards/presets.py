@@ -176,8 +176,6 @@ DRIVER_CHECK = Preset("driver_check")
 
 @dataclass(frozen=True)
 class Guard:
-    """A guard to make."""
-
     name: str
     preset: Preset
     topics: Mapping[str, str] = field(default_factory=dict)

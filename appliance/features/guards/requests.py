@@ -161,7 +161,7 @@ class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check
 
 @rest("viewer", "GET", "/v1/guards/driver-check", name="driver_check")
 class DriverCheckWanted(WaitingRequest[DriverCheck], frozen=True, tag="driver check wanted"):
-    """The present check of a driver. While it runs, the answer comes with its end, or after a second."""
+    """Return the driver's check; while it runs, wait up to a second for its end."""
 
 
 REQUESTS = (

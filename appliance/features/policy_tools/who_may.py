@@ -14,8 +14,6 @@ from appliance.policy.rights import decide, decide_right, rights_of
 
 @dataclass(frozen=True, slots=True)
 class HostAnswer:
-    """An answer for some hosts."""
-
     network: Network | None
     """None: all hosts that no network of the policy contains."""
     names: tuple[str, ...]

@@ -48,8 +48,6 @@ class RecordedFrames(NamedTuple):
 
 
 class StreamFrames(NamedTuple):
-    """The batches of a stream."""
-
     stream: int
     header: dict[str, str]
     batches: list[RecordedFrames]

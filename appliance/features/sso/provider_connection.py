@@ -31,8 +31,6 @@ Pool = httpcore.AsyncConnectionPool | httpcore.AsyncHTTPProxy
 
 
 class ProviderAnswer(NamedTuple):
-    """An answer of the provider."""
-
     status: int
     body: bytes
 

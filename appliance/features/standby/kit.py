@@ -40,8 +40,6 @@ class PairPlan:
 
 
 class KitFile(NamedTuple):
-    """A file of a kit."""
-
     name: str
     text: str
     mode: int

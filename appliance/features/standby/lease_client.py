@@ -18,7 +18,7 @@ _SERVES_SECONDS = 0.5
 
 
 class HandOverError(UnavailableError):
-    """The other appliance cannot take over now; the text has the reason."""
+    """The other appliance cannot take over now; the message has the reason."""
 
 
 class LeaseClient:

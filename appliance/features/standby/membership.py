@@ -13,7 +13,7 @@ FILE = "membership.json"
 LEASE_FILE, LINK_FILE = "lease.json", "link.json"
 """The parts of the membership that the supervisor writes for the process `lease` and for control."""
 
-LEASE_NICE = -10  # as the unit of the witness has
+LEASE_NICE = -10  # the niceness of the witness's unit
 LEFT_FILE = "left.json"
 """The last membership that this appliance left, without its secrets."""
 
@@ -27,7 +27,7 @@ _Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 
 
 class MembershipError(ValueError):
-    """A membership that cannot be used; the text names the file and the reason."""
+    """A membership that cannot be used; the message names the file and the reason."""
 
 
 class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class StandbyPairView(PairView):
-    """The views of an appliance that can be one of two."""
+    """A standby pair in status, alarms and metrics."""
 
     def request(self) -> StandbyWanted:
         return StandbyWanted()

@@ -42,8 +42,6 @@ _log = structlog.get_logger()
 
 
 class PassiveControl:
-    """Control of a standby."""
-
     def __init__(
         self,
         settings: Settings,

@@ -44,7 +44,7 @@ class PeerChannel:
 
     def _is_new(self, message: PeerMessage) -> bool:
         if not isinstance(message, PromiseRequest):
-            return True  # a promise and an order are compared with the request that they name
+            return True  # the caller compares a promise or order with its request
         last = self._last
         new = (
             last is None

@@ -53,7 +53,7 @@ def main(lifeline_fd: int, membership: Path) -> None:
 
 
 class LeaseProcess:
-    """The process; `epoch_file` has the greatest epoch of earlier processes."""
+    """Runs the lease; `epoch_file` has the greatest epoch of earlier runs."""
 
     def __init__(self, membership: Membership, lifeline_fd: int, epoch_file: Path) -> None:
         self._membership = membership

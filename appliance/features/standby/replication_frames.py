@@ -27,7 +27,7 @@ _History = Annotated[str, msgspec.Meta(max_length=64)]
 
 
 class ReplicationError(Exception):
-    """The link between the appliances ended; the text has the reason."""
+    """The link between the appliances ended; the message has the reason."""
 
 
 class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):

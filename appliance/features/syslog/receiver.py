@@ -27,8 +27,6 @@ _LOOK_SECONDS = (0.001, 0.02)  # first and longest interval between two checks f
 
 
 class Receiver(Protocol):
-    """A receiver of messages."""
-
     def send(self, messages: Sequence[bytes]) -> None:
         """Send messages in order, with the module's invariants. Raises `OSError`."""
 

@@ -14,8 +14,6 @@ _COUNTED = "repetitions folded"
 
 @dataclass(frozen=True, slots=True)
 class PastPublisher:
-    """A publisher at a time in the past."""
-
     node: str
     host: str
     since: int | None

@@ -21,8 +21,6 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 @dataclass(frozen=True)
 class Kit:
-    """The data of a kit."""
-
     host: KitParts
     endpoint: str
     """The address or name of the appliance; `host.second` is that of the other one of two."""

@@ -16,7 +16,7 @@ ENROLMENT = EndKind("enrolment", dated=True)
 
 
 class BadEnrolmentTokenError(Exception):
-    """The token is invalid; the text does not reveal why."""
+    """The token is invalid; the message does not reveal why."""
 
 
 class EnrolmentTokens:

@@ -13,8 +13,6 @@ NO_TUNNELS = (
 
 @dataclass(frozen=True)
 class RestAddress:
-    """The ports of REST."""
-
     port: int | None
     """For other machines."""
     trouble: str

@@ -230,7 +230,7 @@ class AdvertisedAddresses:
         return route or self.listen or peer.local
 
     def forget_routes(self) -> None:
-        """Ask again about each host: the machine has other addresses."""
+        """Forget cached routes, because the addresses of the machine changed."""
         self._routes.clear()
 
     async def learn(self, peer: Peer) -> None:

@@ -30,7 +30,7 @@ class TapRequests:
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
     ) -> list[messages.MessageSeen]:
-        """Return the next messages, fewer after the time limit. Raises `TooManyTapsError`."""
+        """Return up to `count` messages, or those that came in time. Raises `TooManyTapsError`."""
         if len(self._open) >= MOST:
             raise TooManyTapsError(f"{MOST} queries of topics' messages are running: try again")
         send = self._sender(topic)

@@ -105,8 +105,6 @@ class Grants:
 
 @dataclass(frozen=True, slots=True)
 class RosGraph:
-    """All changes of the graph."""
-
     registry: Registry
     grants: Grants
     trail: AuditTrail

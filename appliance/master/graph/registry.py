@@ -36,8 +36,6 @@ class HostFullError(Exception):
 
 
 class Kind(enum.StrEnum):
-    """The kind of a registration."""
-
     PUBLICATION = "publication"
     SUBSCRIPTION = "subscription"
     SERVICE = "service"

@@ -17,8 +17,6 @@ class BackendMissingError(FirewallError):
 
 @dataclass(frozen=True)
 class RuleCounter:
-    """A rule in the kernel, with its counters."""
-
     chain: str
     family: Family | None  # None: one rule for both families
     purpose: str

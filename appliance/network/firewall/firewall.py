@@ -16,8 +16,6 @@ BackendChoice = Literal["auto", "nft", "iptables"]
 
 @dataclass(frozen=True)
 class FirewallReport:
-    """The state of the firewall."""
-
     backend: str | None  # None: no rules are installed
     rules: tuple[FirewallRule, ...]
     not_used: tuple[str, ...]  # the reason for each back end that was not used

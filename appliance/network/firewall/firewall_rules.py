@@ -57,8 +57,6 @@ SOURCE_TRANSLATIONS = frozenset({"MASQUERADE", "SNAT", "NETMAP"})  # targets of 
 
 
 class PacketVerdict(StrEnum):
-    """The verdict on a matching packet."""
-
     RETURN = "RETURN"  # continue with the rules of other programs
     RESET = "RESET"  # TCP reset: the peer sees "connection refused"
     DROP = "DROP"

@@ -11,7 +11,7 @@ from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.context import RelayContext
 
 _ANY = "*"
-_MOST = 8  # claims that one publisher is asked with; subscribers choose them
+_MOST = 8  # claims to try on one publisher, because subscribers can make up any number
 
 
 class Introductions:

@@ -25,7 +25,7 @@ def looks_for_names(type_name: str) -> bool:
 
 
 def seen_names(members: Iterable[TopicSubscriber], servers: Collection[str]) -> frozenset[str]:
-    """Return the names of subscribers that a publisher sees, first of all those of its `servers`."""
+    """Return the names of subscribers that a publisher sees, with those served by `servers` first."""
     of_host: dict[str, set[str]] = {}
     for member in sorted(members, key=lambda member: member.caller_id not in servers):
         names = of_host.setdefault(member.host, set())

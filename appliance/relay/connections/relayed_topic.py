@@ -79,7 +79,7 @@ class Upstream:
         """If `silent`, close the connection at once and take no message; otherwise connect if the topic is wanted."""
 
     def check_stall(self) -> None:
-        """Cut a publisher that holds memory for a message and no longer sends any of it."""
+        """Disconnect a publisher that stalls in the middle of a message."""
 
     def close(self) -> None:
         """Close everything, because the publication is withdrawn."""

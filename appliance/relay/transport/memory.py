@@ -18,8 +18,6 @@ from appliance.relay.relay_limits import RelayLimits
 
 
 class HostMemory:
-    """The memory of one host in a pool."""
-
     __slots__ = ("_pool", "host")
 
     def __init__(self, pool: Pool[str], host: str) -> None:

@@ -41,7 +41,7 @@ def conditions(
         if not seen.seen:
             found[robot] = RobotCondition(ConditionKind.NEVER_SEEN, "it never reported")
         elif now - seen.seen > silent and robot in off:
-            found[robot] = RobotCondition(ConditionKind.OFF, "it was switched off in order")
+            found[robot] = RobotCondition(ConditionKind.OFF, "it was shut down cleanly")
         elif now - seen.seen > silent:
             found[robot] = RobotCondition(ConditionKind.SILENT, f"no report for {now - seen.seen:.0f} s")
         elif robot in sick:

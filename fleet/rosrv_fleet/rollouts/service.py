@@ -64,7 +64,7 @@ class BundleService:
     """The published bundles and their rollouts. Orders raise `RolloutRefusedError`.
 
     `folder` has the operator's publication; `key` is the file of the timestamp's key. `off` returns the robots that
-    were switched off in order.
+    were shut down cleanly.
     """
 
     def __init__(
