@@ -1,13 +1,15 @@
-"""roslib from npm, as browsers use it, at the door of a running appliance."""
+"""roslib from npm, as browsers use it, and roslibpy from PyPI, at the door of a running appliance."""
 
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from appliance.features.approvals.requests import ApprovalsWanted
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
@@ -16,6 +18,8 @@ from tests.support.requirements import need_program
 from tests.support.waiting import eventually
 
 HERE = Path(__file__).with_name("roslib")
+IN_PYTHON = Path(__file__).with_name("roslibpy")
+UV = Path(sys.executable).with_name("uv")
 POLICY = """
 [Groups]
 site = 10.77.0.0/24
@@ -49,6 +53,19 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"], cwd=folder, check=True
     )
     return folder / "client.mjs"
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the Python of an environment with roslibpy, as its lock file says."""
+    place = tmp_path_factory.mktemp("roslibpy") / "venv"
+    python, lock = place / "bin/python", IN_PYTHON / "requirements.lock"
+    for command in (
+        ["venv", "--python", sys.executable, str(place)],
+        ["pip", "sync", "--require-hashes", "--python", str(python), str(lock)],
+    ):
+        subprocess.run([UV, "--quiet", *command], check=True, timeout=240)
+    return python
 
 
 @pytest.fixture
@@ -90,3 +107,27 @@ def test_roslib_uses_a_door_and_shows_why_it_is_refused(
     assert number is not None, words
     appliance.rosrv("approve", number[1], "--for", "60s")
     assert held.wait_for(event="received")["data"] == "to /held"
+
+
+def test_roslibpy_uses_a_door_and_gets_the_words_when_it_ends(
+    appliance: Appliance, ros: RosSession, python: Path
+) -> None:
+    """roslibpy shows a program no `status`: only the error of a call, and the reason in the closing frame."""
+    answers, held = ros.listener("rospy", "/answer"), ros.listener("rospy", "/held")
+    command = [str(python), str(IN_PYTHON / "client.py"), "10.77.0.2", "9091"]
+    client = ros.start([*command, "/answer", "/held"], label="roslibpy")
+    assert client.wait_for(event="heard")["data"].startswith("hello ")
+    assert answers.wait_for(event="received")["data"] == "to /answer"
+    assert client.wait_for(event="answered", service="/brake")["success"] is False
+    refused = client.wait_for(event="not answered", service="/forbidden_brake")
+    assert "198.19.240." in str(refused["error"]) and "policy.ini" in str(refused["error"])
+    approvals = eventually(
+        lambda: [one for one in appliance.ask(ApprovalsWanted()).approvals if one.resource == "/held"],
+        "the call waits for an approval",
+    )
+    appliance.rosrv("approve", str(approvals[0].number), "--for", "60s")
+    assert held.wait_for(event="received")["data"] == "to /held"
+    denied = ros.start([*command, "/forbidden"], label="roslibpy, denied")
+    denied.wait_for(event="closed")
+    closing = denied.wait_for(lambda event: "Code=1008" in str(event.get("text")), event="logged")
+    assert "100 refusals in 30 s" in str(closing["text"]) and "/forbidden" in str(closing["text"])
