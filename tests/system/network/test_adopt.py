@@ -261,5 +261,7 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
     appliance.start()
     until_taken(robot, appliance)
     said = rosrv(robot, appliance, "policy", "enforce", "--when-standing", "--within", "30")
-    assert "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no" in said
+    assert (
+        "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no" in said
+    )
     assert "enforces [Publishers]" in said
