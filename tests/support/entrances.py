@@ -115,7 +115,8 @@ CELLS: dict[str, dict[str, str]] = {
         "share": f"{_SSO}test_sessions.py::test_a_person_and_all_people_have_a_quota_of_sessions"
         f" {_SSO}test_sign_on.py::test_a_flood_of_sign_ons_ends_only_its_own",
         "binding": f"{_SSO}test_sign_on.py::test_a_state_is_good_once_here_and_for_ten_minutes",
-        "failure": f"{_SSO}test_sign_on.py::test_the_last_keys_serve_while_the_provider_gives_none_but_not_for_ever",
+        "failure": f"{_SSO}test_sign_on.py::test_the_last_keys_serve_while_the_provider_gives_none_but_not_for_ever"
+        f" {_SSO}test_sign_on.py::test_a_provider_that_does_not_answer_is_asked_seldom",
     },
     "door's port": {
         "block": f"{_DOORS}test_process.py::test_a_blocked_host_is_not_served",
