@@ -44,7 +44,8 @@ class ReportPage:
         numbers = {one.title: number for number, one in enumerate(sections, start=1)}
         answers = [(*row, numbers.get(title, "none")) for *row, title in self._answers()]
         parts = [head(_TITLE), f"<h1>{_TITLE}</h1>\n"]
-        parts += section("About this report", (), _facts(self._report, _time))
+        facts = [(Unbroken(name), value) for name, value in _facts(self._report, _time)]
+        parts += section("About this report", (), facts)
         parts += section("Answers", ("question", "answer", "section"), answers)
         for one in sections:
             parts += section(f"{numbers[one.title]}. {one.title}", one.columns, one.rows, one.empty)
@@ -125,9 +126,9 @@ class ReportPage:
     def _row(self, row: Intervention) -> Cells:
         before, after = (_value(row, which, self._in_words) for which in ("before", "after"))
         return (
-            *self._name(row.appliance), _cell(row.time_utc), row.event,
+            *self._name(row.appliance), _cell(row.time_utc), _short(row.event),
             _short(_host(row.what, row.names, self._in_words)),
-            before, after, _author(row, self._in_words), row.reason, f"{row.sequence}",
+            before, after, _short(_author(row, self._in_words)), row.reason, f"{row.sequence}",
         )  # fmt: skip
 
     def _diff(self, row: Intervention) -> str:
@@ -136,7 +137,7 @@ class ReportPage:
             return ""
         name = f"{row.appliance}, " if row.appliance else ""
         hashes = (
-            f" SHA-256 before: {row.sha256_before or 'unknown'}; after: {row.sha256_after}."
+            f" SHA-256 before: {row.sha256_before or 'none known'}; after: {row.sha256_after}."
             if row.sha256_after
             else ""
         )

@@ -74,26 +74,31 @@ def rights(
 ) -> Iterator[MachineRight]:
     """Yield each right to act on the machine, or to change its safety settings."""
     usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
-    admins, operators = (
-        ", ".join(sorted({token.name for token in usable if token.role == role})) or "no token"
-        for role in ("admin", "operator")
-    )
+
+    def holders(*roles: str) -> str:
+        return ", ".join(sorted({token.name for token in usable if token.role in roles})) or "no token"
+
     keys = in_force.site_keys
     signed = f", signed by one of {counted(len(keys), 'site key')}" if keys else ""
     yield MachineRight(what="every order", who="root and the appliance's group", by="the appliance's machine")
     yield MachineRight(
-        what=f"change policies, monitors and guards{signed}", who=admins, by="token, role admin"
+        what=f"change policies, monitors and guards{signed}", who=holders("admin"), by="token, role admin"
     )
     yield MachineRight(
-        what="load policies and guards that exist already, set guards' values, switch monitors, approve", who=operators,
+        what="load policies and guards that exist already, set guards' values, switch monitors, approve",
+        who=holders("operator"),
         by="token, role operator",
     )  # fmt: skip
     sign_on = _sign_on(records)
     if "roles" in sign_on:
         claim = f"the claim {sign_on.get('roles_claim', '')} of {sign_on.get('issuer', '')}"
-        yield MachineRight(what="the same, by role", who=f"people with {sign_on['roles']}", by=claim)
+        yield MachineRight(
+            what="the rights of the roles admin and operator, over single sign-on",
+            who=f"people with {sign_on['roles']}",
+            by=claim,
+        )
     yield MachineRight(
-        what=f"{_STOP}: block a host, whose motions guards then stop", who=f"{admins}; {operators}",
+        what=f"{_STOP}: block a host, whose motions guards then stop", who=holders("admin", "operator"),
         by="token, role admin or operator",
     )  # fmt: skip
     yield from _ends(policy)
