@@ -131,6 +131,8 @@ class Person:
     y: float
     speed: float
     begins: int
+    leaves: float = math.inf
+    """When the person turns back, in ms."""
     before: Point = (0.0, 0.0)
     """The place a step ago."""
     in_way: bool = False
@@ -251,12 +253,13 @@ class SeparationWorld(DrivenWorld):
             found[found < self.near] = self.near
             data, valid = self.scan(found)
             arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
-            self.after(arrived, lambda: self.arrive(data, valid))
+            whole = self.fault != "cut"
+            self.after(arrived, lambda: self.arrive(data, valid, whole=whole))
 
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
-    def arrive(self, data: bytes, valid: "bool | None") -> None:
-        self.say("by", data, 5, whole=self.fault != "cut")
+    def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
+        self.say("by", data, 5, whole=whole)
         self.measured(valid=valid)
 
     def _fail(self) -> None:
@@ -305,7 +308,10 @@ class SeparationWorld(DrivenWorld):
         self.base.move(until)
         for one in self.persons:
             away = math.dist((one.x, one.y), (self.base.x, self.base.y))
-            if until > one.begins and away > self.radius + PERSON_RADIUS:
+            if until > one.leaves and away > 0:
+                one.x -= (self.base.x - one.x) / away * one.speed * seconds
+                one.y -= (self.base.y - one.y) / away * one.speed * seconds
+            elif until > one.begins and away > self.radius + PERSON_RADIUS:
                 way = min(one.speed * seconds, away - self.radius - PERSON_RADIUS)
                 one.x += (self.base.x - one.x) / away * way
                 one.y += (self.base.y - one.y) / away * way
@@ -468,12 +474,13 @@ class FenceWorld(DrivenWorld):
                 None if self.fault.endswith("heading") else not self.fault
             )  # far from the edge it needs none
             arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
-            self.after(arrived, lambda: self.arrive(data, valid))
+            whole = self.fault != "cut"
+            self.after(arrived, lambda: self.arrive(data, valid, whole=whole))
 
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
-    def arrive(self, data: bytes, valid: "bool | None") -> None:
-        self.say("by", data, 5, whole=self.fault != "cut")
+    def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
+        self.say("by", data, 5, whole=whole)
         self.measured(valid=valid)
 
     def _fail(self) -> None:

@@ -652,6 +652,9 @@ class EstopWorld(World):
     """Stop buttons and resets of several nodes: ISO 13850 (stop and reset), ISO 13851 (two hands)."""
 
     preset: ClassVar[str] = "estop"
+    not_yet: ClassVar[Mapping[str, str]] = {
+        "a press while it is disabled": "it is not known until the button sends again"
+    }
     span = 8000
 
     def plan(self) -> None:
@@ -699,10 +702,11 @@ class EstopWorld(World):
         self.every(lambda: period * r.uniform(0.8, 1.2), send, first=r.uniform(0, 100))
 
     def _press(self, node: int, on: bool) -> None:
-        button = self.stops.setdefault(node, Button())
-        button.on, button.heard = on, self.now
-        if on:
-            self._latch()
+        if not self.switched_off:
+            button = self.stops.setdefault(node, Button())
+            button.on, button.heard = on, self.now
+            if on:
+                self._latch()
         self.say("stop", boolean(on), node)
         if on and not self.switched_off and self.moves(self.force[1]):
             self.broken("L3", "a press does not stop the base at once")
@@ -719,9 +723,14 @@ class EstopWorld(World):
             [] if self.live else sorted(r.uniform(1600, 7000) for _change in range(r.choice((0, 2, 2, 3, 4))))
         )
         on = False
-        for at in changes:
-            on = not on
-            self.after(at, lambda on=on: self._press(node, on))  # type: ignore[misc]  # bound now
+
+        def change(to: bool) -> None:
+            nonlocal on
+            on = to
+            self._press(node, on)
+
+        for number, at in enumerate(changes):
+            self.after(at, lambda to=number % 2 == 0: change(to))  # type: ignore[misc]  # bound now
         dies = self.span + 1 if self.live or r.random() < 0.7 else r.uniform(500, 7000)
         begins = 1 if self.live or r.random() < 0.7 else r.uniform(100, 1500)
         self.after(begins, lambda: self._press(node, False))
@@ -729,7 +738,7 @@ class EstopWorld(World):
             period = (self.silent or 0.5) * 400
 
             def repeat() -> None:
-                self._press(node, node in self.stops and self.stops[node].on)
+                self._press(node, on)
 
             self.every(
                 lambda: -1 if self.now > dies else period * r.uniform(0.5, 1), repeat, first=begins + 2
@@ -738,7 +747,8 @@ class EstopWorld(World):
     def _reset(self, node: int, on: bool) -> None:
         button = self.resets.setdefault(node, Button())
         edge = on and not button.on and button.heard != NEVER
-        button.on, button.heard = on, self.now
+        if not self.switched_off:
+            button.on, button.heard = on, self.now
         if (
             edge
             and self.needs_reset
@@ -847,11 +857,6 @@ class EstopWorld(World):
         for one, button in self.stops.items():
             if self.silent and self.now > button.heard + self.silent * 1000 + 100 + SLACK:
                 self.broken("L4", f"a motion stays in force while the button of node {one} is silent")
-
-    def enable_guard(self) -> None:
-        super().enable_guard()
-        if self._pressed():
-            self._latch()
 
     def ended(self) -> None:
         if self.live and not self.moves(self.force[1]):

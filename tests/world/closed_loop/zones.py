@@ -89,11 +89,10 @@ class ZoneWorld(SeparationWorld):
             self.walls.append((x - length * sin, y + length * cos, x + length * sin, y - length * cos))
         for _person in range(r.choice((0, 1, 2)) if self.speed else 0):
             away, angle = 1.45 * self.half + r.uniform(0.3, 5), r.uniform(-math.pi, math.pi)
-            self.persons.append(
-                Person(
-                    away * math.cos(angle), away * math.sin(angle), r.choice((0.5, 1.6)), r.randrange(4000)
-                )
-            )
+            begins = r.randrange(4000)
+            leaves = begins + r.uniform(500, 4000) if r.random() < 0.6 else math.inf
+            speed = r.choice((0.5, 1.6))
+            self.persons.append(Person(away * math.cos(angle), away * math.sin(angle), speed, begins, leaves))
 
     def scanner(self, period: float, delay: float) -> None:
         super().scanner(period, delay)
@@ -137,14 +136,14 @@ class ZoneWorld(SeparationWorld):
         occupied, (data, valid) = self.scan_occupied, super().scan(found)
         return data + bytes([occupied]), valid
 
-    def arrive(self, data: bytes, valid: "bool | None") -> None:
+    def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         occupied = bool(data[-1]) and bool(valid)
         self.occupied = occupied
         if occupied:
             self.occupied_at = self.now
         if occupied and not self.muted:
             self.ready.clear()
-        super().arrive(data[:-1], valid)
+        super().arrive(data[:-1], valid, whole=whole)
         if (
             occupied
             and not self.switched_off
@@ -160,8 +159,18 @@ class ZoneWorld(SeparationWorld):
     def _law(self) -> str:
         return "L6" if self.muted_until > NEVER else self.law("L3")
 
+    def _receive(self, at: int, topic: str, data: bytes) -> None:
+        """Take a message of the guard. After a stop, for any reason, each node stands before it moves."""
+        moved = self._fast(self.force[1])
+        super()._receive(at, topic, data)
+        alone = self.beside is None and not self.guard.holds and at > self.fresh_from + 100 + SLACK
+        if alone and moved and not self._fast(self.force[1]):
+            self.ready.clear()
+
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
-        if not self.moves(wanted) and not self.occupied:
+        if self.now > self.heard + self.silent * 1000 and not self.muted and not self.guard.holds:
+            self.ready.clear()
+        elif not self.moves(wanted) and not self.occupied:
             self.ready.add(node)
         if self.muted or self.guard.holds:
             return
@@ -172,7 +181,7 @@ class ZoneWorld(SeparationWorld):
                 self._law(), f"a motion passes, though something was in the zone at {self.occupied_at} ms"
             )
         if node not in self.ready and not self.slow:
-            self.broken("L6", "a motion passes of a node that has not stood since something was in the zone")
+            self.broken("L6", "a motion passes of a node that has not stood since the last stop")
 
     def enable_guard(self) -> None:
         super().enable_guard()
