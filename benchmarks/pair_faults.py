@@ -30,9 +30,9 @@ from rich.table import Table
 
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.features.standby import requests as standby_requests
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.membership import load_membership, path_of, save_membership
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_summary import standby_troubles
+from appliance.features.standby.summary import standby_troubles
 from benchmarks.pair_fault_kinds import Fault, drawn
 from benchmarks.standby import Successes, Watch, busy
 from examples.landshark.lab import Lab

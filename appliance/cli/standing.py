@@ -4,6 +4,8 @@
    seconds. All commands and all odometry count.
 2. Silence is not standing: without a commanded zero, or while odometry is silent, the robot is not known to stand.
 3. The wait has an end, with a reason.
+4. Motions that no such topic reports are not seen: an arm, a base with other messages, and without odometry the real
+   speed. The answer names it.
 """
 
 import asyncio
@@ -11,10 +13,21 @@ import functools
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from appliance.base import clock
 from appliance.base.counted import counted
+from appliance.cli.connection.admin_client import AdminSocket
+from appliance.cli.connection.target import Appliance
+from appliance.cli.output import usage_error
+from appliance.configuration.settings import load_resolved
+from appliance.network.interfaces import addresses_by_interface
+from appliance.network.namespaces import Namespace
 from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph, MasterReader, MasterReadError
+from rosmop.tool.terminal import printable, refused, say
 from roswire.definitions import Definitions
 from roswire.errors import RosError
 from roswire.message_view import read_fields
@@ -28,15 +41,31 @@ from roswire.uris import parse_node_uri
 
 STILL_SECONDS = 3.0
 _NAME = "/rosrv_standing"
+_LINK = "veth-rosrv"
 _SPEED = 0.01  # m/s, rad/s
 _LOOK_SECONDS = 0.2
 _MOST = 16  # topics of each kind
+_SHOWN = 3
+WITHIN = 120.0
+"""The seconds that a verb waits unless the operator says otherwise."""
 _COMMANDS: Mapping[str, tuple[str, ...]] = {
     "geometry_msgs/Twist": (),
     "geometry_msgs/TwistStamped": ("twist",),
 }
 _ODOMETRY: Mapping[str, tuple[str, ...]] = {"nav_msgs/Odometry": ("twist", "twist")}
 """The fields above the twist, by the type of the topic."""
+_OTHER_COMMANDS = ("ackermann_msgs/", "control_msgs/", "mavros_msgs/", "std_msgs/Float64", "trajectory_msgs/")
+"""The beginnings of types that command a motion in a way that is not read here."""
+
+WhenStanding = Annotated[
+    bool,
+    typer.Option(
+        "--when-standing", help="Wait until the robot was commanded to stand and its odometry is zero"
+    ),
+]
+Within = Annotated[
+    float, typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds that --when-standing waits")
+]
 
 
 class NotStandingError(Exception):
@@ -80,9 +109,40 @@ class StandingJudge:
         return f"it stands for less than {self.seconds:g} s" if left > 0 else ""
 
 
-async def wait_until_standing(master: str, longest: float, source: str = "127.0.0.1") -> str:
-    """Wait until the robot at this master stands; return the signs of it. Raises `NotStandingError` after `longest` s.
+def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
+    """Wait until the robot of the appliance on this machine stands, and say its signs; else exit with status 1."""
+    if not isinstance(appliance.way, AdminSocket):
+        raise usage_error(
+            "--when-standing listens to the robot's topics: run it on the appliance's machine", verb
+        )
+    try:
+        master, source = _master_of(appliance.way.state)
+        said = asyncio.run(wait_until_standing(master, within, source))
+    except NotStandingError as error:
+        raise refused([printable(f"{verb}: {error}. Nothing was changed")]) from None
+    if not appliance.as_json:
+        say(printable(said))
 
+
+def _master_of(state: Path) -> tuple[str, str]:
+    """Return the URI of RVMaster, and an address of this machine that the robot's nodes reach."""
+    try:
+        settings = load_resolved(state / "run" / "config.json")
+    except (OSError, ValueError) as error:
+        raise NotStandingError(f"no appliance has run in {state}: {error}") from None
+    return f"http://127.0.0.1:{settings.listen_address[1]}", link_address() or "127.0.0.1"
+
+
+def link_address() -> str:
+    """Return the machine's address on the appliance's link; empty while no appliance with such a link runs."""
+    held = addresses_by_interface(Namespace.own()).get(_LINK, [])
+    return next((text.partition("/")[0] for text in held if "." in text), "")
+
+
+async def wait_until_standing(master: str, longest: float, source: str = "127.0.0.1") -> str:
+    """Wait until the robot at this master stands; return the signs of it, and what is not seen.
+
+    Raises `NotStandingError`, at the latest after `longest` s.
     `source` is an address of this machine that the robot's nodes reach.
     """
     try:
@@ -107,12 +167,34 @@ async def wait_until_standing(master: str, longest: float, source: str = "127.0.
     finally:
         await node.close()
     seen = f" and {counted(len(odometry), 'odometry topic')}" if odometry else ""
-    return f"the robot stands: zero for {judge.seconds:g} s on {', '.join(commands)}{seen}"
+    stands = f"the robot stands: zero for {judge.seconds:g} s on {', '.join(commands)}{seen}"
+    return f"{stands}. Not seen: {unseen(graph)}"
+
+
+def unseen(graph: MasterGraph) -> str:
+    """Return in words what the topics of a graph do not tell about motions."""
+    parts = (
+        []
+        if _topics(graph, _ODOMETRY, PUBLICATION)
+        else ["the real speed, because no node publishes odometry"]
+    )
+    used = {resource for kind, resource, _name in graph.entries if kind == SUBSCRIPTION}
+    others = sorted(topic for topic in used if graph.types.get(topic, "").startswith(_OTHER_COMMANDS))
+    if others:
+        more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
+        parts.append(f"what {', '.join(others[:_SHOWN])}{more} may move")
+    parts.append("motions that no topic commands")
+    return "; ".join(parts)
 
 
 def _topics(graph: MasterGraph, kinds: Collection[str], end: str) -> list[str]:
     used = {resource for kind, resource, _name in graph.entries if kind == end}
-    return sorted(topic for topic in used if graph.types.get(topic) in kinds)[:_MOST]
+    found = sorted(topic for topic in used if graph.types.get(topic) in kinds)
+    if len(found) > _MOST:
+        raise NotStandingError(
+            f"{counted(len(found), 'topic')} of a base are more than can be heard ({_MOST})"
+        )
+    return found
 
 
 def _listener(judge: StandingJudge, topic: str, kind: str) -> Received:

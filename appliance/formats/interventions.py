@@ -241,7 +241,7 @@ class Interventions:
             appliance=appliance, subject=SUBJECT_OF[record.event], event=record.event, what=what,
             who=str(detail.get("who") or ""), origin="", reason=record.reason, before=before, after=after,
             sha256_before=sha256_before, sha256_after=sha256_after,
-            diff=[*map(str, detail.get("diff") or ()), *self._changed_settings(detail, appliance)],
+            diff=[*_changed_lines(change, detail), *self._changed_settings(detail, appliance)],
             names={address: self.hosts[address] for address in sorted(addresses)},
         )  # fmt: skip
         settings = detail.get("settings")
@@ -287,6 +287,12 @@ def _changed_values(section: str, before: _Detail, after: _Detail) -> Iterator[s
         if before.get(name) != after.get(name):
             yield f"-{section}.{name}: {before.get(name, 'the default')}"
             yield f"+{section}.{name}: {after.get(name, 'the default')}"
+
+
+def _changed_lines(change: StateChange, detail: _Detail) -> Iterator[str]:
+    yield from map(str, detail.get("diff") or ())
+    if change.text_after and "diff" not in detail and "cut" in detail:
+        yield "(too many changed lines for the record: compare the texts of both SHA-256)"
 
 
 def _filled(text: str, detail: _Detail) -> str:

@@ -134,6 +134,14 @@ class _Order:
     warnings: Sequence[str] = ()
 
 
+class _Checks(NamedTuple):
+    """The checks of an order, of a start, and of a dry run."""
+
+    order: CheckBeside
+    at_start: Check
+    dry_run: CheckBeside
+
+
 class SpecificationManager(Revisions[MonitorRevisionRow]):
     """The specifications in force.
 
@@ -171,12 +179,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         `live()` returns the topics published now.
         """
         super().__init__(store, ends, store.monitor_revisions, store.save_monitor_revision, NOTHING)
-        self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
-        self._check = check
-        self._check_at_start = check_at_start
-        self._try_out = try_out
+        self._checks = _Checks(check, check_at_start, try_out)
         self._live = live
         self._trail = trail
         self.now = InForce(switches=Switches(enable))
@@ -213,7 +218,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         sources, checked, refused = await specifications_at_start(
             last,
             self._folder,
-            self._check_at_start,
+            self._checks.at_start,
             self.site_keys,
             named=named,
             kept=self.in_force if self.revision else None,
@@ -243,6 +248,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- queries ---
 
     @property
+    def folder(self) -> Path | None:
+        return self._folder.path
+
+    @property
     def sources(self) -> Sources:
         return self.now.sources
 
@@ -264,7 +273,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @property
     def differs_from_folder(self) -> bool:
-        return self.folder is not None and not self._is_folder(self.sources)
+        return self._folder.path is not None and not self._is_folder(self.sources)
 
     def names(self) -> list[str]:
         return list(self.checked.monitors)
@@ -314,7 +323,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 who, request.note or "loaded", request.confirm_within, _Consent(request.force, request.hold),
                 loaded=files,
             )  # fmt: skip
-            check = partial(self._beside_broken, self._check, loaded=files)
+            check = partial(self._beside_broken, self._checks.order, loaded=files)
             return await self._change(Wanted(sources, shadow, enabled, topics, constants), check, order)
 
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
@@ -330,7 +339,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             topics, constants = split(request.given)
             new = Sources(request.files, request.definitions, request.signatures, topics)
             following = present.with_files(new)
-            checked = await self._beside_broken(self._try_out, following, request.files)
+            checked = await self._beside_broken(self._checks.dry_run, following, request.files)
             in_force.constants_of(
                 Wanted(following, topics=topics, constants=constants), checked, signed=bool(self.site_keys)
             )
@@ -360,7 +369,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
         """Load the folder; files that are not in it stay in force, unless `prune` is set."""
         async with self._changing(request.expected):
-            if self.folder is None:
+            if self._folder.path is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
             sources = sources.with_topics(self.sources.topics)
@@ -411,7 +420,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             keeper, within = who, request.confirm_within
             if within is None and self._is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
-            check = partial(self._beside_broken, self._check)
+            check = partial(self._beside_broken, self._checks.order)
             return await self._change(Wanted(sources), check, _Order(who, note, within, author=keeper))
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
@@ -697,7 +706,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- internals ---
 
     def _is_folder(self, sources: Sources) -> bool:
-        found = self._folder.looked_at() if self.folder is not None else None
+        found = self._folder.looked_at() if self._folder.path is not None else None
         return found is not None and found.with_topics(sources.topics) == sources
 
     async def _kept(self) -> list[MonitorRevisionRow]:
@@ -787,10 +796,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
 
     async def _strictly(self, sources: Sources) -> CheckedSpecifications:
-        return await self._check(sources, self.site_keys, ())
+        return await self._checks.order(sources, self.site_keys, ())
 
     async def _as_at_start(self, sources: Sources, known: Sequence[str] | None) -> CheckedSpecifications:
-        return await self._check_at_start(sources, self.site_keys, known)
+        return await self._checks.at_start(sources, self.site_keys, known)
 
     def _broken(self) -> dict[str, str]:
         unbuilt = {self.checked.monitors[name]: error for name, error in self.checked.unbuilt.items()}

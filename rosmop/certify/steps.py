@@ -164,7 +164,7 @@ class _Bench:
         self._memory, self._cells, self._feed, self._topic = machine.memory, cells, feed, topic
         self._machine, self._name = machine, name
         self._try = machine.function(f"try {feed.name}")
-        self._frames, self._effects = module.frames, module.effects
+        self._frames = module.frames
         self._functions, self._nothing = module.functions, bytes(4 * module.functions)
         template = self._frames + SCRIPT + 4 * self._functions
         self._template = template + -template % 8

@@ -22,7 +22,7 @@ from typing import Any
 from rosmop.form import nodes
 from rosmop.form.sites import Site
 from rosmop.runtime import formatting, numbers, safe_messages, strings, times, vectors, wire
-from rosmop.runtime.action_context import MAX_CALLS, Context, FaultError, Turn
+from rosmop.runtime.action_context import MAX_CALLS, ActionState, Context, FaultError
 from rosmop.runtime.builtin_functions import CHARGING, FAULTING, FUNCTIONS
 from rosmop.runtime.values import BILLION, ValueCodec, struct_code, struct_size
 from rosmop.types import value_types
@@ -83,7 +83,7 @@ class Interpreter:
         messages: MessageTypes,
     ) -> None:
         self.sites = sites
-        self.turn = Turn()
+        self.turn = ActionState()
         self.variables: dict[str, Any] = {}
         self.failed = LastFailure()
         self._values = ValueCodec(messages, self.turn.check)

@@ -1,7 +1,7 @@
 """Bound a specification's actions, and collect their output.
 
 1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, long copies
-and reads of many elements are charged before they run. With `Turn.limit`, processor time is read every `STEP`
+and reads of many elements are charged before they run. With `ActionState.limit`, processor time is read every `STEP`
 instructions and every `PART` elements.
 2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes, after which `allocate` measures the
 live values.
@@ -72,7 +72,7 @@ class Published(NamedTuple):
 
 
 @dataclass(slots=True)
-class Turn:
+class ActionState:
     """The state that all actions of one message or tick share."""
 
     now: int = 0
@@ -139,7 +139,7 @@ class Context:
     def __init__(
         self,
         monitor: str,
-        turn: Turn,
+        turn: ActionState,
         measures: Mapping[str, Measure],
         live: Callable[[], Sequence[Mapping[str, object]]],
     ) -> None:

@@ -274,7 +274,7 @@ WALL_CLOCK = {
         "features/standby/second_join.py", "cli/status_watch.py", "features/fleet/connection.py",
         "control/assembly/host_blocks.py", "features/standby/passive.py", "cli/connection/audit_file.py",
         "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",
-        "features/recorder/recording_orders.py",
+        "features/recorder/orders.py",
         "features/evidence/bundle.py",
         "features/doors/client_counts.py", "features/guards/guard_orders.py",
         "features/doors/door_node.py", "features/doors/door_table.py", "features/doors/door_tickets.py",
@@ -288,7 +288,7 @@ WALL_CLOCK = {
     ],
     "the date of an end of `EndTable`, for people and for the api": [
         "api/front/access.py", "control/operators/handled_alarms.py", "control/operators/token_orders.py",
-        "features/blocks/block_orders.py", "features/blocks/block_verbs.py",
+        "features/blocks/orders.py", "features/blocks/verbs.py",
         "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
         "features/standby/passive_rest.py",
     ],
@@ -310,11 +310,11 @@ WALL_CLOCK = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
-        "features/evidence/evidence_verbs.py", "features/logbook/report_verb.py", "features/logbook/who_drove_verb.py",
-        "features/monitor_tools/offline.py", "features/policy_tools/policy_input.py",
+        "features/evidence/verbs.py", "features/logbook/report_verb.py", "features/logbook/who_drove_verb.py",
+        "features/monitor_tools/reset_verb.py", "features/policy_tools/policy_input.py",
         "features/tunnels/protect_verb.py",
         "base/timestamps.py",
-        "features/topics/topic_verbs.py", "features/recorder/replay_input.py", "features/recorder/record_verbs.py",
+        "features/topics/verbs.py", "features/recorder/replay_input.py", "features/recorder/verbs.py",
     ],
 }  # fmt: skip
 """Files that may read the wall clock, by purpose. Add a file only if it has one of these purposes."""

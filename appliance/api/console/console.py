@@ -131,7 +131,7 @@ def views() -> tuple[str, ...]:
 
 
 def _parts(features: Iterable[Feature]) -> str:
-    """Return the module of the features' components. Those of a page of their own are loaded when it is opened."""
+    """Return the module of the features' components. A component with a page of its own is loaded with that page."""
     imports: list[str] = ['import { late } from "./parts/late.js";\n']
     rows: list[str] = []
     parts = ((feature.name, part) for feature in features for part in feature.console)

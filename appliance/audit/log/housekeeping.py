@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import sqlite3
 from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.log_writer import ChainWriter
@@ -41,6 +42,13 @@ def _settle(futures: list[Waiter], result: str | None) -> None:
             future.set_result(result)
 
 
+class _SealAfter(NamedTuple):
+    """A checkpoint is due after this number of records, or when the first one is this old in seconds."""
+
+    records: int
+    seconds: float
+
+
 class Housekeeping:
     """The background work of one log; `writer` returns None while the database is closed.
 
@@ -62,7 +70,7 @@ class Housekeeping:
     ) -> None:
         self._signatures = signatures
         self.remover = remover
-        self._records, self._seconds = records, seconds
+        self._seal_after = _SealAfter(records, seconds)
         self._writer = writer
         self._clock = clock
         self._now = now
@@ -95,7 +103,7 @@ class Housekeeping:
         if now < self._paused_until:
             return None
         writer, due = self._writer(), self.remover.due
-        return min(due, self._sealed_at + self._seconds) if writer and writer.unsealed else due
+        return min(due, self._sealed_at + self._seal_after.seconds) if writer and writer.unsealed else due
 
     # --- between two batches of records -----------------------------------------------------------------------
 
@@ -110,8 +118,8 @@ class Housekeeping:
     # --- checkpoints ------------------------------------------------------------------------------------------
 
     def _seal_if_due(self, writer: ChainWriter) -> None:
-        waited = self._now() - self._sealed_at >= self._seconds or bool(self._waiting)
-        if writer.unsealed >= self._records or (writer.unsealed and waited):
+        waited = self._now() - self._sealed_at >= self._seal_after.seconds or bool(self._waiting)
+        if writer.unsealed >= self._seal_after.records or (writer.unsealed and waited):
             self.seal(writer)
         if self._waiting:
             number = writer.checkpoint_number

@@ -15,7 +15,14 @@ from appliance.channel.admin import PolicyReload
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_here
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.standing import NotStandingError, wait_until_standing
+from appliance.cli.standing import (
+    WITHIN,
+    NotStandingError,
+    WhenStanding,
+    Within,
+    link_address,
+    wait_until_standing,
+)
 from appliance.features.adopt.adopt_answers import AdoptState, TakeOverReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, check_lines
 from appliance.features.adopt.adopt_record import load_record, save_record
@@ -23,7 +30,6 @@ from appliance.features.adopt.machine_side import wanted_record
 from appliance.features.adopt.operator_orders import ADOPT, ordered
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus
 from appliance.features.adopt.robot_side import (
-    link_address,
     make_audit_only,
     robot_state,
     running_settings,
@@ -36,7 +42,6 @@ _VERB = "rosrv adopt"
 _START_SECONDS = 180.0
 _LOOK_SECONDS = 0.5
 _WAITS = "waits: "
-_STANDING_SECONDS = 120.0
 
 
 @speaks_here
@@ -54,16 +59,8 @@ def adopt(
             help="Deny nothing at first: needs a policy with `audit-only`, or the shipped policy, which gets it",
         ),
     ] = False,
-    when_standing: Annotated[
-        bool,
-        typer.Option(
-            "--when-standing", help="Wait until the robot was commanded to stand and its odometry is zero"
-        ),
-    ] = False,
-    within: Annotated[
-        float,
-        typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds that --when-standing waits"),
-    ] = _STANDING_SECONDS,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Take over the graph of a running robot from its own ROS master, without restarting a node. Needs root.
 

@@ -13,12 +13,12 @@ from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_here
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.standing import NotStandingError, wait_until_standing
+from appliance.cli.standing import WITHIN, NotStandingError, link_address, wait_until_standing
 from appliance.features.adopt.adopt_answers import GiveBackReport
 from appliance.features.adopt.dead_release import release_dead
 from appliance.features.adopt.operator_orders import RELEASE, ordered
 from appliance.features.adopt.requests import ReleaseOrder
-from appliance.features.adopt.robot_side import MASTER_PORT, link_address, remove_drop_ins, running_settings
+from appliance.features.adopt.robot_side import MASTER_PORT, remove_drop_ins, running_settings
 from appliance.network.namespaces import NetworkError
 from rosmop.tool.terminal import printable, say
 
@@ -45,7 +45,7 @@ def release(
     within: Annotated[
         float,
         typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds to wait until the robot stands"),
-    ] = 120.0,
+    ] = WITHIN,
 ) -> None:
     """Give the graph of an adopted robot back to its own ROS master, without restarting a node. Needs root.
 

@@ -13,6 +13,7 @@ import structlog
 
 from appliance.base.atomic_files import write_whole
 from appliance.base.shipped import SHIPPED
+from appliance.cli.standing import link_address
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.features.adopt.adopt_check import CheckedRobot, sockets_of
 from appliance.features.adopt.adopt_record import AdoptRecord, load_record
@@ -35,7 +36,6 @@ _UNITS = Path("/etc/systemd/system")
 _RUNNING = Path("/run/systemd/system")
 _NFT = "/usr/sbin/nft"
 _SECONDS = 20.0
-_LINK = "veth-rosrv"
 
 log = structlog.get_logger()
 
@@ -65,12 +65,6 @@ def robot_state(state: Path, settings: Settings | None, *, seconds: float = 20.0
         policy=_policy(settings, link, own),
         robot=ip_address(link),
     )
-
-
-def link_address() -> str:
-    """Return the machine's address on the appliance's link; empty while the appliance does not run."""
-    held = interfaces.addresses_by_interface(Namespace.own()).get(_LINK, [])
-    return next((text.partition("/")[0] for text in held if "." in text), "")
 
 
 def _inventory(port: int, seconds: float) -> GraphInventory | None:

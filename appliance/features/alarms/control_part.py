@@ -2,7 +2,7 @@
 
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.alarms.alarm_orders import AlarmOrders
+from appliance.features.alarms.orders import AlarmOrders
 from appliance.features.alarms.requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 
 

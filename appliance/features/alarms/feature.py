@@ -3,7 +3,7 @@
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import Feature
 
-_VERBS = "appliance.features.alarms.alarm_verbs"
+_VERBS = "appliance.features.alarms.verbs"
 
 
 FEATURE = Feature(

@@ -6,10 +6,10 @@ from appliance.control.core import ControlPart, Core
 from appliance.control.motion_stop import MotionStop
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.approvals import requests
-from appliance.features.approvals.approval_orders import ApprovalOrders
 from appliance.features.approvals.feature import HOOK
 from appliance.features.approvals.hook import WebHook, with_hook
 from appliance.features.approvals.hook_link import HookLink
+from appliance.features.approvals.orders import ApprovalOrders
 from appliance.features.approvals.settings import ApprovalHook
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy

@@ -50,10 +50,10 @@ FEATURE = Feature(
         ConsolePart("robot", "panel.js", "Approvals", order=3),
     ),
     verbs={
-        "approve": Verb(f"{_PLACE}approval_verbs:approve", after="drive"),
+        "approve": Verb(f"{_PLACE}verbs:approve", after="drive"),
         "approval": Group(
             "Refuse a call that waits for an approval, or end an approval.",
-            {"refuse": Verb(f"{_PLACE}approval_verbs:refuse")},
+            {"refuse": Verb(f"{_PLACE}verbs:refuse")},
             after="approve",
         ),
     },

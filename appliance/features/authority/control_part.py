@@ -4,7 +4,7 @@ from appliance.control.core import ControlPart, Core
 from appliance.control.motion_stop import MotionStop
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.authority import requests
-from appliance.features.authority.drive_orders import DriveOrders
+from appliance.features.authority.orders import DriveOrders
 from appliance.features.authority.ranked_groups import RankedGroups
 from appliance.features.authority.settings import GIVE, TAKE
 

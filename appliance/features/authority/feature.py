@@ -18,12 +18,12 @@ FEATURE = Feature(
         "drive": Group(
             "Say which host may drive: one at a time holds each group of [Authority].",
             {
-                "status": Verb(f"{_PLACE}drive_verbs:status"),
-                "assign": Verb(f"{_PLACE}drive_verbs:assign"),
-                "free": Verb(f"{_PLACE}drive_verbs:free"),
-                "ask": Verb(f"{_PLACE}drive_verbs:ask"),
-                "take": Verb(f"{_PLACE}drive_verbs:assign", now="drive assign"),
-                "give": Verb(f"{_PLACE}drive_verbs:free", now="drive free"),
+                "status": Verb(f"{_PLACE}verbs:status"),
+                "assign": Verb(f"{_PLACE}verbs:assign"),
+                "free": Verb(f"{_PLACE}verbs:free"),
+                "ask": Verb(f"{_PLACE}verbs:ask"),
+                "take": Verb(f"{_PLACE}verbs:assign", now="drive assign"),
+                "give": Verb(f"{_PLACE}verbs:free", now="drive free"),
             },
             after="guard",
         )

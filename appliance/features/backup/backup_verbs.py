@@ -11,7 +11,7 @@ from appliance.backup.create import back_up
 from appliance.base.counted import counted
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.state_confirmation import Confirm, confirm_state
+from appliance.cli.typed_confirmation import Confirm, confirm_state
 from appliance.features.backup.purge import purge as remove
 from appliance.features.backup.restore import restore as put_back
 from rosmop.tool.terminal import printable, refused, say

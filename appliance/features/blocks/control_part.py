@@ -2,7 +2,7 @@
 
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.blocks.block_orders import BlockOrders
+from appliance.features.blocks.orders import BlockOrders
 from appliance.features.blocks.requests import HostBlock, HostBlocks, HostUnblock
 
 

@@ -12,9 +12,9 @@ FEATURE = Feature(
         "host": Group(
             "Block hosts; enrol, list and revoke hosts that connect through IPsec tunnels.",
             {
-                "block": Verb(f"{_PLACE}block_verbs:block"),
-                "blocks": Verb(f"{_PLACE}block_verbs:list_blocks"),
-                "unblock": Verb(f"{_PLACE}block_verbs:unblock"),
+                "block": Verb(f"{_PLACE}verbs:block"),
+                "blocks": Verb(f"{_PLACE}verbs:list_blocks"),
+                "unblock": Verb(f"{_PLACE}verbs:unblock"),
             },
             after="config",
         )

@@ -7,7 +7,7 @@ from appliance.features.feature import ConsolePart, Feature
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
-_VERBS = "appliance.features.doors.door_verbs"
+_VERBS = "appliance.features.doors.verbs"
 _PART = "appliance.features.doors.control_part"
 
 

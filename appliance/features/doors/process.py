@@ -28,10 +28,10 @@ from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
-from appliance.features.doors.given_network import GivenNetwork
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.node_hosts import NodeHosts
+from appliance.features.doors.passed_sockets import PassedSockets
 from appliance.features.doors.quotas import DOOR_TOPICS
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
@@ -99,7 +99,7 @@ class DoorProcess:
             took=self._took,
         )
         self._given: door_link.DoorGiven | None = None
-        self._network: GivenNetwork | None = None
+        self._network: PassedSockets | None = None
         self._hosts = NodeHosts(self._child.tell)
         self._types = KnownTypes(standard_definitions(), ValueLimits())
         self._door: _Door | None = None
@@ -148,7 +148,7 @@ class DoorProcess:
                 if self._given is None:
                     limits = ConnectionLimits(message.connections, message.in_ten_seconds)
                     self._connections = DoorConnections(limits)
-                    self._network = GivenNetwork(message.address, self._child.tell)
+                    self._network = PassedSockets(message.address, self._child.tell)
                     self._tasks.start(self._start(message, self._network))
                 elif self._given.added != message.added:  # the slot has another door now
                     self._end_door()
@@ -215,7 +215,7 @@ class DoorProcess:
 
     # --- the node ---
 
-    async def _start(self, given: door_link.DoorGiven, network: GivenNetwork) -> None:
+    async def _start(self, given: door_link.DoorGiven, network: PassedSockets) -> None:
         name = node_name(given.name)
         memory = DoorMemory(given.connections)
         waiting, calls = memory.client("the door's messages"), memory.client("the door")

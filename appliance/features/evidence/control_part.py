@@ -2,7 +2,7 @@
 
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.evidence.evidence_orders import EvidenceOrders
+from appliance.features.evidence.orders import EvidenceOrders
 from appliance.features.evidence.requests import EvidenceExported, LogSealed
 
 

@@ -8,7 +8,7 @@ from appliance.supervisor.role import Facts, RemoteReceiver, Role
 from appliance.supervisor.sandbox.folders import folders_of
 from appliance.supervisor.sandbox.sandbox_plan import ROUTES, SandboxPlan
 
-_VERBS = "appliance.features.fleet.fleet_verbs"
+_VERBS = "appliance.features.fleet.verbs"
 
 
 def _receiver(client: str, sections: Sections) -> RemoteReceiver | None:

@@ -18,6 +18,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.guards.guard_answers import GuardList, GuardRow, Suggestion
 from appliance.features.guards.guard_facts import preset_row, values_of
 from appliance.features.guards.presets import (
@@ -293,6 +294,8 @@ def upgrade(
         ),
     ] = None,
     confirm_within: ConfirmWithin = None,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
     hold: _Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
@@ -313,14 +316,16 @@ def upgrade(
             say("no guard has an older version")
     else:
         names = [name]
-    within, refused = seconds_within(confirm_within, "guard"), False
+    confirmed, refused = seconds_within(confirm_within, "guard"), False
     topics = _pairs(further, "--topic NAME=TOPIC")
+    if when_standing and names and not dry_run:
+        stand_or_exit(appliance, within, "rosrv guard")
     for each in names:
         try:
             if dry_run:
                 _plan(appliance, GuardTry(name=each, topics=topics, upgrade=True, hold=hold))
             else:
-                _upgrade(appliance, GuardUpgrade(each, topics, confirm_within=within, hold=hold))
+                _upgrade(appliance, GuardUpgrade(each, topics, confirm_within=confirmed, hold=hold))
         except typer.Exit as end:
             if end.exit_code != 1:
                 raise

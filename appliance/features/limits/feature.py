@@ -8,5 +8,5 @@ _PLACE = "appliance.features.limits."
 
 FEATURE = Feature(
     "limits",
-    verbs={"limits": Verb(f"{_PLACE}limits_verb:limits", after="status")},
+    verbs={"limits": Verb(f"{_PLACE}verb:limits", after="status")},
 )

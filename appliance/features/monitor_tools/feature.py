@@ -38,7 +38,7 @@ FEATURE = Tool(
                 "confirm": Verb(f"{_REVISIONS}:confirm", CONFIRM),
                 "resume": Verb(f"{_LIVE}:resume"),
                 "set": Verb(f"{_LIVE}:set_given"),
-                "reset": Verb(f"{_PLACE}offline:reset"),
+                "reset": Verb(f"{_PLACE}reset_verb:reset"),
                 "rvstate": Verb(f"{_LIVE}:rv_state", hidden=True),
             },
             after="policy",

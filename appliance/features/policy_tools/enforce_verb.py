@@ -15,6 +15,7 @@ from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, write_told
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.policy_tools.audit_only import EnforcedText, EnforceError, enforced
 from appliance.features.policy_tools.learn import Observation, needed_rights
 from appliance.features.policy_tools.live_verbs import say_loaded
@@ -76,6 +77,8 @@ def enforce(
         Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
     ] = None,
     confirm_within: ConfirmWithin = None,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Enforce sections of the policy in force that are `audit-only`, after a comparison with the recorded requests.
 
@@ -85,7 +88,7 @@ def enforce(
 
     Example: rosrv policy enforce Publishers --confirm-within 5m
     """
-    within = seconds_within(confirm_within, "policy")
+    confirmed = seconds_within(confirm_within, "policy")
     body = body_in_force(appliance)
     try:
         change = enforced(body.text, sections or ())
@@ -103,7 +106,9 @@ def enforce(
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
     if dry_run:
         raise typer.Exit(1 if found.denied or found.ended else 0)
-    _load(appliance, body, change, within, written=write)
+    if when_standing and not body.site_keys:
+        stand_or_exit(appliance, within, "rosrv policy")
+    _load(appliance, body, change, confirmed, written=write)
 
 
 def _compared(policy: Policy, period: RecordedPeriod, live: list[LiveRight]) -> _Comparison:

@@ -47,7 +47,7 @@ class DecidedRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class Grant:
+class GrantedText:
     """A changed text; `added` are the changed or new lines (none: the request was granted before)."""
 
     text: str
@@ -66,7 +66,7 @@ class Grant:
         return list(difflib.unified_diff(old, new, file, f"{file} (granted)", lineterm=""))
 
 
-def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
+def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> GrantedText:
     """Grant a request. Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy."""
     policy = known.compiled(text, file)
     word = _word(text, known, policy, asked.request.host)
@@ -90,7 +90,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
     if asked.takeover and policy.takeover != TAKEOVERS[-1]:
         text, line = _with_takeover(text)
         added.append(line)
-    return Grant(text, tuple(added))
+    return GrantedText(text, tuple(added))
 
 
 def _granted(policy: Policy, right: Right) -> bool:

@@ -7,8 +7,8 @@ from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.recorder import requests
 from appliance.features.recorder.feature import ROLE
+from appliance.features.recorder.orders import RecordingOrders
 from appliance.features.recorder.recorder_link import RecorderLink
-from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.settings import RecorderRules
 

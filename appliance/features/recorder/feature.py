@@ -8,7 +8,7 @@ from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
 ROLE = "recorder"
-_VERBS = "appliance.features.recorder.record_verbs"
+_VERBS = "appliance.features.recorder.verbs"
 
 
 FEATURE = Feature(

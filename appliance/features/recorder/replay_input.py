@@ -15,9 +15,9 @@ from appliance.cli.connection.target import Appliance
 from appliance.cli.monitor_program import MONITOR
 from appliance.cli.output import say_json
 from appliance.features.recorder import requests as recording_requests
-from appliance.features.recorder.record_verbs import bag_of
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Recordings
 from appliance.features.recorder.requests import RecordingsWanted
+from appliance.features.recorder.verbs import bag_of
 from rosmop.tool.monitor_output import BILLION
 from rosmop.tool.terminal import refused, say
 

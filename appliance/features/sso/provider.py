@@ -3,8 +3,11 @@
 1. A discovery document of another issuer is not used (OpenID Connect Discovery 1.0, 4.3).
 2. Keys are fetched for each ID token, so an added or withdrawn key counts at once. While the provider serves no keys,
    the last ones are used for `keys_seconds`.
+3. So are the endpoints, which are fetched each hour. A browser that begins to sign on causes that, so concurrent
+   calls share one fetch, and a failed one is not repeated for `_AGAIN_SECONDS`.
 """
 
+import asyncio
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -17,6 +20,7 @@ from appliance.features.sso.provider_connection import Exchange
 from appliance.features.sso.settings import origin_of
 
 _FRESH_SECONDS = 3600.0
+_AGAIN_SECONDS = 5.0
 _MOST_KEYS = 100
 _DISCOVERY = "/.well-known/openid-configuration"
 _OK = 200
@@ -42,27 +46,45 @@ class Provider:
         self._exchange = exchange
         self._keys_seconds = keys_seconds
         self._endpoints: tuple[float, ProviderEndpoints] | None = None
+        self._failure: tuple[float, str] | None = None  # of the last fetch of the endpoints
+        self._one_fetch = asyncio.Lock()
         self._keys: tuple[float, list[dict[str, Any]]] | None = None
 
     async def endpoints(self) -> ProviderEndpoints:
-        """Return the endpoints, at most an hour old."""
-        if self._endpoints is None or clock.now() - self._endpoints[0] >= _FRESH_SECONDS:
-            url = self.issuer.removesuffix("/") + _DISCOVERY
-            try:
-                found = msgspec.json.decode(await self._get(url), type=ProviderEndpoints)
-                for place in (found.authorization_endpoint, found.token_endpoint, found.jwks_uri):
-                    origin_of(place)
-            except ValueError as error:
-                raise ProviderError(f"{url}: not a usable discovery document: {error}") from None
-            if found.issuer != self.issuer:
-                raise ProviderError(
-                    f"{url}: the document is of issuer {found.issuer[:200]!r}: correct sso.issuer"
-                )
-            methods = found.code_challenge_methods_supported
-            if methods is not None and "S256" not in methods:
-                raise ProviderError(f"{url}: the provider does not support PKCE with S256")
-            self._endpoints = clock.now(), found
-        return self._endpoints[1]
+        """Return the endpoints: an hour old at most, or as old as keys while the provider does not serve them."""
+        async with self._one_fetch:
+            known = self._endpoints
+            if known is not None and clock.now() - known[0] < _FRESH_SECONDS:
+                return known[1]
+            failure = self._failure
+            if failure is None or clock.now() - failure[0] >= _AGAIN_SECONDS:
+                try:
+                    found = await self._discover()
+                except ProviderError as error:
+                    failure = self._failure = clock.now(), str(error)
+                else:
+                    self._endpoints, self._failure = (clock.now(), found), None
+                    return found
+            if known is None or clock.now() - known[0] >= self._keys_seconds:
+                raise ProviderError(failure[1])
+            return known[1]
+
+    async def _discover(self) -> ProviderEndpoints:
+        url = self.issuer.removesuffix("/") + _DISCOVERY
+        try:
+            found = msgspec.json.decode(await self._get(url), type=ProviderEndpoints)
+            for place in (found.authorization_endpoint, found.token_endpoint, found.jwks_uri):
+                origin_of(place)
+        except ValueError as error:
+            raise ProviderError(f"{url}: not a usable discovery document: {error}") from None
+        if found.issuer != self.issuer:
+            raise ProviderError(
+                f"{url}: the document is of issuer {found.issuer[:200]!r}: correct sso.issuer"
+            )
+        methods = found.code_challenge_methods_supported
+        if methods is not None and "S256" not in methods:
+            raise ProviderError(f"{url}: the provider does not support PKCE with S256")
+        return found
 
     async def keys(self) -> Sequence[dict[str, Any]]:
         now = clock.now()

@@ -12,8 +12,8 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_view import standby_view
 from rosmop.tool.terminal import printable, say
 

@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyWanted
 from appliance.features.standby.samples import samples_of
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.view import PairView, Samples
 
 if TYPE_CHECKING:

@@ -16,10 +16,12 @@ from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.admin_socket import AdminServer
+from appliance.features.standby.answers import OtherAppliance, StandbyState
 from appliance.features.standby.inheritance import CopyAge
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
+from appliance.features.standby.orders import StandbyAdministration
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replica_sync import INCOMPLETE, ReplicaSync, StateComparison, is_recovered
@@ -27,10 +29,8 @@ from appliance.features.standby.replication import Pair, host_endpoint, state_of
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_transport import ReplicationListener, follow_at
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState
-from appliance.features.standby.standby_orders import StandbyAdministration
-from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.features.standby.takeover_check import TakeoverCheck
+from appliance.features.standby.tunnels import StandbyTunnels
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.store.state_file import SCHEMA
 from appliance.store.writer_thread import StoreError

@@ -23,15 +23,15 @@ from appliance.base.background import run_always
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.features.standby import lease_link
+from appliance.features.standby.answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
-from appliance.features.standby.standby_summary import UNCHECKED, takeover_obstacles
-from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.features.standby.summary import UNCHECKED, takeover_obstacles
+from appliance.features.standby.tunnels import StandbyTunnels
 from appliance.features.standby.witness import EXPIRY
 from appliance.store.writer_thread import Database, StoreError
 

@@ -2,7 +2,7 @@
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.rest_operation import rest
-from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.answers import StandbyState
 
 
 @rest(

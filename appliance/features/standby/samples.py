@@ -2,8 +2,8 @@
 
 import math
 
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_summary import both_active
+from appliance.features.standby.answers import StandbyState
+from appliance.features.standby.summary import both_active
 from appliance.features.view import Samples
 
 

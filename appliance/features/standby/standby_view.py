@@ -9,9 +9,9 @@ from rich.text import Text
 from appliance.api.front.moments import in_full
 from appliance.cli.output import moment
 from appliance.cli.status_watch import StatusView
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_line import answer_in_words, connection, lag_in_words
-from appliance.features.standby.standby_summary import follower_troubles
+from appliance.features.standby.answers import StandbyState
+from appliance.features.standby.status_line import answer_in_words, connection, lag_in_words
+from appliance.features.standby.summary import follower_troubles
 
 _RED = "bold red"
 

@@ -30,7 +30,7 @@ from appliance.control.assembly.policy_gate import policy_at_start
 from appliance.control.assembly.robot import robot_addresses
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
-from appliance.features.standby.standby_summary import UNCHECKED
+from appliance.features.standby.summary import UNCHECKED
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import restore
 from appliance.policy.judgement import PolicyContext

@@ -1,10 +1,10 @@
 """Show two appliances in the status, the alarms and the metrics."""
 
 from appliance.base.metric import counter, gauge
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.samples import samples_of
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_line import standby_line
-from appliance.features.standby.standby_summary import PATIENCE_SECONDS, follower_troubles, standby_troubles
+from appliance.features.standby.status_line import standby_line
+from appliance.features.standby.summary import PATIENCE_SECONDS, follower_troubles, standby_troubles
 from appliance.features.view import FeatureView, StateView
 
 _METRICS = (

@@ -3,7 +3,7 @@
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import Tool
 
-_VERBS = "appliance.features.tokens.token_verbs"
+_VERBS = "appliance.features.tokens.verbs"
 
 FEATURE = Tool(
     "tokens",

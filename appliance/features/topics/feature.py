@@ -13,9 +13,9 @@ FEATURE = Feature(
             "Show topics of the running robot.",
             {
                 "list": Verb(f"{_PLACE}graph_verbs:list_topics"),
-                "echo": Verb(f"{_PLACE}topic_verbs:echo"),
-                "info": Verb(f"{_PLACE}topic_verbs:info"),
-                "publishers": Verb(f"{_PLACE}topic_verbs:publishers"),
+                "echo": Verb(f"{_PLACE}verbs:echo"),
+                "info": Verb(f"{_PLACE}verbs:info"),
+                "publishers": Verb(f"{_PLACE}verbs:publishers"),
             },
             after="monitor",
         ),

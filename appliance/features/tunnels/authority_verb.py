@@ -3,7 +3,7 @@
 from appliance.backup.contents import BackupError
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.state_confirmation import Confirm, confirm_state
+from appliance.cli.typed_confirmation import Confirm, confirm_state
 from appliance.features.tunnels.rotate_authority import rotate_authority
 from rosmop.tool.terminal import refused, say
 

@@ -222,7 +222,7 @@ class ParameterCalls:
         self, waiting: list[tuple[ParameterWrite, Reservation | None]]
     ) -> list[Answer | Exception]:
         try:
-            outcomes = await self._make([_wanted(write) for write, _reserved in waiting])
+            outcomes = await self._call_rosmaster([_wanted(write) for write, _reserved in waiting])
         finally:
             for _write, reserved in waiting:
                 if reserved is not None:
@@ -241,7 +241,7 @@ class ParameterCalls:
             self.mirror.delete(write.key)
             self.subscribers.parameter_deleted(write.key)
 
-    async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
+    async def _call_rosmaster(self, calls: list[Wanted]) -> list[Answer | Exception]:
         if not calls:
             return []
         try:
@@ -252,7 +252,9 @@ class ParameterCalls:
         except EncodingError as error:
             if len(calls) == 1:
                 return [error]
-            return [outcome for call in calls for outcome in await self._make([call])]  # nothing was sent yet
+            return [
+                outcome for call in calls for outcome in await self._call_rosmaster([call])
+            ]  # nothing was sent yet
         except CallFailedError as error:
             return [error] * len(calls)
 

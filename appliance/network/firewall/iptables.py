@@ -117,7 +117,7 @@ def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
 
 def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
     """Return chains that drop forwarded packets."""
-    return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
+    return _foreign(namespace, "filter", lambda table: table.chains_that_drop("FORWARD"))
 
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
@@ -275,7 +275,7 @@ class _Table:
         chains = [str(chain.name) for chain in self._table.chains]
         return [self._named(name) for name in chains if self._targets(name) & SOURCE_TRANSLATIONS]
 
-    def dropping(self, chain: str) -> list[str]:
+    def chains_that_drop(self, chain: str) -> list[str]:
         drops = self._library.Chain(self._table, chain).get_policy().name == "DROP"
         return [self._named(chain)] if drops else []
 

@@ -4,8 +4,8 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
-A publisher that turns the relay's header away is asked again at once with another header (`introductions`). The wait
-starts over once a connection has flowed for more than `retry_longest` seconds.
+A publisher that turns the relay's header away is asked again at once with another header (`header_candidates.py`). The
+wait starts over once a connection has flowed for more than `retry_longest` seconds.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,8 +14,8 @@ from enum import Enum, auto
 
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.channel.messages.relay_link import Violation
+from appliance.relay.connections.header_candidates import HeaderCandidates
 from appliance.relay.connections.headers import size_of
-from appliance.relay.connections.introductions import Introductions
 from appliance.relay.connections.named_subscribers import NamedSubscribers
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.connections.upstream_reader import UpstreamReader, violation_of
@@ -57,9 +57,8 @@ class PublisherConnection(Upstream):
         self._context = context
         self._loop = context.loop
         self._topic = topic
-        self._limits = context.limits
         self._named_subscribers = NamedSubscribers(context, topic.topic, topic.host)
-        self._introductions = Introductions.of(context, topic)
+        self._headers = HeaderCandidates.of(context, topic)
         self.state = UpstreamState.IDLE
         self.failures = 0
         self._wanted = False
@@ -91,11 +90,13 @@ class PublisherConnection(Upstream):
         """Close the connection after this turn of the loop: a lazy publisher has to learn that it is unused."""
         self._wanted = False
         if self._linger is None:
-            seconds = self._limits.linger if self._context.unsettled else 0.0  # subscribers may still return
+            seconds = (
+                self._context.limits.linger if self._context.unsettled else 0.0
+            )  # subscribers may still return
             self._linger = self._loop.after(seconds, self._close_unwanted)
 
     def ask(self) -> None:
-        self._enter(UpstreamState.ASKED, self._limits.answer_seconds, self.ask)
+        self._enter(UpstreamState.ASKED, self._context.limits.answer_seconds, self.ask)
         self._context.reporter.send(UpstreamWanted(self._topic.key, self._topic.topic))
 
     def ask_again(self) -> None:
@@ -114,9 +115,9 @@ class PublisherConnection(Upstream):
         stream = BufferedSocket(
             self._loop, sock, self._header_received, self._broken, payer=payer, opened=self._connected
         )
-        self._attempt = _Attempt(stream, HeaderParser(self._limits.header_bytes), (host, port))
-        late = f"no answer from {host}:{port} within {self._limits.connect_seconds:g} s"
-        self._enter(UpstreamState.CONNECTING, self._limits.connect_seconds, lambda: self._lose(late))
+        self._attempt = _Attempt(stream, HeaderParser(self._context.limits.header_bytes), (host, port))
+        late = f"no answer from {host}:{port} within {self._context.limits.connect_seconds:g} s"
+        self._enter(UpstreamState.CONNECTING, self._context.limits.connect_seconds, lambda: self._lose(late))
 
     def refused(self) -> None:
         if self.state is UpstreamState.ASKED:
@@ -166,7 +167,7 @@ class PublisherConnection(Upstream):
         fields = {
             "callerid": _CALLER_ID,
             "topic": self._topic.topic,
-            **self._introductions.fields,
+            **self._headers.fields,
             "tcp_nodelay": "1",
         }
         if self._attempt is not None:
@@ -220,9 +221,9 @@ class PublisherConnection(Upstream):
     def _flow(self, header: dict[str, str], attempt: _Attempt) -> None:
         self._attempt = None
         self._objected = ""
-        self._introductions.accepted()
+        self._headers.accepted()
         self._enter(UpstreamState.FLOWING)
-        self._named_subscribers.open(attempt.address, self._introductions.fields)
+        self._named_subscribers.open(attempt.address, self._headers.fields)
         sock = attempt.stream.take()
         self._reader = reader = UpstreamReader(self._context, self._topic, sock, header, self._lose)
         self._topic.upstream_opened(header)
@@ -233,7 +234,7 @@ class PublisherConnection(Upstream):
         lose(f"no connection to the publisher: {reason}")
 
     def _turned_away(self, reason: str, violation: Violation = "") -> None:
-        if self._introductions.refused():
+        if self._headers.refused():
             self._drop_connection()
             self.ask()
         else:
@@ -249,7 +250,7 @@ class PublisherConnection(Upstream):
         if not self._wanted:
             self._enter(UpstreamState.IDLE)
             return
-        wait = min(self._limits.retry_first * 2.0**self.failures, self._limits.retry_longest)
+        wait = min(self._context.limits.retry_first * 2.0**self.failures, self._context.limits.retry_longest)
         self.failures = min(self.failures + 1, 32)
         self._enter(UpstreamState.WAITING, wait, self.ask)
 
@@ -264,7 +265,7 @@ class PublisherConnection(Upstream):
             self._attempt.stream.close()
             self._attempt = None
         if self._reader is not None:
-            if self._loop.clock() - self._reader.since > self._limits.retry_longest:
+            if self._loop.clock() - self._reader.since > self._context.limits.retry_longest:
                 self.failures = 0
             self._reader.close()
             self._reader = None

@@ -6,7 +6,7 @@ A change by several monitors is one record under the last of them, but counts fo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from appliance.base.varying_numbers import without_numbers
@@ -46,6 +46,14 @@ class _Counters:
     missed: int = 0
 
 
+@dataclass
+class _Second:
+    """The points that this second's reports show, and the number of reports with causes."""
+
+    shown: set[ObservationPoint] = field(default_factory=set)
+    explained: int = 0
+
+
 class Observer:
     """Counts and reports actions of monitors. The kinds of reports begin with `prefix`, which marks shadow mode."""
 
@@ -67,7 +75,7 @@ class Observer:
         self._publishers = publishers
         self._monitors: MonitorSet | None = None
         self.senders = senders
-        self._explained = 0
+        self._second = _Second()
         self._observations = observations
         self._publish = publish
         self._prefix = prefix
@@ -77,7 +85,6 @@ class Observer:
         self._stopping: dict[tuple[tuple[str, ...], ObservationPoint], bool] = {}
         """Whether the last change that was compared, by its events and point, was a stop: the module only counts."""
         self._lines: dict[str, tuple[int, str]] = {}
-        self._shown: set[ObservationPoint] = set()
         self._owed: list[FastPathCounts] = []
 
     def take(self, monitors: MonitorSet) -> None:
@@ -91,7 +98,7 @@ class Observer:
         }
 
     def shows(self, point: ObservationPoint) -> bool:
-        return point not in self._shown
+        return point not in self._second.shown
 
     def hides_drop(self, monitor: str, point: ObservationPoint) -> bool:
         return self._observations.was_reported("drop", monitor, point)
@@ -105,10 +112,10 @@ class Observer:
         kind = f"{self._prefix}verdict"
         if (
             self._observations.was_reported(kind, verdict.monitor, point, named(verdict))
-            or self._explained >= _EXPLAINED
+            or self._second.explained >= _EXPLAINED
         ):
             return False
-        self._explained += 1
+        self._second.explained += 1
         return True
 
     def collect_later(self, counts: FastPathCounts) -> None:
@@ -256,10 +263,10 @@ class Observer:
         if len(self._stopping) >= _MOST_STOPPING:
             self._stopping.clear()
         self._stopping[events, point] = safe
-        if point in self._shown:
+        if point in self._second.shown:
             self._again[events, point, safe] = self._again.get((events, point, safe), 0) + 1
             return
-        self._shown.add(point)
+        self._second.shown.add(point)
         monitors = self._count_change(events, 1)
         together = _together(events)
         self._observations.note(
@@ -335,8 +342,7 @@ class Observer:
 
     def tick(self, time: int) -> None:
         self._sum_up(time)
-        self._shown.clear()
-        self._explained = 0
+        self._second = _Second()
 
     def _sum_up(self, time: int) -> None:
         self._settle()

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.appliance import Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, has_ros, numbers
 from tests.support.processes import LIMIT, Process
@@ -24,6 +24,7 @@ from tests.support.waiting import eventually
 URI = "http://127.0.0.1:11311"
 CYCLES = int(os.environ.get("ROSRV_ADOPT_CYCLES", "20"))
 _RATE = 50
+POLICY = f"{OPEN_POLICY}\n[Options]\naudit-only = Publishers\n"
 
 
 @dataclass
@@ -95,7 +96,7 @@ def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
 
 @pytest.fixture
 def appliance(robot: Robot) -> Iterator[Appliance]:
-    appliance = Appliance(robot.host, isolation="netns")
+    appliance = Appliance(robot.host, isolation="netns", policy=POLICY)
     try:
         yield appliance
     finally:
@@ -257,3 +258,10 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
     said = rosrv(robot, appliance, "adopt", "--when-standing", "--within", "30")
     assert "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic" in said
     assert "noted" in said
+    appliance.start()
+    until_taken(robot, appliance)
+    said = rosrv(robot, appliance, "policy", "enforce", "--when-standing", "--within", "30")
+    assert (
+        "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no" in said
+    )
+    assert "enforces [Publishers]" in said

@@ -3,7 +3,8 @@ import struct
 
 import pytest
 
-from appliance.cli.standing import STILL_SECONDS, StandingJudge, speed_in
+from appliance.cli.standing import STILL_SECONDS, StandingJudge, speed_in, unseen
+from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph
 
 CMD, ODOM = "/cmd_vel", "/odom"
 
@@ -62,3 +63,17 @@ def test_the_speed_is_the_largest_component_of_the_twist() -> None:
     pose = struct.pack("<7d36d", *[0.0] * 43)
     odometry = header + struct.pack("<I", 0) + pose + struct.pack("<6d36d", 0.3, *[0.0] * 41)
     assert speed_in("nav_msgs/Odometry", ("twist", "twist"), odometry) == pytest.approx(0.3)
+
+
+def test_the_answer_names_what_no_topic_says() -> None:
+    types = {
+        "/arm/command": "trajectory_msgs/JointTrajectory",
+        CMD: "geometry_msgs/Twist",
+        ODOM: "nav_msgs/Odometry",
+    }
+    base = frozenset({(SUBSCRIPTION, CMD, "/base"), (PUBLICATION, ODOM, "/base")})
+    assert unseen(MasterGraph(base, types)) == "motions that no topic commands"
+    arm = frozenset({(SUBSCRIPTION, "/arm/command", "/arm"), (SUBSCRIPTION, ODOM, "/map")})
+    assert unseen(MasterGraph(arm, types)) == (
+        "the real speed, because no node publishes odometry; what /arm/command may move; motions that no topic commands"
+    )

@@ -118,6 +118,8 @@ async def test_a_text_that_does_not_allow_a_value_gets_its_default(desk: Desk) -
     monitors = await loaded(desk, vMax=1.5, n=4)
     done = await monitors.load(admin.MonitorLoad({"cap.rv": TEXT.replace("0..2", "0..1")}), "eve")
     assert any("vMax=1.5 no longer applies" in one for one in done.warnings)
+    (record,) = (fields for event, fields in desk.trail.heard if "no longer applies" in fields["reason"])
+    assert (record["resource"], record["before"], record["values"]) == ("cap", {"vMax": 1.5}, {"vMax": 0.22})
     assert stated(monitors) == {"n": 4}
     assert [one["reason"] for event, one in desk.trail.heard if event == "monitor set"][-1].startswith(
         "cap: vMax=1.5"
@@ -137,3 +139,18 @@ async def test_with_site_keys_a_load_cannot_replace_a_signed_topic(desk: Desk) -
         await monitors.load(order, "eve")
     await monitors.load(admin.MonitorLoad({"cap.rv": TEXT}, signatures={"cap.rv": signed(TEXT)}), "eve")
     assert (await monitors.give(admin.MonitorGive("cap", {"vMax": 1}), "eve")).changed == ["vMax"]
+
+
+async def test_the_record_of_a_load_has_the_text_and_the_values_before_and_after(desk: Desk) -> None:
+    monitors = await loaded(desk, vMax=1.5)
+    await monitors.switch(admin.MonitorSwitch(["cap"], False), "eve")
+    await monitors.load(admin.MonitorLoad({"cap.rv": TEXT.replace("0.22", "0.3")}), "ann")
+    records = [fields for event, fields in desk.trail.heard if event == "specifications loaded"]
+    assert records[-1]["earlier_sha256"] == records[-2]["sha256"] != records[-1]["sha256"]
+    assert [line[:1] for line in records[-1]["diff"][-2:]] == ["-", "+"]
+    assert "0.22" in records[-1]["diff"][-2] and "0.3" in records[-1]["diff"][-1]
+    assert [record["off"] for record in records[-2:]] == [{}, {"cap": "disabled"}]
+    (given,) = (fields for event, fields in desk.trail.heard if event == "monitor set")
+    assert (given["before"], given["values"]) == ({"vMax": 0.22}, {"vMax": 1.5})
+    (disabled,) = (fields for event, fields in desk.trail.heard if event == "monitor disabled")
+    assert disabled["earlier"] == "enabled"

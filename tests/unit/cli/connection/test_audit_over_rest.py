@@ -108,3 +108,27 @@ def test_following_ends_without_a_server(monkeypatch: pytest.MonkeyPatch) -> Non
 )
 def test_an_invalid_id_matches_no_record(record_id: str) -> None:
     assert log_of().show(record_id, 500) is None
+
+
+def test_a_snapshot_over_rest_has_the_events_in_the_order_of_the_log() -> None:
+    """Each event is a request, one after the other: a server limits how many a token has at the same time."""
+    log = log_of(*(Answer([line(number) for number in numbers], breaks=False) for numbers in ((3, 9), (5,))))
+    assert [entry.sequence for entry in log.snapshot().of_events(("policy loaded", "monitor set"))] == [
+        3,
+        5,
+        9,
+    ]
+
+
+def test_a_snapshot_over_rest_reads_pages_only_as_they_are_wanted() -> None:
+    asked: list[str] = []
+
+    class Pages(Rest):
+        def call(self, _method: str, path: str, **more: Any) -> dict[str, Any]:
+            cursor = more["params"]["cursor"]
+            asked.append(cursor)
+            return {"records": [json.loads(line(int(cursor) + 1))], "cursor": str(int(cursor) + 1)}
+
+    following = RestLog(cast(RestClient, Pages())).snapshot().following("rest call", 7)
+    assert [next(following).sequence for _ in range(2)] == [8, 9]
+    assert len(asked) < 100

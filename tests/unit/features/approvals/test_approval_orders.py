@@ -14,8 +14,8 @@ from appliance.base import clock
 from appliance.channel.messages import RequestHeld
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.approvals.approval_orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
 from appliance.features.approvals.approval_table import WAIT_SECONDS
+from appliance.features.approvals.orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
 from appliance.features.approvals.requests import Approval, ApprovalsWanted, ApproveCall, RefuseCall
 from appliance.features.approvals.view import APPROVALS_VIEW
 from appliance.master.endpoints.host_signs import HostSigns

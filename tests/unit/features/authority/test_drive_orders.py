@@ -8,7 +8,7 @@ import pytest
 from appliance.base import clock
 from appliance.channel.messages import OwnServiceCalled, RankReported
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
-from appliance.features.authority.drive_orders import CHECK_SECONDS, DriveOrders
+from appliance.features.authority.orders import CHECK_SECONDS, DriveOrders
 from appliance.features.authority.ranked_groups import RankedDriver
 from appliance.features.authority.requests import (
     DriveAsk,

@@ -6,7 +6,7 @@ import pytest
 import typer
 
 from appliance.cli.output import say_json
-from appliance.features.authority import drive_verbs
+from appliance.features.authority import verbs
 from appliance.features.authority.requests import GroupState, GroupStates
 
 ROWS = [GroupState(name, [], "", None, 5.0, None, []) for name in ("arm", "base")]
@@ -46,7 +46,7 @@ def test_status_has_the_group_and_the_exit_status(
 ) -> None:
     ended = 0
     try:
-        drive_verbs.status.function(appliance_of(rows, as_json=as_json), group)
+        verbs.status.function(appliance_of(rows, as_json=as_json), group)
     except typer.Exit as end:
         ended = end.exit_code
     text = capsys.readouterr().out

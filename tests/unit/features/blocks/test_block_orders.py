@@ -15,7 +15,7 @@ from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.blocks.block_orders import BlockOrders
+from appliance.features.blocks.orders import BlockOrders
 from appliance.features.blocks.requests import (
     BlockEnded,
     HostBlock,
@@ -336,7 +336,7 @@ async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path:
 
 
 async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appliance.features.blocks.block_orders.MOST", 2)
+    monkeypatch.setattr("appliance.features.blocks.orders.MOST", 2)
     async with control(tmp_path, Clock()) as made:
         await made.block(NODE)
         await made.block(OTHER)

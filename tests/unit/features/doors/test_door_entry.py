@@ -3,7 +3,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.features.doors.door_orders import DoorOrders
+from appliance.features.doors.orders import DoorOrders
 from appliance.policy.model import Address
 from appliance.store.door_tables import DoorRow
 from tests.support.core import FakeTrail

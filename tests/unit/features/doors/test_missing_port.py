@@ -1,7 +1,7 @@
 import pytest
 
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.features.doors.door_orders import missing_port
+from appliance.features.doors.orders import missing_port
 
 
 def role(*ports: range) -> ActiveRole:

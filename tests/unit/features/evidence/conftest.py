@@ -14,7 +14,7 @@ from appliance.channel.admin import AdminAnswer, AdminRequest, verb_of
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.features.evidence.bundle import RecordingSelection, TimeSpan, export
-from appliance.features.evidence.evidence_orders import EvidenceOrders, NotSealedError
+from appliance.features.evidence.orders import EvidenceOrders, NotSealedError
 from appliance.features.evidence.page import Names
 from appliance.features.evidence.requests import EvidenceExported, LogSealed
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all

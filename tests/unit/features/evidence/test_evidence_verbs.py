@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.features.evidence import evidence_verbs
+from appliance.features.evidence import verbs
 from appliance.features.evidence.bundle import BundleError
 from tests.support.command import rosrv
 
@@ -25,7 +25,7 @@ def test_a_bundle_gets_its_name_when_complete(
             raise BundleError("a text was changed while it was exported", "failed")
         yield b"whole"
 
-    monkeypatch.setattr(evidence_verbs, "export", export)
+    monkeypatch.setattr(verbs, "export", export)
     order = ("evidence", "export", "--since", "1h", "-o", str(place), "--state", "nowhere")
     done = rosrv(*order)
     assert done.returncode == breaks, done.stderr

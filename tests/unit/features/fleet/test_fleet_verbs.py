@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.features.fleet import fleet_verbs
+from appliance.features.fleet import verbs
 from appliance.features.fleet.connection import reason_in
 from appliance.formats.fleet_membership import JoinRequest
 
@@ -42,9 +42,9 @@ def test_a_join_needs_no_checkpoint(
         (folder / "invitation").touch()
         return _CERTIFICATE
 
-    monkeypatch.setattr(fleet_verbs, "CollectorConnection", Collector)
-    monkeypatch.setattr(fleet_verbs, "prepare_membership", prepared)
-    fleet_verbs.join(invitation, state)
+    monkeypatch.setattr(verbs, "CollectorConnection", Collector)
+    monkeypatch.setattr(verbs, "prepare_membership", prepared)
+    verbs.join(invitation, state)
     assert [request.key for request in posted] == [sent]
 
 

@@ -7,7 +7,7 @@ from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.robots import Robots
 
 from appliance.base.clock import using, wall
-from appliance.features.fleet import fleet_verbs
+from appliance.features.fleet import verbs
 from appliance.features.fleet.connection import CollectorError, robot_context
 from appliance.formats.fleet_membership import Invitation
 from appliance.signing.own_certificate import make_own_certificate
@@ -33,16 +33,14 @@ def test_a_join_with_a_wrong_clock_is_refused(years: float, tmp_path: Path) -> N
 
 
 def test_a_join_after_the_clock_was_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        fleet_verbs, "account_of", lambda _user: SimpleNamespace(uid=os.getuid(), gid=os.getgid())
-    )
+    monkeypatch.setattr(verbs, "account_of", lambda _user: SimpleNamespace(uid=os.getuid(), gid=os.getgid()))
     invitation = Invitation(
         robot="arm7", collector="https://192.0.2.9:8444", authority="", receipt_key="", expires=1.0,
         token=f"rosrv-join_{'A' * 43}",
     )  # fmt: skip
     with using(at(3)):
-        wrong = fleet_verbs.prepare_membership(tmp_path / "joined.new", invitation)
-    first, second = (fleet_verbs.prepare_membership(tmp_path / "joined.new", invitation) for _ in range(2))
+        wrong = verbs.prepare_membership(tmp_path / "joined.new", invitation)
+    first, second = (verbs.prepare_membership(tmp_path / "joined.new", invitation) for _ in range(2))
     assert first == second != wrong
 
 

@@ -82,6 +82,11 @@ def test_a_policy_has_the_hash_before_and_after_and_its_changed_lines() -> None:
     assert rows[1].diff == ["-/cmd_vel = robot", "+/cmd_vel = *"]
 
 
+def test_changed_lines_that_a_record_has_no_room_for_are_not_missed() -> None:
+    (row,) = rows_of(entry(1, "specifications loaded", sha256="bb", earlier_sha256="aa", cut="too large"))
+    assert row.diff == ["(too many changed lines for the record: compare the texts of both SHA-256)"]
+
+
 def test_a_record_says_itself_what_was_before() -> None:
     """So retention of the record before it, or a log that was replaced, hides nothing."""
     (row,) = rows_of(entry(1, "specifications loaded", sha256="bb", earlier_sha256="aa", diff=["-1", "+2"]))

@@ -13,8 +13,8 @@ from appliance.channel.channel import Channel
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.features.recorder import recorder_link
 from appliance.features.recorder import requests as recording_requests
+from appliance.features.recorder.orders import RecordingOrders
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
-from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.recording_store import MOST_TEMPORARY
 from appliance.features.recorder.settings import RecorderRules

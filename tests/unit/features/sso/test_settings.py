@@ -1,3 +1,4 @@
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -66,3 +67,12 @@ def test_the_firewall_lets_the_process_reach_the_provider_or_the_proxy_only() ->
 async def test_without_a_proxy_only_the_issuers_host_is_asked(url: str) -> None:
     with pytest.raises(ProviderError):
         await ProviderConnection(sso()).exchange("GET", url)
+
+
+def test_a_start_records_who_gets_which_role_and_no_secret(tmp_path: Path) -> None:
+    file = tmp_path / "secret"
+    file.write_text("the client's secret")
+    recorded = sso(client_secret_file=file, roles={"admin": ["it"]}).recorded()
+    assert recorded["roles"] == "{'admin': ['it']}" and recorded["client_secret_file"] == str(file)
+    assert "the client's secret" not in str(recorded)
+    assert Sso().recorded() == {}

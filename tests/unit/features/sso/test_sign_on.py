@@ -1,3 +1,4 @@
+import asyncio
 import base64
 from typing import Any
 
@@ -150,16 +151,31 @@ async def test_a_new_key_counts_at_once_and_a_withdrawn_one_no_longer(name: str 
         await _sign_on(provider)
 
 
-async def test_the_last_keys_serve_while_the_provider_gives_none_but_not_for_ever() -> None:
+async def test_a_provider_that_does_not_answer_is_asked_seldom() -> None:
+    """Unknown hosts may begin to sign on, so that must not cost a request to the provider each time."""
+    provider = ScriptedProvider()
+    provider.down = {"openid-configuration"}
+    for asked in (1, 2):
+        begun = await asyncio.gather(*(provider.begin() for _browser in range(100)), return_exceptions=True)
+        assert {str(one) for one in begun} == {f"{ISSUER}/.well-known/openid-configuration: no answer"}
+        assert len(provider.requests) == asked
+        let_time_pass(6.0)
+    provider.down = set()
+    await _sign_on(provider)
+
+
+@pytest.mark.parametrize("down", [{"keys"}, {"keys", "openid-configuration"}], ids=["keys", "all"])
+async def test_the_last_keys_serve_while_the_provider_gives_none_but_not_for_ever(down: set[str]) -> None:
     provider = ScriptedProvider(sso(keys_hours=3.0))
     await _sign_on(provider)
-    provider.down = {"keys"}
+    provider.down = down
     let_time_pass(2.9 * HOUR)
     await _sign_on(provider)
     let_time_pass(0.2 * HOUR)
     with pytest.raises(ProviderError, match="no answer"):
         await _sign_on(provider)
     provider.down = set()
+    let_time_pass(6.0)
     await _sign_on(provider)
 
 

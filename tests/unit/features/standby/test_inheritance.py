@@ -16,7 +16,7 @@ from appliance.features.standby.inheritance import (
 )
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.replication import Pair
-from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.features.standby.tunnels import StandbyTunnels
 from appliance.specifications.rollout import Rollout
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase

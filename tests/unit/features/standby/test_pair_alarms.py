@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.alarms import open_alarms
-from appliance.features.standby.standby_summary import UNCHECKED
+from appliance.features.standby.summary import UNCHECKED
 from tests.unit.channel.test_alarms import changed
 
 PAIR: dict[str, Any] = {

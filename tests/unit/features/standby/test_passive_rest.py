@@ -20,10 +20,10 @@ from appliance.channel.messages.api import (
 )
 from appliance.control.operators.token_orders import TOKENS
 from appliance.features.standby import passive_rest
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.lease_client import HandOverError
+from appliance.features.standby.orders import StandbyAdministration
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_orders import StandbyAdministration
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.host_tables import HostBlockRow

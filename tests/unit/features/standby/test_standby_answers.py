@@ -18,8 +18,8 @@ from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.features.standby import requests as standby_requests
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_orders import on_standby
+from appliance.features.standby.answers import StandbyState
+from appliance.features.standby.orders import on_standby
 from appliance.store.access_tokens import make_token
 from tests.support.answers import example
 from tests.support.asgi import requested

@@ -6,9 +6,9 @@ from appliance.audit.log.record import AuditRecord
 from appliance.channel import admin
 from appliance.control.errors import UnknownThingError
 from appliance.features.standby import requests as standby_requests
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.lease_client import HandOverError
-from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_orders import SingleAppliance, StandbyAdministration, StandbyOrders
+from appliance.features.standby.orders import SingleAppliance, StandbyAdministration, StandbyOrders
 from tests.support.answers import example
 from tests.support.core import FakeTrail
 

@@ -13,9 +13,9 @@ from appliance.base import clock
 from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.membership import Membership
+from appliance.features.standby.orders import ActiveAppliance
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_sender import ReplicationLag
-from appliance.features.standby.standby_orders import ActiveAppliance
 
 pytestmark = pytest.mark.anyio
 

@@ -1,7 +1,7 @@
 import pytest
 import typer
 
-from appliance.features.topics.topic_verbs import part_of
+from appliance.features.topics.verbs import part_of
 from roswire.definitions import Definitions
 from roswire.message_view import CUT, read_fields
 

@@ -7,7 +7,7 @@ import pytest
 
 from appliance.channel.admin import AdminAnswer
 from appliance.features.standby import live_verbs
-from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.answers import StandbyState
 from tests.support.answers import example
 from tests.support.command import rosrv
 from tests.support.fake_appliance import FakeAppliance

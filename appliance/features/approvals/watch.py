@@ -17,7 +17,7 @@ _EVERY_SECONDS = 0.5
 _BELL = "\a"
 
 
-def watch(appliance: Appliance, line: Callable[[Approval], tuple[str, str]]) -> None:
+def show_held_calls(appliance: Appliance, line: Callable[[Approval], tuple[str, str]]) -> None:
     """Print each change; `line` returns the text of an approval, and its style."""
     known: dict[int, Approval] = {}
     away, pause = False, threading.Event()

@@ -6,7 +6,7 @@ refused with the first.
 
 from collections.abc import Iterator
 
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.view import Trouble
 
 PATIENCE_SECONDS = 60.0

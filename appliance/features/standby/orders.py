@@ -10,9 +10,9 @@ from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import UnknownThingError
 from appliance.features.standby import requests as standby_requests
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.replication import Replication
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()

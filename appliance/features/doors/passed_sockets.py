@@ -11,7 +11,7 @@ from roswire.node.network import BUFFER_BYTES, ByteWriter, ListeningServer, Serv
 _SECONDS = 10.0
 
 
-class GivenNetwork:
+class PassedSockets:
     """A `NodeNetwork` with sockets from control. `ask(message)` sends a request, and returns False without a link."""
 
     def __init__(self, source: str, ask: Callable[[SocketWanted], bool]) -> None:

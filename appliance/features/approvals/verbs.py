@@ -9,13 +9,13 @@ from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
-from appliance.features.approvals import approval_watch
 from appliance.features.approvals.requests import (
     Approval,
     ApprovalsWanted,
     ApproveCall,
     RefuseCall,
 )
+from appliance.features.approvals.watch import show_held_calls
 from rosmop.tool.terminal import say
 from roswire.errors import DefinitionError
 from roswire.message_view import read_bytes, read_fields, rest_of
@@ -51,7 +51,7 @@ def approve(
     if watch:
         if number is not None or last is not None or refused:
             raise usage_error("--watch takes no call: approve in another terminal", "rosrv approve")
-        approval_watch.watch(appliance, lambda one: _line(appliance, one))
+        show_held_calls(appliance, lambda one: _line(appliance, one))
         return
     if number is None:
         if last is not None or refused:

@@ -14,7 +14,7 @@ _ANY = "*"
 _MOST = 8  # claims to try on one publisher, because subscribers can make up any number
 
 
-class Introductions:
+class HeaderCandidates:
     """The header fields for the next connection to one publisher; accepted fields are used for all later ones.
 
     `claims` returns known fields, the most likely ones first; the `registered` type replaces an unknown one.
@@ -29,8 +29,8 @@ class Introductions:
         self.fields: Mapping[str, str] = {"type": _ANY, "md5sum": _ANY}
 
     @classmethod
-    def of(cls, context: RelayContext, topic: RelayedTopic) -> "Introductions":
-        """Return introductions with the previous header, the type in specifications, and those of subscribers."""
+    def of(cls, context: RelayContext, topic: RelayedTopic) -> "HeaderCandidates":
+        """Return candidates with the previous header, the type in specifications, and those of subscribers."""
 
         def claims() -> Iterator[Mapping[str, str]]:
             if topic.header is not None:

@@ -1,6 +1,6 @@
 import pytest
 
-from appliance.relay.connections.introductions import Introductions
+from appliance.relay.connections.header_candidates import HeaderCandidates
 
 STRING, MD5 = "std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1"
 SUBSCRIBER = {"callerid": "/listener", "topic": "/chatter", "type": STRING, "md5sum": MD5}
@@ -10,16 +10,16 @@ DEFINED = {"type": STRING, "md5sum": MD5, "message_definition": "string data\n"}
 
 
 def asked(claims: list[dict[str, str]], registered: str) -> list[str]:
-    introductions = Introductions(lambda: claims, lambda: registered)
-    shown = [_shown(introductions)]
-    while introductions.refused():
-        shown.append(_shown(introductions))
-    assert _shown(introductions) == shown[0]  # from the start, at the next attempt
+    candidates = HeaderCandidates(lambda: claims, lambda: registered)
+    shown = [_shown(candidates)]
+    while candidates.refused():
+        shown.append(_shown(candidates))
+    assert _shown(candidates) == shown[0]  # from the start, at the next attempt
     return shown
 
 
-def _shown(introductions: Introductions) -> str:
-    fields = introductions.fields
+def _shown(candidates: HeaderCandidates) -> str:
+    fields = candidates.fields
     definition = fields.get("message_definition")
     return f"{fields['type']} {fields['md5sum'][:4]}" + ("" if definition is None else f" {definition!r}")
 
@@ -47,9 +47,9 @@ def test_subscribers_do_not_choose_how_often_a_publisher_is_asked() -> None:
 
 
 def test_an_accepted_header_is_used_again() -> None:
-    introductions = Introductions(lambda: [SUBSCRIBER], lambda: STRING)
-    assert introductions.refused()
-    introductions.accepted()
-    assert (introductions.fields["type"], introductions.fields["md5sum"]) == (STRING, MD5)
-    assert introductions.refused()  # the publisher has changed its mind: another claim is left
-    assert introductions.fields["md5sum"] == "*"
+    candidates = HeaderCandidates(lambda: [SUBSCRIBER], lambda: STRING)
+    assert candidates.refused()
+    candidates.accepted()
+    assert (candidates.fields["type"], candidates.fields["md5sum"]) == (STRING, MD5)
+    assert candidates.refused()  # the publisher has changed its mind: another claim is left
+    assert candidates.fields["md5sum"] == "*"

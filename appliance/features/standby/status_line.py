@@ -1,7 +1,7 @@
 """Write the state of two appliances in one line."""
 
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
-from appliance.features.standby.standby_summary import is_silent, lag_of, lasting
+from appliance.features.standby.answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.summary import is_silent, lag_of, lasting
 from appliance.features.view import Pieces
 
 
