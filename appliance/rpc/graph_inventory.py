@@ -141,7 +141,10 @@ def problems(inventory: GraphInventory) -> Iterator[str]:
     for node in inventory.nodes:
         udp = sorted({row.topic for row in node.connections if row.transport.upper() == "UDPROS"})
         if udp:
-            yield f"{node.name} uses UDPROS for {', '.join(udp)}, which the appliance refuses; nodes then use TCPROS"
+            yield (
+                f"{node.name} uses UDPROS for {', '.join(udp)}, which the appliance refuses; a subscriber that"
+                " also allows TCPROS then uses that"
+            )
 
 
 def exposure(inventory: GraphInventory) -> dict[str, int]:

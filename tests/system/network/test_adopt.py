@@ -265,3 +265,28 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
         "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no" in said
     )
     assert "enforces [Publishers]" in said
+
+
+@pytest.mark.nightly
+def test_an_action_server_and_a_recording_go_on_after_each_change(
+    robot: Robot, appliance: Appliance, tmp_path: Path
+) -> None:
+    def go_on() -> None:
+        client = robot.ros.node("rospy", "action", "client")
+        assert client.wait_for(event="result")["result"] == 3
+        client.stop()
+        before = bag.stat().st_size
+        eventually(lambda: bag.stat().st_size > before + 10_000, robot.ros.story)
+
+    bag = tmp_path / "robot.bag.active"
+    robot.ros.node("rospy", "action", "server", name="counter")
+    record = ["/usr/lib/rosbag/record", "--output-name", str(tmp_path / "robot"), "--chunksize", "1"]
+    robot.ros.start([*record, "/rospy", "/roscpp"], label="rosbag record")
+    eventually(bag.exists, robot.ros.story)
+    go_on()
+    rosrv(robot, appliance, "adopt")
+    appliance.start()
+    until_taken(robot, appliance)
+    go_on()
+    rosrv(robot, appliance, "release")
+    go_on()
