@@ -1,5 +1,7 @@
 """Typed topics, roles, given lists and the `preset` statement."""
 
+from itertools import product
+
 import pytest
 
 from rosmop.check.sources import compiled_from
@@ -113,6 +115,19 @@ WRONG = [
     ("topic t : Velocity = /t; corners c = 0,0 1,1 1,0;", "e(x) t", "c = 0,0 1,1;", "write it like c = -2,-2"),
     ("topic t : Velocity = /t; corners c = 0,0 1,1 1,0;", "e(x) t", "c = 0,0 2,2 2,0 0,2;", "edges cross"),
     ("topic t : Velocity = /t; time c = 0s;", "e(x) t", "", "write it like c = 120s"),
+    ("topic t : Velocity = /t; double d = 1 in 0..2;", "e(x) t", "d = fast;", "`fast`: write a number, such as d = 1"),
+    ("topic t : Velocity = /t; double d = 1 m in 0..2;", "e(x) t", "d = 1 m;", "`1 m`: write a number without its"),
+    ("topic t : Velocity = /t; double d = 1 in 0..2;", "e(x) t", "d = ;", "``: write a number"),
+    ("topic t : Velocity = /t; double d = 1 in 0..2;", "e(x) t", "d = true;", "`true`: write a number"),
+    ("topic t : Velocity = /t; bool d = true;", "e(x) t", "d = 1;", "`1`: write d = true or d = false"),
+    ("topic t : Velocity = /t;", "e(x) t", "t = cmd;", "`cmd` is not a topic; write it like t = /cmd_vel"),
+    ("topic t : Velocity = /t; topic u = /u;", "e(x) t", "u = /v std_msgs/Bool;", "like u = /cmd_vel, without a type"),
+    ("topic t : Velocity = /t; double t = 1 in 0..2;", "e(x) t", "", "`t` is given twice"),
+    ("topic t : Velocity = /t; hosts c = ::/0; hosts c = ::/0;", "e(x) t", "", "`c` is given twice"),
+    ("topic t : Velocity = /t; joints c = a:0..1 a:0..2;", "e(x) t", "", "a occurs twice; write it like c = elbow"),
+    ("topic t : Velocity = /t; joints c = a:1..0;", "e(x) t", "", "the lower limit of a is above the upper one"),
+    ("topic t : Velocity = /t;", "e(y) t when (y > 0)", "t = /t ackermann_msgs/AckermannDrive;",
+     "`y` is not a field of ackermann_msgs/AckermannDrive: test it in the action"),
 ]  # fmt: skip
 
 
@@ -120,6 +135,27 @@ WRONG = [
 def test_a_wrong_type_or_value_is_refused(given: str, event: str, settings: str, why: str) -> None:
     errors = refused(f"preset s 1 as s {{ {settings} }} s() given {{ {given} }} {{ event {event} {{ }} }}")
     assert any(why in one.text for one in errors), errors
+
+
+def test_each_kind_of_value_of_a_preset_statement_is_checked_at_its_place() -> None:
+    """Any text between `=` and `;` is read, so each kind has to check it."""
+    given = """topic t : Velocity = /t; topic u = /u; double d = 1 in 0..2; int i = 1 in 0..2; bool b = true;
+        corners c = 0,0 1,1 1,0; joints j = none; hosts h = ::/0; time s = 1s;"""
+    for name, value in product("tudibcjhs", ("", "x", "1e999", "0x1", "/ //", "1 // one", "nan", "-", '"')):
+        text = f"preset s 1 as s {{\n  {name} = {value};\n}} s() given {{ {given} }} {{ event e(x) t {{ }} }}"
+        errors = refused(text)
+        assert errors and {(one.position.line, one.position.column) for one in errors} == {(2, 3)}, (
+            name,
+            value,
+        )
+
+
+def test_a_specification_cancels_the_goals_of_one_action() -> None:
+    action = "move_base_msgs/MoveBaseActionGoal"
+    errors = refused(f"""preset s 1 as s {{ t = /a/goal {action}; u = /b/goal {action}; }}
+        s() given {{ topic t : Command = /t; topic u : Command = /u; }} {{
+        safe {{ }} on t every 1s; safe {{ }} on u every 1s; event e() t {{ STOP; }} event f() u {{ STOP; }} }}""")
+    assert any("cancels the goals of one action" in one.text for one in errors)
 
 
 def test_a_preset_statement_needs_its_specification() -> None:
@@ -138,6 +174,28 @@ def test_a_file_has_roles_of_its_own() -> None:
     monitors = load(f"{role} s() given {{ topic t : Level = /t; }} {{ event e(v) t {{ v = 1; }} }}")
     outcome = monitors.process("/t", message("std_msgs/Float64"), 1)
     assert fields("std_msgs/Float64", bytes(outcome.buffer)).data == 1
+
+
+def test_a_value_that_the_type_of_an_own_role_lacks_has_its_type() -> None:
+    role = """role Own(std::string s, double[] a, double u) {
+        std_msgs/Float64 '{data:u}'; std_msgs/String '{data:s}'; }"""
+    use = '{ if (s == "" && a.size() == 0) { u = 1; } }'
+    monitors = load(f"{role} s() given {{ topic t : Own = /t; }} {{ event e(s, a, u) t {use} }}")
+    outcome = monitors.process("/t", message("std_msgs/Float64"), 1)
+    assert fields("std_msgs/Float64", bytes(outcome.buffer)).data == 1
+
+
+def test_a_role_has_a_name_and_a_type() -> None:
+    code = "s() given { topic t : Own = /t; } { event e() t { } }"
+    for own, why in (
+        (
+            "role Own() { std_msgs/Bool '{}'; } role Own() { std_msgs/Bool '{}'; }",
+            "there is another role `Own`",
+        ),
+        ("role Own() { }", "no type of /t is known; begin Own with a row"),
+        ("role Own() { default '{}'; }", "no type of /t is known; begin Own with a row"),
+    ):
+        assert any(why in one.text for one in refused(f"{own} {code}"))
 
 
 def test_a_role_has_the_values_of_all_that_it_extends() -> None:

@@ -109,7 +109,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return tree.PresetStatement(self.at(meta), str(preset), number, str(name or preset), values)
 
     def setting(self, meta: Meta, name: Token, value: Token) -> tree.Setting:
-        return tree.Setting(self.at(meta), str(name), value.strip())
+        return tree.Setting(self.at(meta), str(name), " ".join(value.split()))
 
     def role(
         self, meta: Meta, name: Token, parameters: _Parameters | None, base: Token | None, *rows: tree.RoleRow

@@ -4,7 +4,7 @@ The types of typed topics decide which rows of the roles (`types/roles.py`) the 
 tree, so positions and messages are those of the text.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple, TypeVar, cast
 
@@ -12,6 +12,7 @@ from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.text import tree
 from rosmop.types import given_lists
 from rosmop.types.messages import nearest, shown
+from roswire.names import is_global_name
 
 _T = TypeVar("_T")
 Roles = Mapping[str, tree.RoleDeclaration]
@@ -37,7 +38,7 @@ def made(typed: tree.TypedFile, library: Callable[[], Roles]) -> tree.Specificat
     `library()` returns the roles that each file has beside its own.
     """
     presets = {one.preset: one for one in typed.presets}
-    findings = [*_unknown_presets(typed)]
+    findings = [*_unknown_presets(typed), *_repeated_roles(typed)]
     specifications = []
     for one in typed.specifications:
         preset = presets.get(one.known.name if isinstance(one, tree.TypedSpecification) else one.name)
@@ -65,6 +66,14 @@ def _unknown_presets(typed: tree.TypedFile) -> Iterable[Diagnostic]:
         seen.add(one.preset)
 
 
+def _repeated_roles(typed: tree.TypedFile) -> Iterable[Diagnostic]:
+    seen = set()
+    for one in typed.roles:
+        if one.name in seen:
+            yield Diagnostic(one.position, "error", f"there is another role {shown(one.name)} in this file")
+        seen.add(one.name)
+
+
 @dataclass
 class _Maker:
     typed: tree.TypedFile
@@ -85,6 +94,8 @@ class _Maker:
             if one.name in settings:
                 self._refuse(one.position, f"{shown(one.name)} is set twice")
             settings[one.name] = one
+        if isinstance(written, tree.TypedSpecification):
+            self._check_names(written)
         givens = tuple(
             made
             for given in written.givens
@@ -96,6 +107,9 @@ class _Maker:
             made_safe = self._safe(safe) if isinstance(safe, tree.TypedSafe) else safe
             if made_safe is None and isinstance(safe, tree.TypedSafe) and safe.topic in self.topics:
                 cancels.add(safe.topic)
+                if len(cancels) > 1:
+                    text = "a specification cancels the goals of one action; write another one for this topic"
+                    self._refuse(safe.position, text)
             elif made_safe is not None:
                 safes.append(made_safe)
         events = [self._event(one) if isinstance(one, tree.TypedEvent) else one for one in written.events]
@@ -120,6 +134,13 @@ class _Maker:
     def _refuse(self, place: Position, text: str) -> None:
         self.findings.append(Diagnostic(place, "error", text))
 
+    def _check_names(self, written: tree.TypedSpecification) -> None:
+        seen = set()
+        for given in written.givens:
+            if given.name in seen:
+                self._refuse(given.position, f"{shown(given.name)} is given twice")
+            seen.add(given.name)
+
     def _check_settings(self, settings: Mapping[str, tree.Setting], names: list[str]) -> None:
         for name, one in settings.items():
             if name not in names:
@@ -135,7 +156,9 @@ class _Maker:
         place = setting.position if setting else node.position
         if isinstance(node, tree.TypedTopic):
             topic, _, kind = (setting.value if setting else node.topic).partition(" ")
-            self._choose(node, topic, kind.strip(), place)
+            if setting is not None:
+                self._check_topic(node.name, topic, place)
+            self._choose(node, topic, kind, place)
             return tree.TopicDeclaration(node.position, node.name, topic)
         if isinstance(node, tree.GivenList):
             self._list(
@@ -147,8 +170,33 @@ class _Maker:
         if setting is None:
             return node
         if isinstance(node, tree.TopicDeclaration):
+            self._check_topic(node.name, setting.value, place)
             return replace(node, topic=setting.value)
-        return replace(node, position=place, default=setting.value)
+        return replace(node, position=place, default=self._constant(node, setting))
+
+    def _check_topic(self, name: str, topic: str, place: Position) -> None:
+        if not is_global_name(topic):
+            only = ", without a type" if is_global_name(topic.partition(" ")[0]) else ""
+            self._refuse(place, f"{shown(topic)} is not a topic; write it like {name} = /cmd_vel{only}")
+
+    def _constant(self, node: tree.GivenValue, setting: tree.Setting) -> str:
+        value = setting.value
+        if node.type == ("bool",):
+            if value not in ("true", "false"):
+                self._refuse(
+                    setting.position, f"{shown(value)}: write {node.name} = true or {node.name} = false"
+                )
+                return node.default
+            return value
+        try:
+            return given_lists.number(value)
+        except ValueError:
+            unit = " without its unit" if node.unit else ""
+            self._refuse(
+                setting.position,
+                f"{shown(value)}: write a number{unit}, such as {node.name} = {node.default}",
+            )
+            return node.default
 
     def _choose(self, node: tree.TypedTopic, topic: str, kind: str, place: Position) -> None:
         role = self._role(node.role, node.position)
@@ -156,6 +204,10 @@ class _Maker:
             return
         rows = {row.type: row for row in role.rows}
         kind = kind or next(iter(rows), "")
+        if not kind:
+            text = f"no type of {topic} is known; begin {role.name} with a row, such as `std_msgs/Bool '{{data:x}}';`"
+            self._refuse(place, text)
+            return
         row = rows.get(kind) or (rows.get("") if kind else None)
         if row is None:
             text = f"{topic} cannot have the type {shown(kind)}; {role.name} has {', '.join(rows)}"
@@ -260,12 +312,32 @@ class _Maker:
             parameters = tuple(tree.ParameterDeclaration(at, types[name], name) for name in there)
             pattern = tuple(bound[name] for name in there)
             lacking = [name for name in names if name not in bound]
-            if lacking:
-                zeros = tuple(tree.Declarator(at, name, tree.NumberLiteral(at, "0")) for name in lacking)
+            doubles = [name for name in lacking if types[name].name == ("double",)]
+            if doubles:
+                zeros = tuple(tree.Declarator(at, name, tree.NumberLiteral(at, "0")) for name in doubles)
                 first = [tree.Declaration(at, tree.TypeName(at, ("double",)), zeros)]
+            first += [
+                tree.Declaration(at, _of_variable(types[name]), (tree.Declarator(at, name),))
+                for name in lacking
+                if name not in doubles
+            ]
+        self._check_condition(node, chosen, {one.name for one in parameters})
+        if self.findings:
+            return None
         trigger = tree.MessageTrigger(at, node.topic, chosen.type, at, None, _moved(pattern, at), node.when)
         action = replace(node.action, statements=(*_moved(tuple(first), at), *node.action.statements))
         return tree.EventDefinition(at, node.modifiers, node.name, _moved(parameters, at), trigger, action)
+
+    def _check_condition(self, node: tree.TypedEvent, chosen: _Chosen, fields: Collection[str]) -> None:
+        names = {one.parts[0] for one in node.names} - {*fields}
+        for part in tree.walk(node.when):
+            if isinstance(part, tree.Name) and part.parts[0] in names:
+                text = f"{shown(part.parts[0])} is not a field of {chosen.type}: test it in the action, not in `when`"
+                self._refuse(part.position, text)
+
+
+def _of_variable(kind: tree.TypeName) -> tree.TypeName:
+    return replace(kind, name=("std", "vector")) if kind.name == ("[]",) else kind
 
 
 def _number(at: Position, text: str) -> tree.Expression:
@@ -315,10 +387,7 @@ def _with_values_of_roles(known: tree.Specification, topics: Iterable[_Chosen]) 
     types: dict[tuple[str, ...], tree.TypeName] = {}
     for chosen in topics:
         for one in (*chosen.role.parameters, *chosen.row.parameters):
-            array = one.type.name == ("[]",)
-            types[chosen.role.name, one.name] = (
-                replace(one.type, name=("std", "vector")) if array else one.type
-            )
+            types[chosen.role.name, one.name] = _of_variable(one.type)
     if not types:
         return known
     return _changed(known, lambda part: types.get(part.name) if isinstance(part, tree.TypeName) else None)

@@ -33,7 +33,7 @@ def corners(value: str) -> tuple[tuple[str, str], ...]:
     pairs = [word.split(",") for word in value.replace(" ,", ",").replace(", ", ",").split()]
     if not 3 <= len(pairs) <= _MOST_CORNERS or any(len(pair) != 2 for pair in pairs):
         raise ValueError
-    found = tuple((_number(x), _number(y)) for x, y in pairs)
+    found = tuple((number(x), number(y)) for x, y in pairs)
     if fault := fault_of([(float(x), float(y)) for x, y in found]):
         raise ValueError(f"{fault}; give the corners in order along the edge")
     return found
@@ -43,13 +43,17 @@ def joints(value: str) -> tuple[tuple[str, str, str], ...]:
     """Return name, lower and upper limit of each joint."""
     if value == NO_JOINTS:
         return ()
-    rows = []
+    rows: list[tuple[str, str, str]] = []
     for word in value.split():
         name, _, limits = word.partition(":")
         low, dots, high = limits.partition("..")
         if not dots or not _JOINT.fullmatch(name):
             raise ValueError
-        rows.append((name, _number(low), _number(high)))
+        if any(name == row[0] for row in rows):
+            raise ValueError(f"{name} occurs twice")
+        if float(number(low)) > float(number(high)):
+            raise ValueError(f"the lower limit of {name} is above the upper one")
+        rows.append((name, low, high))
     if not rows:
         raise ValueError
     return tuple(rows)
@@ -70,7 +74,8 @@ def nanoseconds(value: str) -> int:
     return int(time)
 
 
-def _number(text: str) -> str:
+def number(text: str) -> str:
+    """Return the text of a finite number."""
     if not _NUMBER.fullmatch(text) or not math.isfinite(float(text)):
         raise ValueError
     return text

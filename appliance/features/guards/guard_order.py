@@ -1,7 +1,7 @@
 """The pairs of presets whose order on a topic changes what they promise.
 
 The phases of the presets keep each row. Guards of releases before 0.4 have no phase, and see messages in the order of
-their files: until 0.5, a new guard beside them whose name breaks a row gets an `order` statement.
+their files: until 0.5, a new guard gets an `order` statement for each of them on its topic.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -88,11 +88,27 @@ class Placed:
     """Whether it has the phase of its preset, unlike guards of releases before 0.4."""
 
 
+def _closure() -> frozenset[tuple[str, str]]:
+    pairs = {(first, then) for row in PRECEDENCES for first in row.first for then in row.then}
+    while further := {(one, last) for one, to in pairs for by, last in pairs if to == by} - pairs:
+        pairs |= further
+    return frozenset(pairs)
+
+
+_BEFORE = _closure()
+"""The pairs of presets that the rows order, also through a third one."""
+
+
 def statements(new: Placed, loaded: Iterable[Placed]) -> str:
-    """Return the `order` statements that the text of a new guard needs, as lines behind it."""
-    pairs = [sorted((new, other), key=lambda one: one.file) for other in loaded]
+    """Return the `order` statements that the text of a new guard needs, as lines behind it.
+
+    The files alone do not order the two: phases move guards, also because of guards of other topics.
+    """
+    pairs = [pair for other in loaded if not other.phased for pair in ((other, new), (new, other))]
     return "".join(
-        f"\norder {second.name} < {first.name};\n" for first, second in pairs if _broken(first, second)
+        f"\norder {first.name} < {then.name};\n"
+        for first, then in pairs
+        if first.command == then.command and (first.preset, then.preset) in _BEFORE
     )
 
 

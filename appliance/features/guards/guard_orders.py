@@ -61,6 +61,10 @@ def _written(value: bool | int | float | str) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def _with_warnings(loaded: Replacement, further: list[str]) -> Replacement:
+    return msgspec.structs.replace(loaded, warnings=[*loaded.warnings, *further]) if further else loaded
+
+
 class GuardOrders:
     """Answers requests about guards; `graph()` returns the present graph."""
 
@@ -182,10 +186,7 @@ class GuardOrders:
         )  # fmt: skip
         loaded = await self._monitors.load(order, who, enable=not request.shadow)
         self._record_loaded()
-        elsewhere = self.placement.sentences(request.topics["command"])
-        return (
-            msgspec.structs.replace(loaded, warnings=[*loaded.warnings, *elsewhere]) if elsewhere else loaded
-        )
+        return _with_warnings(loaded, self.placement.sentences(request.topics["command"]))
 
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         monitors, name = self._monitors, request.name
@@ -211,7 +212,7 @@ class GuardOrders:
         )  # fmt: skip
         loaded = await monitors.load(order, who)
         self._record_loaded()
-        return loaded
+        return _with_warnings(loaded, [*faults(self._placed())])
 
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
         monitors, name = self._monitors, request.name or request.preset
@@ -361,12 +362,15 @@ class GuardOrders:
         file = monitors.checked.monitors[name]
         text = monitors.sources.files[file]
         given = monitors.givens.states(monitors.checked, name)
+        topics = PRESETS[
+            preset.name
+        ].given_topics  # without the one that cancels goals, which follows from the goal
         return GuardRow(
             name=name,
             preset=preset.name,
             file=file,
             state=self._state(name),
-            topics={one.name: str(one.value) for one in given if one.kind == "topic"},
+            topics={one.name: str(one.value) for one in given if one.kind == "topic" and one.name in topics},
             types=types_in(text),
             given=given,
             loads=loaded_values(text),

@@ -21,6 +21,10 @@ def planned(  # noqa: PLR0917  one caller
     """Return the guard to make, or raise `GuardError`. `kinds` are the user's types for topics that no node has yet."""
     known = {one.name: one.type for one in graph if one.type != _UNKNOWN}
     given = preset.given_topics
+    for each in kinds:
+        if each not in preset.topics:
+            why = "always has the same type" if each in given else "is not one of its topics"
+            raise GuardError(f"{preset.name}: {each} {why}; give the type of {', '.join(preset.topics)}")
     chosen = dict(topics)
     if preset.name == "answer":
         before = topics["command"].removesuffix("/goal")

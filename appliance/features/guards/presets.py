@@ -233,8 +233,8 @@ def _written(head: Head, body: str) -> str:
 
 def head_of(text: str) -> Head | None:
     """Return what the `preset` statement of a text says, or nothing if the text does not begin with one."""
-    line = text.partition("\n")[0]
-    words = line.replace("{", " {").rstrip(";").split()
+    statement, _rest = _divided(text)
+    words = statement.partition("{")[0].rstrip("; ").split()
     if words[:1] != ["preset"]:
         return old_form.head_of(text)
     if len(words) < 3 or not words[2].isdecimal():
@@ -242,8 +242,8 @@ def head_of(text: str) -> Head | None:
     if words[3:4] != ["as"]:
         return Head(words[1], int(words[2]), words[1], {})
     settings = {}
-    for line in text.partition("}")[0].partition("{")[2].split(";"):
-        name, sign, value = line.partition("=")
+    for setting in statement.partition("{")[2].split(";"):
+        name, sign, value = setting.partition("=")
         if sign:
             settings[name.strip()] = " ".join(value.split())
     return Head(words[1], int(words[2]), words[4] if len(words) > 4 else "", settings)
@@ -251,8 +251,22 @@ def head_of(text: str) -> Head | None:
 
 def body_of(text: str) -> str:
     """Return the text behind its `preset` statement."""
-    line, _, rest = text.partition("\n")
-    return text.partition("}\n")[2] if line.startswith("preset ") and " as " in line else rest
+    return _divided(text)[1]
+
+
+def _divided(text: str) -> tuple[str, str]:
+    """Return the `preset` statement without remarks and its end, or the first line; and the text behind it."""
+    first, _, rest = text.partition("\n")
+    if not first.startswith("preset ") or " as " not in first.partition("//")[0]:
+        return first.partition("//")[0], rest
+    statement, end = "", 0
+    for line in text.split("\n"):
+        code, brace, _ = line.partition("//")[0].partition("}")
+        statement += f"{code} "
+        if brace:
+            return statement, text[end + len(code) + 1 :].removeprefix("\n")
+        end += len(line) + 1
+    return statement, ""
 
 
 def preset_of(text: str) -> Preset | None:

@@ -73,7 +73,10 @@ def upgraded(
             changed[each] = ["", parameter.default]
     try:
         types = {each: kind for each, kind in types_in(text).items() if each not in topics}
-        guard = planned(preset, name, {**topics_in(text), **topics}, graph, values, types)
+        types = {each: kind for each, kind in types.items() if each in preset.topics}
+        given = preset.given_topics  # `cancel` of an action follows from its goal now
+        kept = {each: topic for each, topic in topics_in(text).items() if each in given}
+        guard = planned(preset, name, {**kept, **topics}, graph, values, types)
     except GuardError as error:
         raise GuardError(f"{name}: {error}; or remove it, and make it again") from error
     return Upgrade(text_of(guard) + order_of(text), changed, warnings)

@@ -182,7 +182,8 @@ def new(
 
     Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5
     """
-    topics = {"command": topic, **({} if by is None else {"by": by}), **_pairs(further, "--topic NAME=TOPIC")}
+    named = [f"command={topic}", *([] if by is None else [f"by={by}"])]
+    topics = _pairs([*named, *(further or [])], "--topic NAME=TOPIC")
     given, types = _pairs(values, "PARAMETER=VALUE"), _pairs(kinds, "--type NAME=TYPE")
     guard = name or preset
     if dry_run:
@@ -370,9 +371,8 @@ def _undo(guard: GuardRow) -> str:
     """Return the command that makes a removed guard again. It begins in its initial state."""
     if guard.origin != "current":
         return "rosrv monitor rollback"
-    constants = {
-        one.name: str(one.value) for one in guard.given if one.kind != "topic" and one.value != one.default
-    }
+    others = [one for one in guard.given if one.value != one.default]
+    constants = values_of(others)
     topics = dict(guard.topics)
     words = ["rosrv", "guard", "new", guard.preset, topics.pop("command")]
     words += [f"{name}={value}" for name, value in (constants | guard.loads).items()]
@@ -392,11 +392,13 @@ def _runs(appliance: Appliance) -> bool:
 
 
 def _pairs(texts: list[str] | None, form: str) -> dict[str, str]:
-    found = {}
+    found: dict[str, str] = {}
     for text in texts or []:
         name, sign, value = text.partition("=")
         if not sign or not name or not value:
             raise GuardError(f"{text}: write {form}")
+        if name in found:
+            raise GuardError(f"{name} has two values, {found[name]} and {value}: give one")
         found[name] = value
     return found
 

@@ -197,20 +197,50 @@ def test_the_page_has_the_table() -> None:
         assert f"| {names[0]} | {names[1]} | {otherwise} |" in page
 
 
-def test_an_old_guard_is_ordered_among_those_of_its_topic_only_where_a_name_is_wrong() -> None:
-    def placed(name: str, preset: str, command: str = "/cmd_vel", *, phased: bool = False) -> Placed:
-        return Placed(name, preset, command, f"{name}.rv", phased)
+def placed(name: str, preset: str, command: str = "/cmd_vel", *, phased: bool = True) -> Placed:
+    return Placed(name, preset, command, f"{name}.rv", phased)
 
-    stop, fence = placed("estop", "estop"), placed("yard", "fence")
-    cap = placed("cap", "speed", phased=True)
-    assert statements(placed("speed", "speed"), [stop, placed("z", "fence", "/arm/cmd_vel")]) == ""
+
+def in_its_phase(guard: Placed) -> str:
+    """Return a specification with the name of a guard, and with the phase of its preset if it has one."""
+    phase = re.search(r" in \w+(?= given)", PRESETS[guard.preset].text) if guard.phased else None
+    return f"{guard.name}(){phase[0] if phase else ''} {{ event e() /t std_msgs/Empty '{{}}' {{ }} }}\n"
+
+
+@pytest.mark.parametrize("guards", [*product(("a", "m"), ("b", "n"), ("c", "z"))])
+def test_a_new_guard_is_ordered_among_old_ones_whatever_their_names_and_other_topics(
+    guards: tuple[str, str, str],
+) -> None:
+    """The phase of the guard of an arm also moves the others."""
+    fence, speed, joints = guards
+    old = placed(speed, "speed", phased=False)
+    new = placed(fence, "fence")
+    arm = placed(joints, "joints", "/arm/command")
+    files = {
+        old.file: in_its_phase(old),
+        new.file: in_its_phase(new) + statements(new, [old]),
+        arm.file: in_its_phase(arm) + statements(arm, [old, new]),
+    }
+    compiled = compiled_from(dict(sorted(files.items())), DEFINITIONS, lints=False)
+    names = [one.name for one in compiled.specifications]
+    assert names.index(fence) < names.index(speed)
+
+
+def test_an_old_guard_is_ordered_among_those_of_its_topic() -> None:
+    stop, fence = placed("estop", "estop", phased=False), placed("yard", "fence", phased=False)
+    cap = placed("cap", "speed")
+    assert statements(placed("speed", "speed"), [placed("z", "fence", "/arm/cmd_vel", phased=False)]) == ""
     assert statements(cap, [stop, fence]) == "\norder estop < cap;\n\norder yard < cap;\n"
-    assert statements(cap, [placed("yard", "fence", phased=True)]) == ""
-    assert statements(fence, [cap]) == "\norder yard < cap;\n"
-    [fault] = faults([stop, placed("speed", "speed"), fence])
+    assert statements(cap, [placed("yard", "fence")]) == ""
+    assert (
+        statements(placed("yard", "fence"), [placed("cap", "speed", phased=False)]) == "\norder yard < cap;\n"
+    )
+    third = placed("last", "deadman")  # before a rate, which is before a fence
+    assert statements(third, [fence]) == "\norder last < yard;\n"
+    [fault] = faults([stop, placed("speed", "speed", phased=False), fence])
     assert (
         fault.startswith("speed acts before yard: after a stop")
         and "order yard < speed; into speed.rv" in fault
     )
-    assert not [*faults([stop, fence, placed("speed", "speed")])]
-    assert not [*faults([cap, placed("yard", "fence", phased=True)])]
+    assert not [*faults([stop, fence, placed("speed", "speed", phased=False)])]
+    assert not [*faults([cap, placed("yard", "fence")])]

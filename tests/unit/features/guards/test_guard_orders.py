@@ -15,6 +15,7 @@ from appliance.features.guards import guard_orders
 from appliance.features.guards import requests as guard_requests
 from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_orders import GuardOrders
+from appliance.features.guards.message_types import GOAL
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.features.guards.released import released
 from appliance.features.guards.upgrades import Upgrade
@@ -172,6 +173,18 @@ async def test_a_guard_names_the_nodes_that_it_awaits(manager: Manager, orders: 
     assert (await row(orders)).awaits == "/lidar on /scan"
 
 
+async def test_the_topic_that_cancels_goals_is_not_one_to_make_the_guard_with(
+    manager: Manager, orders: GuardOrders
+) -> None:
+    stop = Guard("fence", PRESETS["estop"], {"command": "/arm/goal"}, {"command": GOAL})
+    manager.sources.files["fence.rv"] = text_of(stop)
+    topics = {"command": "/arm/goal", "cancel": "/arm/cancel", "stop": "/s", "reset": "/r"}
+    manager.givens.states = lambda _checked, _name: [
+        SimpleNamespace(name=name, value=topic, kind="topic") for name, topic in topics.items()
+    ]
+    assert (await row(orders)).topics.keys() == PRESETS["estop"].given_topics.keys()
+
+
 async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders) -> None:
     found = await row(orders)
     assert (found.loads, found.types) == ({"polygon": "0,0 1,0 1,1"}, TYPES)
@@ -267,6 +280,34 @@ async def test_a_new_guard_acts_behind_an_old_one_and_a_wrong_order_is_reported(
     manager.checked.monitors = {"cap": "cap.rv", **manager.checked.monitors}
     [warning] = (await orders.guards(guard_requests.GuardsWanted())).warnings
     assert "cap acts before fence" in warning
+
+
+async def test_an_upgrade_beside_old_guards_reports_a_wrong_order(
+    manager: Manager, orders: GuardOrders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def load(order: Any, _who: str) -> Replacement:
+        manager.sources.files |= order.files
+        return Replacement(3, "3.0", 1, [], [], [], [], [], [], [], None)
+
+    monkeypatch.setattr(manager, "load", load)
+    manager.sources.files = {"cap.rv": released("speed", 1).text, "fence.rv": released("fence", 2).text}
+    manager.checked.monitors = {"cap": "cap.rv", "fence": "fence.rv"}
+    new = Upgrade(text_of(FENCE), {}, [])
+    monkeypatch.setattr(guard_orders, "upgraded", lambda *_given: new)
+    [warning] = (await orders.upgrade(guard_requests.GuardUpgrade("fence"), "eve")).warnings
+    assert "cap acts before fence" in warning
+
+
+async def test_a_type_of_an_unknown_topic_is_refused(manager: Manager, orders: GuardOrders) -> None:
+    for preset, name, why in (
+        ("speed", "by", "speed: by is not one of its topics; give the type of command"),
+        ("arm", "fix", "arm: fix always has the same type; give the type of command, by"),
+    ):
+        types = {"command": TYPES["command"], name: "nav_msgs/Odometry"}
+        request = guard_requests.GuardNew(preset, {"command": "/c", "by": "/b"}, types=types, name="x")
+        with pytest.raises(SenselessError, match=why):
+            await orders.new(request, "eve")
+    assert not manager.orders
 
 
 async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.guards.guard_order import PRECEDENCES
+from appliance.features.guards.old_form import Head
 from appliance.features.guards.presets import (
     FOLDER,
     PRESETS,
@@ -13,6 +14,7 @@ from appliance.features.guards.presets import (
     Preset,
     below_the_standard,
     described,
+    head_of,
     preset_of,
     text_of,
     with_values,
@@ -109,6 +111,21 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
     assert text.replace("0,0 4,0 0,3.5", "1,1 2,1 2,2") == with_values(text, {"polygon": "1,1 2,1 2,2"})
     [code] = compiled(text).specifications
     assert {one.topic for one in code.events if one.topic} == {"/base/cmd", "/pose"}
+
+
+def test_a_preset_statement_is_read_however_it_is_written() -> None:
+    guard = Guard("yard", PRESETS["fence"], {"command": "/base/cmd"}, values={"margin": "0.5"})
+    text = text_of(guard)
+    statement = text.removesuffix(guard.preset.body)
+    with_remarks = statement.replace("{", "{   // our } yard; margin = 9").replace(
+        "0.5;", "0.5;  // metres = 1;"
+    )
+    for written in (statement, with_remarks, " ".join(statement.split()) + "\n"):
+        other = written + guard.preset.body
+        assert head_of(other) == head_of(text) and with_values(other, {}) == text
+        [here], [there] = (compiled(one).specifications for one in (other, text))
+        assert here.identity == there.identity
+    assert head_of("preset fence 3;  // ours\n") == Head("fence", 3, "fence", {})
 
 
 WRONG = [

@@ -30,6 +30,7 @@ from appliance.features.guards.upgrades import upgraded
 from distribution import released_presets
 from rosmop.check.reachable_types import identity
 from rosmop.text.parser import parse
+from rosmop.text.tree import TopicDeclaration
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import sample
 
@@ -140,6 +141,18 @@ def test_a_guard_of_an_old_release_is_recognised_and_made_again(name: str, versi
     new = upgraded(old_form.with_values(text, by_default), {}, facts)
     assert origin_of(new.text) == "current" and topics_in(new.text).items() >= topics.items()
     assert {one: values_in(new.text)[one] for one in kept} == {one: values_in(text)[one] for one in kept}
+
+
+def test_an_old_guard_of_goals_is_made_again() -> None:
+    """Its text, which 0.3.0 made, has the topic that cancels goals. Now that topic follows from the goal."""
+    text = Path(__file__).with_name("estop_of_goals_0.3.0.rv").read_text(encoding="utf-8")
+    assert origin_of(text) == "older" and topics_in(text)["cancel"] == "/r/arm/cancel"
+    new = upgraded(text, {}, [])
+    assert origin_of(new.text) == "current"
+    assert topics_in(text).items() - topics_in(new.text).items() == {("cancel", "/r/arm/cancel")}
+    assert types_in(new.text) == {"command": "move_base_msgs/MoveBaseActionGoal"}
+    given = parse(new.text, "guard.rv").specifications[0].givens
+    assert "/r/arm/cancel" in {one.topic for one in given if isinstance(one, TopicDeclaration)}
 
 
 def old_types(text: str) -> Iterator[tuple[str, str]]:

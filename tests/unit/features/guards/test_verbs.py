@@ -1,6 +1,8 @@
 import contextlib
 import errno
 import json
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +11,7 @@ import pytest
 import typer
 
 from appliance.channel import admin
-from appliance.channel.answers.monitor_answers import GivenSet, Replacement, Switched
+from appliance.channel.answers.monitor_answers import GivenSet, GivenState, Replacement, Switched
 from appliance.cli.output import say_json
 from appliance.features.guards import verbs
 from appliance.features.guards.guard_answers import (
@@ -21,7 +23,19 @@ from appliance.features.guards.guard_answers import (
     Suggestion,
     Suggestions,
 )
-from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
+from appliance.features.guards.plans import planned
+from appliance.features.guards.presets import (
+    PRESETS,
+    Guard,
+    GuardError,
+    Parameter,
+    Preset,
+    loaded_values,
+    text_of,
+    topics_in,
+    types_in,
+    values_in,
+)
 from appliance.features.guards.requests import (
     GuardNew,
     GuardSuggestionsWanted,
@@ -29,6 +43,9 @@ from appliance.features.guards.requests import (
     GuardTry,
     GuardUpgrade,
 )
+from appliance.features.guards.upgrades import same
+from rosmop.types.roles import ANY_TYPE
+from tests.unit.features.guards.test_released import made
 
 
 class Robot:
@@ -347,3 +364,87 @@ def test_a_guard_that_cannot_be_upgraded_does_not_keep_the_others_from_it(
     with pytest.raises(typer.Exit):
         run(verbs.upgrade, robot)
     assert asked == ["old"]
+
+
+class Removing(Robot):
+    """An appliance with one guard, as it shows it."""
+
+    def __init__(self, folder: Path, guard: Guard) -> None:
+        super().__init__(folder, guard)
+        text = text_of(guard)
+        constants = [
+            GivenState(
+                one.name,
+                one.kind,
+                _typed(one, guard.values[one.name]),
+                one.unit,
+                default=_typed(one, one.default),
+            )
+            for one in guard.preset.parameters
+            if not one.loads
+        ]
+        self.row = GuardRow(
+            guard.name, guard.preset.name, "", "shadow", dict(guard.topics), types_in(text), constants,
+            loaded_values(text), 0, version=guard.preset.version, origin="current", below=[], digest="",
+        )  # fmt: skip
+
+    def ask_or_exit(self, request: Any) -> Any:
+        if isinstance(request, GuardsWanted):
+            return SimpleNamespace(guards=[self.row], warnings=[])
+        return super().ask_or_exit(request)
+
+
+def _typed(parameter: Parameter, value: str) -> bool | int | float:
+    return (
+        value == "true" if parameter.kind == "bool" else {"int": int, "double": float}[parameter.kind](value)
+    )
+
+
+@pytest.mark.parametrize("place", [0, -1])
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_the_undo_of_a_removal_makes_the_same_guard(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], preset: Preset, place: int
+) -> None:
+    kinds = tuple(types[place].replace(ANY_TYPE, "sensor_msgs/Joy") for types in preset.topics.values())
+    guard = made(preset, kinds)
+    if "frozen" in guard.values:  # of any other type only the silence is judged
+        guard = replace(guard, values={**guard.values, "frozen": "0"})
+    robot = Removing(tmp_path, guard)
+    run(verbs.remove, robot, guard.name)
+    [undo] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("undo: ")]
+    words = iter(shlex.split(undo)[4:])
+    values, options = [], []
+    for word in words:
+        if word.startswith("--"):
+            options.append((word, "" if word == "--shadow" else next(words)))
+        else:
+            values.append(word)
+    robot.orders.clear()
+    order = run(
+        verbs.new, robot, *values[:2], values[2:], shadow=("--shadow", "") in options,
+        **{name: value for option, value in options if (name := option.strip("-")) in {"by", "name"}},
+        further=[value for option, value in options if option == "--topic"],
+        kinds=[value for option, value in options if option == "--type"],
+    )  # fmt: skip
+    again = text_of(planned(PRESETS[order.preset], order.name, order.topics, [], order.values, order.types))
+    assert order.shadow and (topics_in(again), types_in(again)) == (guard.topics, guard.types)
+    found = values_in(again)
+    assert found.keys() == guard.values.keys()
+    assert all(same(found[name], value) for name, value in guard.values.items())
+
+
+@pytest.mark.parametrize(
+    ("values", "options"),
+    [
+        (["vMax=1", "vMax=2"], {}),
+        ([], {"further": ["by=/a", "by=/b"]}),
+        ([], {"by": "/a", "further": ["by=/b"]}),
+        ([], {"further": ["command=/b"]}),
+        ([], {"kinds": ["command=geometry_msgs/Twist", "command=geometry_msgs/TwistStamped"]}),
+    ],
+)
+def test_an_argument_that_is_given_twice_is_refused(tmp_path: Path, values: list[str], options: Any) -> None:
+    robot = Robot(tmp_path)
+    with pytest.raises(GuardError, match=r"has two values, .* and .*: give one"):
+        run(verbs.new, robot, "speed", "/cmd_vel", values, **options)
+    assert not robot.orders
