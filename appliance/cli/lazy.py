@@ -18,6 +18,8 @@ from rosmop.tool.renamed_options import renamed
 from rosmop.tool.terminal import flowed
 
 _HELP_OPTIONS = ["-h", "--help"]
+_FOLDERS = ("--state", "--monitors", "--other")
+_TIMES = ("--since", "--until", "--before", "--after", "--within", "--confirm-within", "--at", "--for")
 
 
 def application(
@@ -140,8 +142,23 @@ def loaded(verb: Verb, name: str) -> Any:
     command = typer.main.get_command(app)
     # click keeps the help option of the first context that asks for it
     context = typer.Context(command, info_name=name, help_option_names=_HELP_OPTIONS)
-    _without_type_of_flags(command.get_params(context))
+    for option in _without_type_of_flags(command.get_params(context)):
+        if isinstance(option, TyperOption) and option.metavar is None:
+            option.metavar = _metavar(option, option.display_type(context) or "")
     return command
+
+
+def _metavar(option: TyperOption, kind: str) -> str | None:
+    """Return the word for an option's value, one for each kind of value; None keeps typer's."""
+    name = next(one for one in option.opts if one.startswith("--"))
+    if name in _TIMES and kind == "<str>":
+        return "TIME"
+    words = {
+        "<path>": "DIR" if name in _FOLDERS else "FILE",
+        "<str>": name.lstrip("-").upper(),
+        "<int>": "N",
+    }
+    return words.get(kind.replace("list[", "").replace("]", ""))
 
 
 def _without_type_of_flags(options: list[Any]) -> list[Any]:

@@ -9,7 +9,7 @@ from appliance.cli.output import moment
 from rosmop.tool.terminal import say
 
 
-def say_replaced(body: Replacement, promote: str = "rosrv monitor promote") -> None:
+def say_replaced(body: Replacement, enforce: str = "rosrv monitor enforce") -> None:
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [
@@ -27,7 +27,7 @@ def say_replaced(body: Replacement, promote: str = "rosrv monitor promote") -> N
     say_deadline(body.confirm_by, "monitor")
     for word, idle, command in (
         ("disabled", body.disabled, "rosrv monitor enable"),
-        ("in shadow mode", body.shadow, promote),
+        ("in shadow mode", body.shadow, enforce),
     ):
         if idle:
             say(f"{word}: {', '.join(idle)}; {command} {' '.join(idle)}", "yellow")

@@ -20,9 +20,7 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.output import say_json
 from rosmop.tool.terminal import printable
 
-Watch = Annotated[
-    bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
-]
+Watch = Annotated[bool, typer.Option("--watch", help="Redraw it until Ctrl-C, in place on a terminal")]
 LEAST_SECONDS, LONGEST_SECONDS = 1.0, 3600.0
 _INTERRUPTED, _AWAY = 130, 2
 _MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment

@@ -67,9 +67,7 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     listen: Annotated[
         str | None, typer.Option(help="HOST:PORT of RVMaster for ROS_MASTER_URI; port 0: any")
     ] = None,
-    rosmaster_port: Annotated[
-        int | None, typer.Option(help="Port of the hidden ROS master; with 0, any")
-    ] = None,
+    rosmaster_port: Annotated[int | None, typer.Option(help="Port of the ROS master; with 0, any")] = None,
     isolation: Annotated[
         str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)
     ] = None,

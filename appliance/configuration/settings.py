@@ -384,7 +384,7 @@ class Settings:
         default=12311,
         ge=0,
         le=65_535,
-        description="loopback port of the hidden ROS master; with 0, any free one",
+        description="loopback port of the ROS master; with 0, any free one",
     )
     isolation: Literal["container", "netns", "none"] = key(
         default="netns",

@@ -445,7 +445,8 @@ def main(arguments: list[str]) -> int:
             copies = kept_copies(given.checkpoints) if given.checkpoints else {}
             verifier = Verifier(given.bundle, given.key, Path(folder), copies)
         except Exception as error:
-            why = f"{given.bundle}: {error}" if isinstance(error, zipfile.BadZipFile) else str(error)
+            bad = isinstance(error, zipfile.BadZipFile)
+            why = f"{given.bundle}: not an evidence bundle: {error}" if bad else str(error)
             if isinstance(error, OSError) and error.filename:
                 why = f"{error.filename}: {error.strerror}"
             print(printable(f"nothing can be verified: {why}"))

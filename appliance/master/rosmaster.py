@@ -1,4 +1,4 @@
-"""Call the hidden ROS master, and state the registrations to it.
+"""Call the ROS master, and state the registrations to it.
 
 Calls use kept connections. A *door* holds them back while the ROS master is rebuilt.
 

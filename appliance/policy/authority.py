@@ -148,7 +148,7 @@ def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings:
     taken = {name: group.name for group in found.values() for name in group.names}
     for value in entry.values:
         if not is_global_name(value.text):
-            text = f"{quoted(value.text)} is not a resolved name (/cmd_vel) without patterns"
+            text = f"{quoted(value.text)}: a group lists full names such as /cmd_vel, without patterns"
             findings.error(value, text)
         elif value.text in taken:
             findings.error(value, f"{value.text} is already in the group {taken[value.text]}")
@@ -221,9 +221,7 @@ def _with_option(
         text = " ".join(value.text for value in entry.values)
         number = _SECONDS.fullmatch(text)
         if number is None or not SHORTEST_LEASE <= float(number[1]) <= LONGEST_LEASE:
-            fault = (
-                f"{quoted(text)} is not a lease: give {SHORTEST_LEASE:g}s to {LONGEST_LEASE:g}s, such as 5s"
-            )
+            fault = f"{quoted(text)} is not a valid time: give {SHORTEST_LEASE:g}s to {LONGEST_LEASE:g}s, such as 5s"
             findings.error(word, fault)
             return group
         return replace(group, lease=float(number[1]))

@@ -466,7 +466,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 raise SpecificationsRefusedError([text])
             shadowed = [name for name in request.names if request.enabled and self.switches.in_shadow(name)]
             if shadowed:
-                text = f"{', '.join(shadowed)} is in shadow mode: rosrv monitor promote brings it into force"
+                text = f"{', '.join(shadowed)} is in shadow mode: rosrv monitor enforce brings it into force"
                 raise SpecificationsRefusedError([text])
             names = await self._switch(request.names, request.enabled, who, seconds)
             return self._switched(names, until=self.returns.until(names[0]) if names else None)

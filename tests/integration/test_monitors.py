@@ -142,8 +142,8 @@ def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     status = appliance.status()["monitors"]
     assert (status["enabled"], status["shadow"]) == (0, ["words"])
     assert "1 in shadow mode" in appliance.rosrv("status").stdout
-    assert "rosrv monitor promote" in appliance.rosrv("monitor", "enable", "words", check=False).stderr
-    assert appliance.rosrv("monitor", "promote", "words").stdout == "enabled: words\n"
+    assert "rosrv monitor enforce" in appliance.rosrv("monitor", "enable", "words", check=False).stderr
+    assert appliance.rosrv("monitor", "enforce", "words").stdout == "enabled: words\n"
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
     said = [event["data"] for event in listener.seen(event="received") if event["publisher"] == "/voice"]
     changed = [text.startswith("checked ") for text in said]

@@ -172,7 +172,7 @@ EVENTS: dict[str, str] = {
     "limit exceeded": "A peer sent more data, larger messages or faster than the limits allow.",
     "rate limited": "Messages beyond a limit of the policy ([Limits]) were dropped; `rule` has the limit,"
     " `detail.count` the number of messages.",
-    "probe failed": "The hidden ROS master was reachable from outside; nodes are not served until it is hidden again.",
+    "probe failed": "The ROS master was reachable from outside; nodes are not served until it is hidden again.",
     "probe passed": "The ROS master is hidden, or hidden again.",
     "reconciled": "The reconcile loop found and repaired a difference between the wanted and the observed state.",
     "denials folded": "Repetitions of a denial that is already recorded; `detail` has their number, the first and the"

@@ -96,7 +96,9 @@ def open_for_writing(path: Path) -> sqlite3.Connection:
 def open_for_reading(path: Path) -> sqlite3.Connection:
     """Return a connection that only reads. Raises `LogUnreadableError` and `sqlite3.Error`."""
     if not path.parent.is_dir():
-        raise LogUnreadableError(f"{path.parent}: no such directory; is the state directory right (--state)?")
+        raise LogUnreadableError(
+            f"{path.parent.parent} is not a state directory (--state): it has no folder {path.parent.name}"
+        )
     try:
         if not path.exists():
             raise LogUnreadableError(

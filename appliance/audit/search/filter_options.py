@@ -38,7 +38,7 @@ def filter_given(
         str | None,
         typer.Option(
             "--host",
-            help="Peer: an address or a glob; of an appliance also a network, or a host's name",
+            help="Peer: an address, network or glob; with a running appliance also a host's name",
         ),
     ] = None,
     caller: Annotated[str | None, typer.Option("--caller", help="Name that the node gave; a glob")] = None,
@@ -57,7 +57,10 @@ def filter_given(
     ] = None,
     who: Annotated[
         str | None,
-        typer.Option("--who", help="Author: the name of a token, operator, or disk; a glob"),
+        typer.Option(
+            "--who",
+            help="Author: the name of a token or person, operator for this machine, disk for a file; or a glob",
+        ),
     ] = None,
 ) -> Filter:
     """Return the filter that the options define. Raises `TimestampError`."""

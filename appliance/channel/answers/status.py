@@ -224,9 +224,7 @@ class Status(msgspec.Struct, frozen=True):
     relaying: Annotated[str, doc("`all`, or `monitored`: only topics and services with monitors are relayed")]
     mediation: Annotated[str, doc("`full`, or `monitored`: nodes then get each other's own addresses")]
     firewall: FirewallState
-    probe: Annotated[
-        str, doc("probe of the hidden ROS master: `passed`, or the finding, or empty if not run yet")
-    ]
+    probe: Annotated[str, doc("probe of the ROS master: `passed`, or the finding, or empty if not run yet")]
     policy: PolicyState
     ipsec: IpsecState
     monitors: MonitorsState

@@ -36,7 +36,7 @@ def off_now(monitors: SpecificationManager, policies: Policies) -> Iterator[Swit
             again, until = f"rosrv monitor enable {name}", monitors.returns.until(name)
             yield SwitchedOff("monitors", name, f"monitor {name} is disabled", again, now, until, False)
         else:
-            what, again = f"monitor {name} is in shadow mode", f"rosrv monitor promote {name}"
+            what, again = f"monitor {name} is in shadow mode", f"rosrv monitor enforce {name}"
             yield SwitchedOff("monitors", name, what, again, now, None, False)
     policy = policies.current
     for decider in DECIDERS:

@@ -28,7 +28,7 @@ FEATURE = Feature(
     ),
     verbs={
         "door": Group(
-            "Let browsers, viewers and agents in, each with its own rights.",
+            "Let browsers, Foxglove and agents in, each with its own rights.",
             {
                 "add": Verb(f"{_VERBS}:add"),
                 "list": Verb(f"{_VERBS}:list_doors"),

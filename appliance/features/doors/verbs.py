@@ -40,7 +40,7 @@ def add(
         typer.Option("--from", metavar="ADDRESS", help="Address or network of the agent", show_default=False),
     ] = "",
 ) -> None:
-    """Add a door for one person, viewer or agent. Its rights are those of the host `door:NAME` in the policy.
+    """Add a door for one person, program or agent. Its rights are those of the host `door:NAME` in the policy.
 
     Without --port, only tickets open the door. With --port, any program that connects to the port from the given
     address has the rights of the door.
@@ -63,7 +63,7 @@ def add(
 
 @speaks
 def list_doors(appliance: Appliance) -> None:
-    """List the doors: address, tickets, why a door does not serve, and its clients with their last minute.
+    """List the doors: address, tickets, why a door does not serve, and its clients' traffic of the last minute.
 
     Example: rosrv door list
     """
@@ -100,7 +100,7 @@ def ticket(
         str, typer.Option("--for", metavar="TIME", help="How long it is valid (30m, 8h, 7d)")
     ] = "8h",
 ) -> None:
-    """Make a ticket: a URL with which a person's browser or viewer opens the door. It is shown only here.
+    """Make a ticket: a URL with which a person's browser or Foxglove opens the door. It is shown only here.
 
     Anyone who has the URL has the rights of the door until the ticket ends.
 

@@ -1,4 +1,4 @@
-"""`rosrv monitor list|enable|promote|disable|remove|reload|resume`: monitors of the running appliance."""
+"""`rosrv monitor list|enable|enforce|disable|remove|reload|resume`: monitors of the running appliance."""
 
 from typing import Annotated
 
@@ -103,16 +103,16 @@ def enable(
 
 
 @speaks
-def promote(
+def enforce(
     appliance: Appliance, names: _Names, *, force: Force = False, confirm_within: ConfirmWithin = None
 ) -> None:
-    """Enable monitors that are in shadow mode. They keep their state.
+    """Bring monitors from shadow mode into force. They keep their state.
 
     With --confirm-within they return to shadow mode after this time, even if the appliance restarts.
 
     A monitor that missed messages in shadow mode starts in its initial state; the output names it.
 
-    Example: rosrv monitor promote safeTrigger
+    Example: rosrv monitor enforce safeTrigger
     """
     seconds = seconds_within(confirm_within, "monitor")
     _switch(appliance, admin.MonitorShadow(names, False, force=force, confirm_within=seconds), "enabled")

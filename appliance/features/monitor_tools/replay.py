@@ -58,7 +58,7 @@ def replay_monitor(
     most: Annotated[
         int,
         typer.Option(
-            "--limit", min=0, metavar="N", help="Number of places to show for each monitor, topic and kind"
+            "--limit", min=0, metavar="N", help="Number of findings to show for each monitor, topic and kind"
         ),
     ] = 10,
     margins: Annotated[

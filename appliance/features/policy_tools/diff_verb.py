@@ -69,10 +69,10 @@ def compare(
     robot: Robot = None,
     enrolled: Enrolled = None,
 ) -> None:
-    """Show the changes between two policies as a unified diff. Exit status: 0 no difference, 1 differences.
+    """Show the changes between two policies: of text or, with --decisions, of decisions. Exit status 1 if any.
 
     With one file, compare the policy in force with it. With one revision, compare it with the policy in force. Without
-    arguments, show the changes of the revision in force. For two files, this release still assumes --decisions.
+    arguments, show the changes of the revision in force. For two files, --decisions is assumed.
 
     Example: rosrv policy diff next.ini
     """

@@ -54,7 +54,7 @@ class RecordingWanted(WaitingRequest[Recording], frozen=True, tag="recording"):
     good="The recording is being made.", problems=_NO_RECORDING,
 )  # fmt: skip
 class RecordNow(WaitingRequest[RecordingBegun], frozen=True, tag="record now"):
-    """Record the robot's messages of the last and the next seconds."""
+    """Record the messages of the seconds before and after now."""
 
     before: float | None = None  # seconds before now; None: as configured
     after: float | None = None

@@ -71,7 +71,7 @@ def now(
         str, typer.Option(help="Description of the event, for the recording and the audit log")
     ] = "",
 ) -> None:
-    """Record the robot's messages of the last and the next seconds.
+    """Record the messages of the seconds before and after now.
 
     Example: rosrv record now --after 30s --note "the arm hit the door"
     """

@@ -1,4 +1,4 @@
-"""The commands `rosrv standby status|promote`, for a running appliance."""
+"""The commands `rosrv standby status|switch`, for a running appliance."""
 
 import threading
 from functools import partial
@@ -65,13 +65,13 @@ def status(
 
 
 @speaks
-def promote(appliance: Appliance) -> None:
+def switch(appliance: Appliance) -> None:
     """Make the standby the active appliance, for example before an update: a planned switchover.
 
     Give the order on the active appliance, or on the standby's own machine. It waits until the standby is active, at
     most 20 s. Exit status: 0 switched over, 1 not, with the reason, 2 no appliance runs.
 
-    Example: rosrv standby promote
+    Example: rosrv standby switch
     """
     before = appliance.ask_or_exit(StandbyWanted())
     name = before.other.name if before.role == "active" else before.name

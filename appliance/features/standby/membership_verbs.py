@@ -70,7 +70,11 @@ def join(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--output", help="New folder for the files of the other machines; it has private keys"),
+        typer.Option(
+            "--output",
+            metavar="DIR",
+            help="New folder for the files of the other machines; it has private keys",
+        ),
     ] = None,
     again: Annotated[
         bool, typer.Option("--again", help="Replace an earlier membership; all machines are set up again")
@@ -158,10 +162,10 @@ def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
 
 
 def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
-    """Forget the stored epoch, so that this appliance takes the witness's at its next start. Stop it first.
+    """Forget the stored epoch, so that the next start takes the witness's epoch. Stop the appliance first.
 
     Use it if the witness reports a smaller epoch although its disk was not restored. Run it on both appliances. Exit
-    status: 0 done, 1 the appliance runs, 2 it is not one of two.
+    status: 0 done, 1 the appliance runs, 2 it is not one of a pair.
 
     Example: rosrv standby repair
     """

@@ -14,7 +14,7 @@ from appliance.store.host_tables import AuthorityRow, HostTables
 LIST_DAYS = 30.0  # strongSwan accepts a list for so long (`certificate_authority.REVOCATIONS_DAYS`)
 _WAITS = (
     "new certificates wait, because the key of the hosts' authority is on the other appliance: make that one active"
-    " (rosrv standby promote), or set ipsec.ca_passphrase_file on both, run `rosrv standby join` again and restart"
+    " (rosrv standby switch), or set ipsec.ca_passphrase_file on both, run `rosrv standby join` again and restart"
     " this one"
 )
 

@@ -27,8 +27,8 @@ def add(
     role: Annotated[
         TokenRole,
         typer.Option(
-            help="viewer: read; operator: also reload and roll back; admin: also load new policies; investigator: read,"
-            " and fetch the messages of recordings"
+            help="viewer: read; operator: also reload, roll back, approve, block hosts, make tickets; admin: also load"
+            " new policies; investigator: read, and fetch the messages of recordings"
         ),
     ] = "viewer",
     *,

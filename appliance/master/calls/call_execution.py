@@ -344,7 +344,7 @@ class Execution:
             case EncodingError():
                 return self._malformed(call, caller, ProtocolError(f"cannot be forwarded: {error}"))
             case CallFailedError():
-                # The text contains the hidden ROS master's address, so it is only logged.
+                # The text contains the ROS master's address, so it is only logged.
                 _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
                 return [0, "the ROS master does not answer; the appliance is restarting it", call.denial]
         raise error

@@ -77,7 +77,7 @@ LOOKING = [
     ("host", "blocks"), ("host", "unblock", "10.9.9.9"), ("host", "block", "nobody"),
     ("record", "list"), ("record", "list", "--json"), ("record", "show", "a" * 20), ("record", "now"),
     ("record", "remove", "a" * 20), ("record", "timeline", "a" * 20), ("monitor", "rollback", "777"),
-    ("monitor", "confirm"), ("monitor", "promote", "nobody"), ("monitor", "set", "nobody", "vMax=1"),
+    ("monitor", "confirm"), ("monitor", "enforce", "nobody"), ("monitor", "set", "nobody", "vMax=1"),
     ("alarm", "list"), ("alarm", "acknowledge", "nothing", "--note", "seen"),
     ("alarm", "silence", "nothing", "--for", "1h"),
     ("guard", "list"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),

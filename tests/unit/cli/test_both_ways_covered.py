@@ -10,7 +10,7 @@ COMPARISON = Path(__file__).parents[2] / "integration" / "cli" / "test_both_ways
 # select the appliance.
 ELSEWHERE = {
     "monitor replay", "record messages", "record fetch", "host add", "host kit", "policy check", "monitor diff",
-    "standby status", "standby promote", "limits", "door add", "audit acknowledge", "adopt", "release",
+    "standby status", "standby switch", "limits", "door add", "audit acknowledge", "adopt", "release",
     "report interventions", "up", "selftest", "protect",
 }  # fmt: skip
 

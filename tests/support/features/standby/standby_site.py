@@ -179,7 +179,7 @@ class StandbySite:
 
     def promote(self, name: str) -> None:
         eventually(
-            lambda: self.holder() != name or self.appliances[name].rosrv("standby", "promote"), self.story
+            lambda: self.holder() != name or self.appliances[name].rosrv("standby", "switch"), self.story
         )
 
     def until_taken_over(self, name: str) -> None:

@@ -54,7 +54,7 @@ def test_a_standby_that_the_witness_does_not_answer(site: StandbySite) -> None:
                 lambda one=one: one.rosrv("standby", "status", check=False).returncode == 1,  # type: ignore[misc]  # mypy infers no type for a lambda's default
                 site.story,
             )
-            done = one.rosrv("standby", "promote", check=False)
+            done = one.rosrv("standby", "switch", check=False)
             assert (done.returncode, "does not answer" in done.stderr) == (1, True), done
     assert site.lease.read().epoch == 2
 
@@ -136,7 +136,7 @@ def refuse(site: StandbySite, words: str) -> None:
 
         eventually(reports, site.story)
     for one in site.appliances.values():
-        done = one.rosrv("standby", "promote", check=False)
+        done = one.rosrv("standby", "switch", check=False)
         assert (done.returncode, words in done.stderr) == (1, True), done
     assert site.lease.read().epoch == epoch
 

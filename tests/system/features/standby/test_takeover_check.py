@@ -74,7 +74,7 @@ def test_other_site_keys(site: StandbySite) -> None:
     load(site, f"{OPEN_POLICY}# unsigned\n", "")
     until_obstacle(site, NO_SIGNATURE, "a", "b")
     for name in ("a", "b"):
-        done = site.appliances[name].rosrv("standby", "promote", check=False)
+        done = site.appliances[name].rosrv("standby", "switch", check=False)
         assert (done.returncode, NO_SIGNATURE in done.stderr) == (1, True), done
     assert site.holder() == "a"
     claims = site.lease.read().epoch

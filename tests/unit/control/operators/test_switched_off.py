@@ -53,7 +53,7 @@ async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
     watch.look(700.0)
     assert scene.recorded == [
         "protection forgotten: monitor a is disabled for more than 1.0 h: rosrv monitor enable a",
-        "protection forgotten: monitor b is in shadow mode for more than 1.0 h: rosrv monitor promote b",
+        "protection forgotten: monitor b is in shadow mode for more than 1.0 h: rosrv monitor enforce b",
     ]
     await scene.store.settled()
     watch = scene.watch()

@@ -56,7 +56,7 @@ async def test_the_second_appliance_opens_tunnels_and_issues_nothing(
     second = SharedAuthority(near(tmp_path, "b"), store.hosts)
     assert await second.certificate() == certificate
     assert await second.revocations([("1f", 1.0), ("2f", 2.0)]) == listed
-    with pytest.raises(AuthorityError, match=r"new certificates wait, .*\(rosrv standby promote\)") as caught:
+    with pytest.raises(AuthorityError, match=r"new certificates wait, .*\(rosrv standby switch\)") as caught:
         await second.issue(signing_request(make_key(), "ocu-1"), "ocu-1", 1)
     assert not caught.value.refused
 

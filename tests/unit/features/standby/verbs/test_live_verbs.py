@@ -41,7 +41,7 @@ class Pair:
         return state("active", 4, "a")
 
     def promote(self, *options: str) -> tuple[int, str, str]:
-        done = rosrv("standby", "promote", *options, ROSRV_STATE=str(self.folder))
+        done = rosrv("standby", "switch", *options, ROSRV_STATE=str(self.folder))
         return done.returncode, done.stdout, done.stderr
 
 
