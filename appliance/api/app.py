@@ -1,7 +1,6 @@
 """Build the REST application: its routes, the answers to errors, and the contract (OpenAPI)."""
 
 import asyncio
-from collections import ChainMap
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -44,10 +43,9 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    app.include_router(operation_routes.routes(services, ChainMap(*members("routes", "ANSWERS"))))
-    app.include_router(health.routes(services))
-    for routes in members("routes", "routes"):
-        app.include_router(routes(services))
+    of_features = [routes(services) for routes in members("routes", "routes")]
+    for router in (operation_routes.routes(services, of_features), health.routes(services), *of_features):
+        app.include_router(router)
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 

@@ -20,6 +20,7 @@ from appliance.control.assembly.robot import robot_addresses
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS
+from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder, read_usable
 from appliance.supervisor.errors import StartError
 from rosmop.tool.terminal import refused
 
@@ -109,11 +110,6 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
         check,
         contents,
         contents_at_start,
-    )
-    from appliance.specifications.specification_files import (  # noqa: PLC0415  as above
-        SpecificationsRefusedError,
-        read_folder,
-        read_usable,
     )
 
     try:

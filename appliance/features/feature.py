@@ -7,7 +7,7 @@ needs, so only `feature.py` must be fast to import.
 |---|---|---|
 | `feature.py` | `FEATURE`, with the names of `Feature` or `Tool` | every process |
 | `requests.py` | `REQUESTS`, and `PUBLIC`: paths that need no token | control, api, verbs |
-| `routes.py` | `routes(services)`, and `ANSWERS` of operations that control alone cannot answer | api |
+| `routes.py` | `routes(services)`, which may be `AnsweringRoutes` | api |
 | `control_part.py` | `begin(core)`: `appliance/control/core.py` has all that it may use | control |
 | `view.py` | the fields of `rosrv status`, their alarms and metrics (`views.py` lists them) | status, metrics |
 

@@ -45,7 +45,9 @@ class _Unsaid:
 
 
 def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:
-    def build(self: "TreeBuilder", meta: Meta, left: Any, right: Any) -> tree.BinaryExpression:
+    def build(
+        self: "TreeBuilder", meta: Meta, left: tree.Expression, right: tree.Expression
+    ) -> tree.BinaryExpression:
         return tree.BinaryExpression(self.at(meta), operator, left, right)
 
     return build
@@ -121,7 +123,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         name = "" if kind.type == "DEFAULT" else str(kind).replace("::", "/")
         return tree.RoleRow(self.at(meta), name, parameters or (), pattern, cancels is not None, action)
 
-    def order(self, meta: Meta, _word: Any, *names: Any) -> tree.OrderStatement:
+    def order(self, meta: Meta, _word: Token, *names: Any) -> tree.OrderStatement:
         return tree.OrderStatement(
             self.at(meta), tuple(tree.Name(self.at(name), (str(name),)) for name in names)
         )
@@ -177,7 +179,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def phase(self, meta: Meta, name: Token) -> tree.Name:
         return tree.Name(self.at(meta), (str(name),))
 
-    def given(self, _: Meta, _word: Any, *items: Any) -> list[Any]:
+    def given(self, _: Meta, _word: Token, *items: Any) -> list[Any]:
         return [*items]
 
     def given_value(self, meta: Meta, *children: Any) -> tree.GivenValue:
@@ -257,11 +259,11 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), part, *rest)
 
     def service_trigger(
-        self, meta: Meta, _: Any, topic: Any, kind: Any, part: Any, *rest: Any
+        self, meta: Meta, _: Token, topic: Any, kind: Any, part: Any, *rest: Any
     ) -> tree.MessageTrigger:
         return self.trigger(meta, topic, kind, *rest, part=str(part))
 
-    def timer(self, meta: Meta, _every: Any, duration: Any) -> tree.TimerTrigger:
+    def timer(self, meta: Meta, _every: Token, duration: Any) -> tree.TimerTrigger:
         has_unit = duration.strip()[-1:].isalpha()
         return tree.TimerTrigger(self.at(meta), self._period_ns(duration), has_unit=has_unit)
 
@@ -273,7 +275,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             return 10**9
 
     def safe(
-        self, meta: Meta, _: Any, kind: Any, fields: Any, _on: Any, topic: Any, _every: Any, period: Any
+        self, meta: Meta, _: Token, kind: Any, fields: Any, _on: Token, topic: Any, _every: Token, period: Any
     ) -> tree.SafeDeclaration:
         name = str(kind).replace("::", "/")
         place = self.at(kind)
@@ -286,7 +288,9 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     ) -> tree.TypedSafe:
         return tree.TypedSafe(self.at(meta), str(topic), self._period_ns(period))
 
-    def withhold(self, meta: Meta, _: Any, topic: Any, _from: Any, *rest: Any) -> tree.WithholdDeclaration:
+    def withhold(
+        self, meta: Meta, _: Token, topic: Any, _from: Token, *rest: Any
+    ) -> tree.WithholdDeclaration:
         *networks, _while, condition = rest
         networks = [
             tree.Name(self.at(network), (str(network),)) if isinstance(network, Token) else network
@@ -296,7 +300,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             self.at(meta), str(topic), tuple(networks), tree.Name(self.at(condition), (str(condition),))
         )
 
-    def pattern(self, _: Meta, _open: Any, fields: Any, _close: Any) -> tuple[tree.Binding, ...]:
+    def pattern(self, _: Meta, _open: Token, fields: Any, _close: Token) -> tuple[tree.Binding, ...]:
         return tuple(fields or ())
 
     def fields(self, _: Meta, *groups: Any) -> list[tree.Binding]:
@@ -378,10 +382,12 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     if_ = _made(tree.IfStatement, 1)
     while_ = _made(tree.WhileStatement, 1)
 
-    def do_(self, meta: Meta, _: Any, body: Any, condition: Any) -> tree.WhileStatement:
+    def do_(self, meta: Meta, _: Token, body: Any, condition: tree.Expression) -> tree.WhileStatement:
         return tree.WhileStatement(self.at(meta), condition, body, at_end=True)
 
-    def for_(self, meta: Meta, _: Any, start: Any, condition: Any, step: Any, body: Any) -> tree.ForStatement:
+    def for_(
+        self, meta: Meta, _: Token, start: Any, condition: tree.Expression, step: Any, body: Any
+    ) -> tree.ForStatement:
         empty = isinstance(start, tree.Block)
         return tree.ForStatement(self.at(meta), None if empty else start, condition, step, body)
 
@@ -390,13 +396,13 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def range_for_reference(self, meta: Meta, word: Any, kind: Any, *more: Any) -> tree.RangeForStatement:
         return self.range_for(meta, word, _referenced(kind), *more)
 
-    def switch(self, meta: Meta, _: Any, value: Any, *cases: Any) -> tree.SwitchStatement:
+    def switch(self, meta: Meta, _: Token, value: Any, *cases: Any) -> tree.SwitchStatement:
         return tree.SwitchStatement(self.at(meta), value, cases)
 
-    def case(self, meta: Meta, _: Any, value: Any, *statements: Any) -> tree.SwitchCase:
+    def case(self, meta: Meta, _: Token, value: Any, *statements: Any) -> tree.SwitchCase:
         return tree.SwitchCase(self.at(meta), value, statements)
 
-    def default(self, meta: Meta, _: Any, *statements: Any) -> tree.SwitchCase:
+    def default(self, meta: Meta, _: Token, *statements: Any) -> tree.SwitchCase:
         return tree.SwitchCase(self.at(meta), None, statements)
 
     break_ = _made(tree.BreakStatement, 1)
@@ -409,10 +415,10 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def delete(self, meta: Meta, *children: Any) -> tree.DeleteStatement:
         return tree.DeleteStatement(self.at(meta), children[-1])
 
-    def publish(self, meta: Meta, _: Any, topic: Any, kind: Any, value: Any) -> tree.PublishStatement:
+    def publish(self, meta: Meta, _: Token, topic: Any, kind: Any, value: Any) -> tree.PublishStatement:
         return tree.PublishStatement(self.at(meta), *_resource(topic, kind), self.at(kind), value)
 
-    def call_service(self, meta: Meta, _: Any, service: Any, kind: Any, value: Any) -> tree.CallStatement:
+    def call_service(self, meta: Meta, _: Token, service: Any, kind: Any, value: Any) -> tree.CallStatement:
         return tree.CallStatement(self.at(meta), *_resource(service, kind), self.at(kind), value)
 
     def declaration(self, meta: Meta, kind: Any, *declarators: Any) -> tree.Declaration:
@@ -446,15 +452,17 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def sequence(self, meta: Meta, *children: Any) -> tree.CommaExpression:
         return tree.CommaExpression(self.at(meta), children)
 
-    def assign(self, meta: Meta, target: Any, operator: Any, value: Any) -> tree.Assignment:
+    def assign(self, meta: Meta, target: tree.Expression, operator: Token, value: Any) -> tree.Assignment:
         return tree.Assignment(self.at(meta), str(operator), target, value)
 
-    def set(self, meta: Meta, target: Any, value: Any) -> tree.Assignment:
+    def set(self, meta: Meta, target: tree.Expression, value: Any) -> tree.Assignment:
         return tree.Assignment(self.at(meta), "=", target, value)
 
     conditional = _made(tree.ConditionalExpression)
 
-    def binary(self, meta: Meta, left: Any, operator: Any, right: Any) -> tree.BinaryExpression:
+    def binary(
+        self, meta: Meta, left: tree.Expression, operator: Token, right: tree.Expression
+    ) -> tree.BinaryExpression:
         return tree.BinaryExpression(self.at(meta), str(operator), left, right)
 
     bit_or_ = _binary("|")
@@ -473,13 +481,13 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     prefix = _made(tree.UnaryExpression)
     step_before = _made(tree.IncrementExpression, prefix=True)
 
-    def step_after(self, meta: Meta, target: Any, operator: Any) -> tree.IncrementExpression:
+    def step_after(self, meta: Meta, target: tree.Expression, operator: Token) -> tree.IncrementExpression:
         return tree.IncrementExpression(self.at(meta), str(operator), target, prefix=False)
 
-    def parenthesis(self, _: Meta, _open: Any, inner: tree.Expression) -> tree.Expression:
+    def parenthesis(self, _: Meta, _open: Token, inner: tree.Expression) -> tree.Expression:
         return inner
 
-    def cast(self, meta: Meta, _open: Any, *children: Any) -> tree.CastExpression:
+    def cast(self, meta: Meta, _open: Token, *children: Any) -> tree.CastExpression:
         *words, value = children
         if words[0].type == "FIXED":
             words = [part.strip() for part in words[0].split("::")]

@@ -1,8 +1,9 @@
 """Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract."""
 
 import inspect
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from typing import Annotated, Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
 from fastapi import Depends, Header, Path, Query, Request, Response
@@ -88,8 +89,25 @@ class Answer:
     success: Mapping[str, Any] | None = None
 
 
-def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
+class AnsweringRoutes(Routes):
+    """Routes of a feature that also replaces control's answers, by the names of their operations."""
+
+    def __init__(
+        self, answers: Mapping[str, Answer], *, prefix: str = "", tags: list[str | Enum] | None = None
+    ) -> None:
+        super().__init__(prefix=prefix, tags=tags)
+        self.answers = answers
+
+
+def routes(services: Services, of_features: Iterable[Routes]) -> Routes:
+    """Return the routes of all operations."""
     router = Routes()
+    answers = {
+        name: answer
+        for own in of_features
+        if isinstance(own, AnsweringRoutes)
+        for name, answer in own.answers.items()
+    }
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
         own = answers.get(operation.name)

@@ -5,7 +5,7 @@ policy denies fails with the master's words.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 from urllib.parse import urlsplit
 
 import msgspec
@@ -98,6 +98,9 @@ def _rows(value: Value) -> dict[str, list[str]]:
     return {name: [str(node) for node in nodes] for name, nodes in _pairs(value) if isinstance(nodes, list)}
 
 
+Json = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
+
+
 class _Arguments(Struct):
     topic: str = ""
     type: str = ""
@@ -108,7 +111,7 @@ class _Arguments(Struct):
     default: str = ""
 
 
-_Answer = Callable[[_Arguments], Awaitable[dict[str, Any]]]
+_Answer = Callable[[_Arguments], Awaitable[Mapping[str, Json] | Mapping[str, Value]]]
 
 
 class Rosapi:
@@ -168,57 +171,57 @@ class Rosapi:
 
     # --- topics ---
 
-    async def _topics(self, _given: _Arguments) -> dict[str, Any]:
+    async def _topics(self, _given: _Arguments) -> dict[str, list[str]]:
         graph = await self._sight.graph()
-        return {"topics": graph.topics, "types": [graph.types.get(topic, "") for topic in graph.topics]}
+        return {"topics": list(graph.topics), "types": [graph.types.get(topic, "") for topic in graph.topics]}
 
-    async def _topics_and_raw_types(self, given: _Arguments) -> dict[str, Any]:
+    async def _topics_and_raw_types(self, given: _Arguments) -> Mapping[str, Json]:
         found = await self._topics(given)
         texts = {seen.topic: seen.definition for seen in (await self._outlook.look()).topics}
         # As in rosapi, a type that is not known has no text.
         return found | {"typedefs_full_text": [texts.get(topic, "") for topic in found["topics"]]}
 
-    async def _topics_for_type(self, given: _Arguments) -> dict[str, Any]:
+    async def _topics_for_type(self, given: _Arguments) -> Mapping[str, Json]:
         graph = await self._sight.graph()
         return {"topics": [topic for topic in graph.topics if graph.types.get(topic) == given.type]}
 
-    async def _topic_type(self, given: _Arguments) -> dict[str, Any]:
+    async def _topic_type(self, given: _Arguments) -> Mapping[str, Json]:
         return {"type": (await self._sight.graph()).types.get(given.topic, "")}
 
-    async def _publishers(self, given: _Arguments) -> dict[str, Any]:
+    async def _publishers(self, given: _Arguments) -> Mapping[str, Json]:
         return {"publishers": (await self._sight.graph()).publishers.get(given.topic, [])}
 
-    async def _subscribers(self, given: _Arguments) -> dict[str, Any]:
+    async def _subscribers(self, given: _Arguments) -> Mapping[str, Json]:
         return {"subscribers": (await self._sight.graph()).subscribers.get(given.topic, [])}
 
     # --- services and nodes ---
 
-    async def _services(self, _given: _Arguments) -> dict[str, Any]:
+    async def _services(self, _given: _Arguments) -> Mapping[str, Json]:
         return {"services": sorted((await self._sight.graph()).services)}
 
-    async def _services_for_type(self, given: _Arguments) -> dict[str, Any]:
+    async def _services_for_type(self, given: _Arguments) -> Mapping[str, Json]:
         types = await self._outlook.service_types()  # of services that the door may not use, there is none
         return {"services": sorted(service for service, kind in types.items() if kind == given.type)}
 
-    async def _service_type(self, given: _Arguments) -> dict[str, Any]:
+    async def _service_type(self, given: _Arguments) -> Mapping[str, Json]:
         return {"type": (await self._sight.service_header(given.service)).get("type", "")}
 
-    async def _service_node(self, given: _Arguments) -> dict[str, Any]:
+    async def _service_node(self, given: _Arguments) -> Mapping[str, Json]:
         nodes = (await self._sight.graph()).services.get(given.service, [])
         return {"node": nodes[0] if nodes else ""}
 
-    async def _service_providers(self, given: _Arguments) -> dict[str, Any]:
+    async def _service_providers(self, given: _Arguments) -> Mapping[str, Json]:
         return {"providers": (await self._sight.graph()).services.get(given.service, [])}
 
-    async def _service_host(self, given: _Arguments) -> dict[str, Any]:
+    async def _service_host(self, given: _Arguments) -> Mapping[str, Json]:
         return {"host": urlsplit(await self._sight.service_uri(given.service)).hostname or ""}
 
-    async def _nodes(self, _given: _Arguments) -> dict[str, Any]:
+    async def _nodes(self, _given: _Arguments) -> Mapping[str, Json]:
         graph = await self._sight.graph()
         tables = (graph.publishers, graph.subscribers, graph.services)
         return {"nodes": sorted({node for table in tables for nodes in table.values() for node in nodes})}
 
-    async def _node_details(self, given: _Arguments) -> dict[str, Any]:
+    async def _node_details(self, given: _Arguments) -> Mapping[str, Json]:
         graph = await self._sight.graph()
 
         def of(table: Mapping[str, Sequence[str]]) -> list[str]:
@@ -230,7 +233,7 @@ class Rosapi:
             "services": of(graph.services),
         }
 
-    async def _action_servers(self, _given: _Arguments) -> dict[str, Any]:
+    async def _action_servers(self, _given: _Arguments) -> Mapping[str, Json]:
         topics = {*(await self._sight.graph()).topics}
         roots = {topic.rpartition("/")[0] for topic in topics if topic.endswith("/goal")}
         return {
@@ -241,7 +244,7 @@ class Rosapi:
 
     # --- types ---
 
-    async def _message_details(self, given: _Arguments) -> dict[str, Any]:
+    async def _message_details(self, given: _Arguments) -> Mapping[str, Json]:
         if self._types.has_message(given.type):
             return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}
         seen = [one for one in (await self._outlook.look()).topics if one.type == given.type]
@@ -253,40 +256,40 @@ class Rosapi:
             return {"typedefs": typedefs(Definitions.from_full_text(one.type, one.definition), one.type)}
         return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}  # raises
 
-    async def _request_details(self, given: _Arguments) -> dict[str, Any]:
+    async def _request_details(self, given: _Arguments) -> Mapping[str, Json]:
         definitions = self._types.service(given.type)[2]
         return {"typedefs": typedefs(definitions, definitions.service(given.type).request.name)}
 
-    async def _response_details(self, given: _Arguments) -> dict[str, Any]:
+    async def _response_details(self, given: _Arguments) -> Mapping[str, Json]:
         definitions = self._types.service(given.type)[2]
         return {"typedefs": typedefs(definitions, definitions.service(given.type).response.name)}
 
     # --- parameters and time ---
 
-    async def _get_param(self, given: _Arguments) -> dict[str, Any]:
+    async def _get_param(self, given: _Arguments) -> Mapping[str, Json]:
         if not await self._sight.parameter("hasParam", given.name):
             return {"value": _as_text(_as_value(given.default)) if given.default else "null"}
         return {"value": _as_text(await self._sight.parameter("getParam", given.name))}
 
-    async def _set_param(self, given: _Arguments) -> dict[str, Any]:
+    async def _set_param(self, given: _Arguments) -> Mapping[str, Json]:
         await self._sight.set_parameter(given.name, _as_value(given.value))
         return {}
 
-    async def _has_param(self, given: _Arguments) -> dict[str, Any]:
+    async def _has_param(self, given: _Arguments) -> Mapping[str, Json]:
         return {"exists": bool(await self._sight.parameter("hasParam", given.name))}
 
-    async def _search_param(self, given: _Arguments) -> dict[str, Any]:
+    async def _search_param(self, given: _Arguments) -> Mapping[str, Json]:
         return {"global_name": str(await self._sight.parameter("searchParam", given.name) or "")}
 
-    async def _delete_param(self, given: _Arguments) -> dict[str, Any]:
+    async def _delete_param(self, given: _Arguments) -> Mapping[str, Json]:
         if await self._sight.parameter("hasParam", given.name):
             await self._sight.parameter("deleteParam", given.name)
         return {}
 
-    async def _param_names(self, _given: _Arguments) -> dict[str, Any]:
+    async def _param_names(self, _given: _Arguments) -> Mapping[str, Value]:
         return {"names": await self._sight.parameter("getParamNames")}
 
-    async def _time(self, _given: _Arguments) -> dict[str, Any]:
+    async def _time(self, _given: _Arguments) -> Mapping[str, Json]:
         secs, nsecs = self._sight.time()
         return {"time": {"secs": secs, "nsecs": nsecs}}
 
@@ -308,8 +311,8 @@ def _as_text(value: Value) -> str:
     return msgspec.json.encode(value).decode()
 
 
-def typedefs(definitions: Definitions, name: str) -> list[dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
+def typedefs(definitions: Definitions, name: str) -> list[Mapping[str, Json]]:
+    found: dict[str, Mapping[str, Json]] = {}
 
     def add(kind: str) -> None:
         if kind in found or (kind in PRIMITIVES and kind not in _TIME_TYPES) or kind == "string":
@@ -327,7 +330,7 @@ def typedefs(definitions: Definitions, name: str) -> list[dict[str, Any]]:
     return [*found.values()]
 
 
-def _typedef(message: MessageDefinition) -> dict[str, Any]:
+def _typedef(message: MessageDefinition) -> Mapping[str, Json]:
     fields, constants = message.fields, sorted(message.constants, key=lambda one: one.name)
     return {
         "type": message.name,
@@ -347,7 +350,7 @@ def _is_number(kind: str) -> bool:
     return kind in PRIMITIVES and kind not in _TIME_TYPES
 
 
-def _time_typedef(kind: str) -> dict[str, Any]:
+def _time_typedef(kind: str) -> Mapping[str, Json]:
     return {
         "type": kind,
         "fieldnames": ["secs", "nsecs"],

@@ -13,7 +13,7 @@ from appliance.api.front.route_roles import Viewer, ask, reads_contents
 from appliance.api.front.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import LogReader
-from appliance.api.routes.operation_routes import Answer, OperationCall
+from appliance.api.routes.operation_routes import Answer, AnsweringRoutes, OperationCall
 from appliance.api.routes.specification_findings import findings_of
 from appliance.audit.log.record_format import LogEntry, rfc3339, without_contents
 from appliance.audit.search.query import Filter
@@ -64,7 +64,7 @@ def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
 
 
 def routes(services: Services) -> Routes:
-    router = Routes(prefix="/v1/monitors", tags=["monitors"])
+    router = AnsweringRoutes(_ANSWERS, prefix="/v1/monitors", tags=["monitors"])
     looking = _Looking(services)
 
     @router.get("/{name}", responses=UNKNOWN)
@@ -203,7 +203,7 @@ async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
     return files[name]
 
 
-ANSWERS = {
+_ANSWERS = {
     "load_monitors": Answer(_load),
     "replace_monitor": Answer(_replace),
     "reload_monitors": Answer(_change),

@@ -15,6 +15,7 @@ from appliance.api.front.routing import Responses, Routes, body
 from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord
 from appliance.api.routes.named_hosts import host_in_words
+from appliance.api.routes.operation_routes import AnsweringRoutes
 from appliance.api.routes.shown_records import readable_by
 from appliance.audit.search.search import recorded_in_full
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
@@ -42,11 +43,8 @@ _NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
 _MOST_SHOWN = 1000
 
 
-ANSWERS = policy_routes.ANSWERS
-
-
 def routes(services: Services) -> Routes:
-    router = Routes(prefix="/v1")
+    router = AnsweringRoutes(policy_routes.ANSWERS, prefix="/v1")
     router.include_router(policy_routes.routes(services))
     router.include_router(_of_policy(services))
     router.include_router(_of_records(services))

@@ -21,6 +21,7 @@ from appliance.api.front.route_roles import answered
 from appliance.api.front.routing import Responses, Routes, answer, body, content, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import peer_of
+from appliance.api.routes.operation_routes import AnsweringRoutes
 from appliance.base import clock
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers.field_docs import Moment, doc
@@ -85,11 +86,8 @@ _PEM: Responses = file("application/x-pem-file", "PEM") | {
 }
 
 
-__all__ = ["ANSWERS", "routes"]
-
-
 def routes(services: Services) -> Routes:
-    router = Routes(tags=["hosts"])
+    router = AnsweringRoutes(ANSWERS, tags=["hosts"])
     add_host_routes(router, services)
     _add_enrolment(router, services)
     _add_renewal(router, services)

@@ -6,10 +6,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from appliance.features.approvals.requests import ApprovalsWanted
+from appliance.channel.operations import request_named
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
@@ -17,6 +18,7 @@ from tests.support.processes import Process
 from tests.support.requirements import need_program
 from tests.support.waiting import eventually
 
+APPROVALS: Any = request_named("approvals")
 HERE = Path(__file__).with_name("roslib")
 IN_PYTHON = Path(__file__).with_name("roslibpy")
 UV = Path(sys.executable).with_name("uv")
@@ -122,7 +124,7 @@ def test_roslibpy_uses_a_door_and_gets_the_words_when_it_ends(
     refused = client.wait_for(event="not answered", service="/forbidden_brake")
     assert "198.19.240." in str(refused["error"]) and "policy.ini" in str(refused["error"])
     approvals = eventually(
-        lambda: [one for one in appliance.ask(ApprovalsWanted()).approvals if one.resource == "/held"],
+        lambda: [one for one in appliance.ask(APPROVALS()).approvals if one.resource == "/held"],
         "the call waits for an approval",
     )
     appliance.rosrv("approve", str(approvals[0].number), "--for", "60s")
