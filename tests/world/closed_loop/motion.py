@@ -150,6 +150,8 @@ class SeparationWorld(DrivenWorld):
     """Walls and persons around a base with a scanner: ISO 13855 and ISO/TS 15066, speed and separation."""
 
     preset: ClassVar[str] = "separation"
+    returns = False
+    """Whether a scanner that was silent may send again."""
     not_yet: ClassVar[Mapping[str, str]] = {
         "switch": "a base that drove without the guard may be so fast that no stop prevents a collision"
     }
@@ -265,7 +267,7 @@ class SeparationWorld(DrivenWorld):
     def _fail(self) -> None:
         self.fault = self.random.choice(SCAN_FAULTS)
         self.trace(f"the scanner fails: {self.fault}")
-        if self.fault != "dead" and self.random.random() < 0.5:
+        if (self.returns or self.fault != "dead") and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(500, 3000), self._repair)
 
     def _repair(self) -> None:

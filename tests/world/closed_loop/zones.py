@@ -22,6 +22,7 @@ class ZoneWorld(SeparationWorld):
     """Walls and persons around a base that stops, or slows, while something is in its zone."""
 
     preset: ClassVar[str] = "zone"
+    returns = True
     not_yet: ClassVar[Mapping[str, str]] = {}
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut"), "mute": ()}
 
@@ -168,7 +169,8 @@ class ZoneWorld(SeparationWorld):
             self.ready.clear()
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
-        if self.now > self.heard + self.silent * 1000 and not self.muted and not self.guard.holds:
+        unseen = self.now > self.heard + self.silent * 1000 or self.beside_source()
+        if unseen and not self.muted and not self.guard.holds:
             self.ready.clear()
         elif not self.moves(wanted) and not self.occupied:
             self.ready.add(node)
