@@ -37,6 +37,7 @@ from appliance.features.guards.requests import (
     GuardTry,
     GuardUpgrade,
 )
+from appliance.features.guards.upgrades import same
 from appliance.features.table import verb_function
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import say
@@ -371,8 +372,12 @@ def _undo(guard: GuardRow) -> str:
     """Return the command that makes a removed guard again. It begins in its initial state."""
     if guard.origin != "current":
         return "rosrv monitor rollback"
-    others = [one for one in guard.given if one.value != one.default]
-    constants = values_of(others)
+    defaults = {
+        one.name: one.default for one in PRESETS[guard.preset].parameters
+    }  # those of the text are its values
+    constants = {
+        name: value for name, value in values_of(guard.given).items() if not same(value, defaults[name])
+    }
     topics = dict(guard.topics)
     words = ["rosrv", "guard", "new", guard.preset, topics.pop("command")]
     words += [f"{name}={value}" for name, value in (constants | guard.loads).items()]

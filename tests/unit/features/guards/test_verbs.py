@@ -372,17 +372,7 @@ class Removing(Robot):
     def __init__(self, folder: Path, guard: Guard) -> None:
         super().__init__(folder, guard)
         text = text_of(guard)
-        constants = [
-            GivenState(
-                one.name,
-                one.kind,
-                _typed(one, guard.values[one.name]),
-                one.unit,
-                default=_typed(one, one.default),
-            )
-            for one in guard.preset.parameters
-            if not one.loads
-        ]
+        constants = [_stated(one, guard.values[one.name]) for one in guard.preset.parameters if not one.loads]
         self.row = GuardRow(
             guard.name, guard.preset.name, "", "shadow", dict(guard.topics), types_in(text), constants,
             loaded_values(text), 0, version=guard.preset.version, origin="current", below=[], digest="",
@@ -394,10 +384,11 @@ class Removing(Robot):
         return super().ask_or_exit(request)
 
 
-def _typed(parameter: Parameter, value: str) -> bool | int | float:
-    return (
-        value == "true" if parameter.kind == "bool" else {"int": int, "double": float}[parameter.kind](value)
-    )
+def _stated(parameter: Parameter, text: str) -> GivenState:
+    """Return a value that is in the text of a guard, so it is also its default."""
+    number = int if parameter.kind == "int" else float
+    value = text == "true" if parameter.kind == "bool" else number(text)
+    return GivenState(parameter.name, parameter.kind, value, parameter.unit, default=value)
 
 
 @pytest.mark.parametrize("place", [0, -1])
