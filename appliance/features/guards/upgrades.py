@@ -73,7 +73,8 @@ def upgraded(
             changed[each] = ["", parameter.default]
     try:
         types = {each: kind for each, kind in types_in(text).items() if each not in topics}
-        types = {each: kind for each, kind in types.items() if each in preset.topics}
+        only = {each: kinds[0] for each, kinds in preset.topics.items() if len(kinds) == 1}
+        types = only | {each: kind for each, kind in types.items() if each in preset.topics}
         given = preset.given_topics  # `cancel` of an action follows from its goal now
         kept = {each: topic for each, topic in topics_in(text).items() if each in given}
         guard = planned(preset, name, {**kept, **topics}, graph, values, types)

@@ -143,6 +143,17 @@ def test_a_guard_of_an_old_release_is_recognised_and_made_again(name: str, versi
     assert {one: values_in(new.text)[one] for one in kept} == {one: values_in(text)[one] for one in kept}
 
 
+def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet() -> None:
+    base = released.released("joints", 1)
+    with pytest.raises(GuardError, match="joints needs a topic for state: give --topic state=TOPIC"):
+        upgraded(base.text, {}, [])
+    new = upgraded(base.text, {}, [], {"state": "/arm/joint_states"})
+    assert topics_in(new.text)["state"] == "/arm/joint_states"
+    other = TopicFacts("/arm/joint_states", "nav_msgs/Odometry", (), ())
+    with pytest.raises(GuardError, match="has the type nav_msgs/Odometry on this robot"):
+        upgraded(base.text, {}, [other], {"state": "/arm/joint_states"})
+
+
 def test_an_old_guard_of_goals_is_made_again() -> None:
     """Its text, which 0.3.0 made, has the topic that cancels goals. Now that topic follows from the goal."""
     text = Path(__file__).with_name("estop_of_goals_0.3.0.rv").read_text(encoding="utf-8")
