@@ -1,1 +1,1 @@
-"""Doors: browsers, viewers and agents reach the robot, each with the rights of its own host."""
+"""Doors: browsers, Foxglove and agents reach the robot, each with the rights of its own host."""

@@ -12,7 +12,7 @@ MOST_DOORS = 32
 
 @section
 class Doors(FeatureSection):
-    """Doors for browsers, viewers and agents. `rosrv door add` adds a door; without one, nothing listens."""
+    """Doors for browsers, Foxglove and agents. `rosrv door add` adds a door; without one, nothing listens."""
 
     place: ClassVar[str] = "doors"
     network: str = key(
