@@ -158,10 +158,10 @@ class JointsWorld(World):
         data = trajectory(self.now, names, points)
         passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, self.commander)
         for one in sent:
-            self._receive(*one)
+            self.receive(*one)
         self._judge(bad, points, passes=passed == data)
         if passed is not None:
-            self._receive(
+            self.receive(
                 self.now, self.guard.topics[COMMAND], passed, points if passed == data and not bad else ()
             )
 
@@ -184,7 +184,7 @@ class JointsWorld(World):
                     f"a trajectory passes, and node {node} does not report where the joints are",
                 )
 
-    def _receive(self, at: int, topic: str, data: bytes, points: Sequence[Point] = ()) -> None:
+    def receive(self, at: int, topic: str, data: bytes, points: Sequence[Point] = ()) -> None:
         """Take a trajectory; one of the guard is empty, and stops the arm where it is."""
         if topic != self.guard.topics[COMMAND]:
             return

@@ -162,7 +162,7 @@ class World:
     def tell_beside(self, topic: str, data: bytes) -> None:
         """Publish a message on a topic that only the guard beside this one observes."""
         for one in self.guard.tell(topic, data, self.now, 6)[1]:
-            self._receive(*one)
+            self.receive(*one)
 
     def after(self, at: float, act: Callable[[], None]) -> None:
         self._number += 1
@@ -209,7 +209,7 @@ class World:
 
     def _reach(self, at: int) -> None:
         for time, topic, data in self.guard.advance(at):
-            self._receive(time, topic, data)
+            self.receive(time, topic, data)
         self.move(at)
         self.now = at
 
@@ -220,7 +220,7 @@ class World:
     def move(self, until: int) -> None:
         """Move what moves."""
 
-    def _receive(self, at: int, topic: str, data: bytes) -> None:
+    def receive(self, at: int, topic: str, data: bytes) -> None:
         if topic == self.guard.topics[COMMAND]:
             self.received(max(at, self.now), legs_of(self.kind, data))
 
@@ -237,7 +237,7 @@ class World:
             self._note(given, node, whole=whole)
         passed, sent = self.guard.tell(self.guard.topics[given], data, self.now, node)
         for one in sent:
-            self._receive(*one)
+            self.receive(*one)
         if passed is None and held and whole and given != COMMAND:
             self.broken(
                 "L5", f"a guard that holds drops a message on {self.guard.topics[given]}, which it observes"
@@ -255,7 +255,7 @@ class World:
         passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, node)
         got = None if passed is None else legs_of(self.kind, passed)
         for one in sent:
-            self._receive(*one)
+            self.receive(*one)
         if got is not None:
             self.received(self.now, got)
             if passed != data:

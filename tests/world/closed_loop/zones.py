@@ -160,10 +160,10 @@ class ZoneWorld(SeparationWorld):
     def _law(self) -> str:
         return "L6" if self.muted_until > NEVER else self.law("L3")
 
-    def _receive(self, at: int, topic: str, data: bytes) -> None:
+    def receive(self, at: int, topic: str, data: bytes) -> None:
         """Take a message of the guard. After a stop, for any reason, each node stands before it moves."""
         moved = self._fast(self.force[1])
-        super()._receive(at, topic, data)
+        super().receive(at, topic, data)
         alone = self.beside is None and not self.guard.holds and at > self.fresh_from + 100 + SLACK
         if alone and moved and not self._fast(self.force[1]):
             self.ready.clear()
