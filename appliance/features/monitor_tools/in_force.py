@@ -207,8 +207,7 @@ def set_given(
     Example: rosrv monitor set speed vMax=0.3
     """
     if values:
-        wanted: dict[str, GivenValue] = dict(_assigned(value, "NAME=VALUE") for value in values)
-        answer = appliance.answer_or_exit(admin.MonitorGive(name, wanted))
+        answer = appliance.answer_or_exit(admin.MonitorGive(name, _all_assigned(values, "NAME=VALUE")))
         given = answer.given
     else:
         rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
@@ -244,13 +243,23 @@ def _assigned(text: str, form: str) -> tuple[str, str]:
     return name, value
 
 
+def _all_assigned(texts: list[str], form: str) -> dict[str, GivenValue]:
+    found: dict[str, GivenValue] = {}
+    for text in texts:
+        name, value = _assigned(text, form)
+        if name in found:
+            raise usage_error(f"{printable(name)} has two values: give one", "rosrv monitor")
+        found[name] = value
+    return found
+
+
 def given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
     found: dict[str, dict[str, GivenValue]] = {}
-    for text in given:
-        path, value = _assigned(text, "--set MONITOR.NAME=VALUE")
+    form = "--set MONITOR.NAME=VALUE"
+    for path, value in _all_assigned(given, form).items():
         monitor, dot, name = path.partition(".")
         if not dot or not name:
-            raise usage_error(f"{printable(text)}: write --set MONITOR.NAME=VALUE", "rosrv monitor")
+            raise usage_error(f"{printable(f'{path}={value}')}: write {form}", "rosrv monitor")
         found.setdefault(monitor, {})[name] = value
     return found
 

@@ -17,6 +17,18 @@ def test_proving_needs_the_prover(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "--prove needs the package z3-solver: pip install z3-solver" in result.stderr
 
 
+@pytest.mark.parametrize(
+    "verb", ["set speed vMax=1 vMax=2", "load FILE --set speed.vMax=1 --set speed.vMax=2"]
+)
+def test_a_value_that_is_given_twice_is_refused(tmp_path: Path, verb: str) -> None:
+    file = tmp_path / "speed.rv"
+    file.write_text("speed() { event e() /t std_msgs/Empty '{}' { } }")
+    words = [word.replace("FILE", str(file)) for word in verb.split()]
+    result = rosrv("monitor", *words, "--state", str(tmp_path))
+    assert result.returncode == 2
+    assert "vMax has two values: give one" in result.stderr
+
+
 def test_output_has_what_subscribers_would_receive(tmp_path: Path) -> None:
     (tmp_path / "a.rv").write_text("""a() { std_msgs::String s; event e(int x) /t std_msgs/Int32 '{data:x}' {
         if (x == 2) return; x = x * 10; s.data = "n"; PUBLISH(/out, std_msgs/String, s); } }""")
