@@ -30,11 +30,12 @@ class ConsolePart(NamedTuple):
     """A component of the console, in a file of the feature's folder `console`.
 
     A `view` is a page with this title. A `banner` is shown on every view, a `record` beside an audit record, a
-    `situation` is a line on top of Now, and `standby` is the page of an appliance that is not active. The parts of a
-    place are sorted by `order`, then by the table of features.
+    `situation` is a line on top of Now, and `standby` is the page of an appliance that is not active. A `search` is a
+    function instead: it fetches what the search finds under this title. The parts of a place are sorted by `order`,
+    then by the table of features. The files of `view`, `robot`, `record` and `search` are loaded when they are needed.
     """
 
-    place: Literal["view", "banner", "situation", "now", "record", "robot", "standby"]
+    place: Literal["view", "banner", "situation", "now", "record", "robot", "search", "standby"]
     file: str
     component: str
     title: str = ""

@@ -140,6 +140,8 @@ def _parts(features: Iterable[Feature]) -> str:
         shown = f"part{len(rows)}"
         if part.place in _LATE:
             shown = f"late(() => import({address}), {json.dumps(part.component)})"
+        elif part.place == "search":
+            shown = f"async () => (await import({address}))[{json.dumps(part.component)}]"
         else:
             imports.append(f"import {{ {part.component} as {shown} }} from {address};\n")
         rows.append(

@@ -25,6 +25,7 @@ FEATURE = Feature(
     console=(
         ConsolePart("robot", "own.js", "OwnDoor", order=4),
         ConsolePart("robot", "panel.js", "Doors", order=4),
+        ConsolePart("search", "search.js", "doors", "Doors"),
     ),
     verbs={
         "door": Group(

@@ -11,6 +11,7 @@ FEATURE = Feature(
     console=(
         ConsolePart("situation", "situation.js", "Stops", order=2),
         ConsolePart("robot", "panel.js", "Guards", order=2),
+        ConsolePart("search", "search.js", "guards", "Guards"),
     ),
     verbs={
         "guard": Group(

@@ -22,7 +22,10 @@ FEATURE = Feature(
             ),
         ),
     ),
-    console=(ConsolePart("view", "view.js", "Hosts", "Hosts"),),
+    console=(
+        ConsolePart("view", "view.js", "Hosts", "Hosts"),
+        ConsolePart("search", "search.js", "hosts", "Enrolled hosts"),
+    ),
     verbs={
         "protect": Verb(
             f"{_PLACE}protect_verb:protect",

@@ -182,7 +182,7 @@ def test_the_list_goes_by_keys(opened: Callable[..., Reader], refuse: Callable[[
     expect(page.locator("tbody tr.chosen")).to_contain_text("/keys_2")
     page.keyboard.press("Escape")
     expect(page.locator("tbody tr.chosen")).to_have_count(0)
-    page.keyboard.press("/")
+    page.keyboard.press("f")
     expect(page.get_by_label("Text")).to_be_focused()
 
 

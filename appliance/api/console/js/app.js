@@ -11,6 +11,7 @@ import { useNames } from "./parts/host.js";
 import { Toasts, clearToasts } from "./parts/toast.js";
 import { passive } from "./passive.js";
 import { place } from "./router.js";
+import { Search } from "./search/search.js";
 import { session } from "./session.js";
 import { useShortcuts } from "./shortcuts.js";
 import { useStore } from "./store.js";
@@ -54,5 +55,5 @@ function Shell({ standby }) {
   return html`<a class="skip" href="#main" onClick=${skip}>Skip to the view</a>
     <div class="shell"><${Nav} />
       <main class="main" id="main" tabindex="-1"><${NotLive} /><${FeatureParts} place="banner" /><${View} /></main></div>
-    <${Toasts} />${help}`;
+    <${Toasts} />${help}<${Search} />`;
 }

@@ -8,6 +8,7 @@ import { Link, place } from "./router.js";
 import { ROBOT, session } from "./session.js";
 import { signOut } from "./sign-on.js";
 import { Pulse } from "./standing.js";
+import { openSearch } from "./search/search.js";
 import { listKeys } from "./shortcuts.js";
 import { useStore } from "./store.js";
 import { switchTheme, theme } from "./theme.js";
@@ -28,7 +29,7 @@ export function Nav() {
       </${Link}></li>`)}</ul></nav>
     <div class="side-foot"><${Pulse} />
       <div class="who"><span class="who-name"><${Given} value=${current?.name} most=${40} /></span><span class="muted small" data-role=${current?.role}>${current?.role}</span></div>
-      <div class="side-buttons"><${ThemeSwitch} />
+      <div class="side-buttons"><button class="button plain" onClick=${openSearch} aria-label="Search" title="Search" aria-keyshortcuts="/"><${Icon} name="search" /></button><${ThemeSwitch} />
         <button class="button plain" onClick=${listKeys} aria-label="Keys" title="Keys" aria-keyshortcuts="?"><${Icon} name="keyboard" /></button>
         <button class="button plain" onClick=${signOut} aria-label="Sign out" title="Sign out"><${Icon} name="out" /></button></div>
     </div></header>`;

@@ -9,9 +9,11 @@ import { Check } from "./parts/field.js";
 import { createStore, useStore } from "./store.js";
 
 const KEPT = "rosrv.keys";
+const FILTER = "f"; // focuses the field that filters the view
 const LIST = /** @type {[string, string][]} */ ([
   ["1 … 8", "The views, in their order"],
-  ["/", "Search in the view"],
+  ["/", "Search for hosts, nodes, topics, rules, records, guards and doors"],
+  ["f", "Filter the view"],
   ["j, k", "Next and previous entry (Now), record (Audit) or event (recordings)"],
   ["Enter, Esc", "Open; close the open record or dialog, leave the editor"],
   ["g", "In a record: show what would grant it, then open that in the editor"],
@@ -36,11 +38,11 @@ export function useShortcuts() {
   const { on, listed } = useStore(keys);
   useKeys((key, event) => {
     if (key.length !== 1 || event.repeat) return false;
-    const named = key === "/" ? "[data-search]" : `[aria-keyshortcuts="${CSS.escape(key)}"]`;
+    const named = key === FILTER ? "[data-search]" : `[aria-keyshortcuts="${CSS.escape(key)}"]`;
     const control = /** @type {HTMLElement | undefined} */ ([...document.querySelectorAll(named)].find((one) => one.getClientRects().length));
     if (!control) return false;
     // A disabled control takes the focus, so that its reason is read.
-    if (key === "/" || control.shadowRoot || control.ariaDisabled === "true") /** @type {HTMLElement} */ (control.shadowRoot?.querySelector("[contenteditable]") ?? control).focus();
+    if (key === FILTER || control.shadowRoot || control.ariaDisabled === "true") /** @type {HTMLElement} */ (control.shadowRoot?.querySelector("[contenteditable]") ?? control).focus();
     else control.click();
     return true;
   });

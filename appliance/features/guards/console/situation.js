@@ -12,6 +12,7 @@ import { useGuards } from "./state.js";
 const ACTS = /** @type {Record<string, string>} */ ({ stopping: "stops", withholding: "withholds", holding: "holds" });
 const LATELY = 900; // seconds in which a stop that has ended is news
 const MOST = 2; // guards by name
+const VALUES = /^\w+ = /;
 
 export function Stops() {
   const { body, error } = useGuards({ presets: false });
@@ -29,16 +30,21 @@ export function Stops() {
 
 function Acting(/** @type {{guard: any}} */ { guard }) {
   const { name, state, topics, why_held, last_stop } = guard;
-  const why = state === "holding" ? why_held : last_stop?.cause;
+  const why = state === "holding" ? why_held : words(last_stop?.cause);
   return html`<div><${Given} value=${name} most=${40} /> <span class="muted">${ACTS[state]}</span> <${Given} value=${topics.command} mono most=${60} />${state !== "holding" && last_stop && html`<${From} stop=${last_stop} /> <${Ago} at=${last_stop.since} lasts />`}${why && html`<div class="muted small"><${Given} value=${why} most=${120} /></div>`}</div>`;
 }
 
 function Stopped(/** @type {{guard: any}} */ { guard: { name, topics, last_stop } }) {
-  return html`<div><${Given} value=${name} most=${40} /> <span class="muted">stopped</span> <${Given} value=${topics.command} mono most=${60} /><${From} stop=${last_stop} />, <${Ago} at=${last_stop.until} />${last_stop.cause && html`<div class="muted small"><${Given} value=${last_stop.cause} most=${120} /></div>`}</div>`;
+  return html`<div><${Given} value=${name} most=${40} /> <span class="muted">stopped</span> <${Given} value=${topics.command} mono most=${60} /><${From} stop=${last_stop} />, <${Ago} at=${last_stop.until} />${words(last_stop.cause) && html`<div class="muted small"><${Given} value=${words(last_stop.cause)} most=${120} /></div>`}</div>`;
 }
 
 function From(/** @type {{stop: any}} */ { stop }) {
   return stop.host ? html` <span class="muted">of</span> <${Host} value=${stop.host} />` : null;
+}
+
+/** A cause in words; empty if it is the values of a condition, which its record explains. */
+function words(/** @type {string | undefined} */ cause) {
+  return cause && !VALUES.test(cause) ? cause : "";
 }
 
 function secondsOf(/** @type {string | number} */ at) {

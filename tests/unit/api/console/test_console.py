@@ -107,7 +107,7 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
             assert plain.headers["etag"] != answer.headers["etag"] or not address.endswith((".js", ".css"))
     assert {Path(address).name.partition(".")[0] for address in seen} == {
         "console", "early", "main", "preact", "dagre", "codemirror", "inter", "jetbrains-mono", "icon", "icon-calls",
-        "view", "panel", "own", "taking",
+        "view", "panel", "own", "taking", "results", "search",
     }  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import { counted } from "../numbers.js";
 import { Check } from "../parts/field.js";
 import { useShown } from "../parts/host.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
+import { place } from "../router.js";
 import { useStore } from "../store.js";
 import { afresh, arrange, loadLayout } from "./arrange.js";
 import { collapse } from "./collapse.js";
@@ -37,6 +38,13 @@ export function GraphView() {
   useEffect(() => {
     loadLayout().then(() => setLayout({ loaded: true, error: null }), (error) => setLayout({ loaded: false, error }));
   }, []);
+  const linked = useStore(place, (one) => one.query.get("item"));
+  useEffect(() => {
+    if (!linked || !graph) return;
+    setWanted((wanted) => ({ ...wanted, quiet: false, services: wanted.services || linked.startsWith("s") }));
+    setSearch("");
+    setChosen(linked);
+  }, [linked, graph !== null]);
   const shownHost = useShown();
   const counts = useDeniedCounts(denials?.[0]?.sequence ?? 0);
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);

@@ -11,6 +11,7 @@ import { Link } from "../router.js";
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
 const SEEN = "rosrv.reviewed";
 const MOST = 8;
+const ORDER = ["alarm", "warning", "notice"];
 
 /** The page about an alarm, by its kind or subject. @param {import("../live.js").Alarm} alarm */
 export function placeOf(alarm) {
@@ -33,7 +34,7 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
   return html`<section class="panel spaced" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>${incidents !== null && !alarms.length && !open.length && html`<span class="muted small">No open alarms</span>`}
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
     ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? null
-      : html`<ul class="alarm-list">${alarms.map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
+      : html`<ul class="alarm-list">${alarms.toSorted((one, other) => ORDER.indexOf(one.severity) - ORDER.indexOf(other.severity)).map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${placeOf(one)} class="alarm-text"><${Given} value=${inOwnZone(one.text)} most=${300} /></${Link}><${CopyCommand} text=${one.text} /></li>`)}
         ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}

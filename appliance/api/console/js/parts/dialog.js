@@ -1,13 +1,14 @@
 /** A modal dialog. Escape and the close button close it; the focus then returns to the previous element. */
 
-import { html, useEffect, useId, useRef } from "../html.js";
+import { html, useId, useLayoutEffect, useRef } from "../html.js";
 import { Icon } from "./icon.js";
 
 /** @param {{title: string, close: () => void, foot?: any, wide?: boolean, children?: any}} given */
 export function Dialog({ title, close, foot, wide = false, children }) {
   const ref = useRef(/** @type {HTMLDialogElement | null} */ (null));
   const id = useId();
-  useEffect(() => {
+  // Not an effect after the drawing: a key that follows belongs to the dialog, and is no shortcut.
+  useLayoutEffect(() => {
     const dialog = ref.current;
     const before = /** @type {HTMLElement | null} */ (document.activeElement);
     dialog?.showModal();
