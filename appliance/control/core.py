@@ -191,7 +191,7 @@ class RelayOrders:
         self._relay = relay
         self._holder = holder
         self._changed = changed
-        self._published: set[str] = set()
+        self._published: dict[str, set[str]] = {}  # by owner
         self.ranks = relay.ranks
         """The drivers of topics with a rank."""
         self.publish = relay.publish
@@ -215,15 +215,16 @@ class RelayOrders:
         """
         self._holder.held.provide(HeldCalls(call, request))
 
-    def publish_only(self, headers: Iterable[messages.OwnHeaderStated]) -> None:
-        """Let the appliance's own node publish these topics, and no others of earlier calls."""
-        before, self._published = self._published, set()
+    def publish_only(self, owner: str, headers: Iterable[messages.OwnHeaderStated]) -> None:
+        """Let the appliance's own node publish these topics, and no others of the owner's earlier calls."""
+        before, now = self._published.get(owner, set()), set[str]()
         for header in headers:
             self._relay.begin_own_topic(header)
-            self._published.add(header.topic)
-        for topic in before - self._published:
+            now.add(header.topic)
+        self._published[owner] = now
+        for topic in before - now:
             self._relay.end_own_topic(topic)
-        if before != self._published:
+        if before != now:
             self._changed()
 
     def ready(self) -> bool:

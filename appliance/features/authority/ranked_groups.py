@@ -96,7 +96,7 @@ class RankedGroups:
         groups = {group.topic: group for group in self._policy().authority.values() if group.ranks}
         self._relay.ranks.keep(groups)
         self._drivers = {topic: one for topic, one in self._drivers.items() if topic in groups}
-        self._relay.publish_only(self._headers(groups.values()) if groups else ())
+        self._relay.publish_only("authority", self._headers(groups.values()) if groups else ())
         for group in groups.values():
             self._publish(group)
 

@@ -20,6 +20,7 @@ from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.own_doors import OwnDoors
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.doors.view import DoorsState
+from appliance.features.doors.viewer_topics import ViewerTopics
 from appliance.policy.model import address_of
 from appliance.store.door_tables import DoorRow, TicketRow
 
@@ -46,6 +47,7 @@ class DoorOrders:
         self._tickets = tickets
         self._visits = visits
         self._processes = processes
+        self._viewers = ViewerTopics(core.relay, core.settings.publish_as)
         self._own = OwnDoors(table, core.bearers.sessions)
         self._one = asyncio.Lock()
         # By ticket: the door to which connections were passed, also by an earlier control.
@@ -186,6 +188,9 @@ class DoorOrders:
             await asyncio.sleep(_LOOK_SECONDS)
             self._processes.define()
             self._processes.end_overdue()
+            self._viewers.tell(
+                (row.name, self._processes.health(row).connections) for row in self._table.live()
+            )
             ended = {row.id: row.door for row in self._visits.ended()}
             ended |= {one: self._used.pop(one) for one in [*self._used] if self._tickets.ended(one)}
             for ticket, name in ended.items():

@@ -1,4 +1,6 @@
-"""Print each command on /cmd_vel, with its publisher and speed."""
+"""Print each command on /cmd_vel, with its publisher and speed, and when it came in seconds of the machine."""
+
+import time
 
 import rospy
 from geometry_msgs.msg import Twist
@@ -6,7 +8,12 @@ from report import init_node, report
 
 
 def heard(command):
-    report("received", publisher=command._connection_header["callerid"], speed=command.linear.x)
+    report(
+        "received",
+        publisher=command._connection_header["callerid"],
+        speed=command.linear.x,
+        at=time.monotonic(),
+    )
 
 
 def main():

@@ -43,9 +43,9 @@ def test_each_kind_leads_to_its_page(
     )
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ros.talker("rospy", "/battery")
-        for look in ({"width": 1440}, {"width": 390, "height": 844, "token": token("viewer")}):
-            reader = opened(**look)
-            page = reader.go("policy" if look["width"] > 1000 else "now")
+        for width, height, view, role in ((1440, 900, "policy", "admin"), (390, 844, "now", "viewer")):
+            reader = opened(token(role), width=width, height=height)
+            page = reader.go(view)
             box = search(page, "batt")
             result = box.get_by_role("region", name="Topics").get_by_role("link")
             expect(result).to_contain_text("/battery")

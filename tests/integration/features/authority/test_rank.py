@@ -1,5 +1,6 @@
 """A gamepad and a planner on one computer, and a base: who moves drives."""
 
+import statistics
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,8 @@ base = /cmd_vel
 rank base = {OCU}/gamepad > {OCU}/planner
 free base = 300ms
 """
+FREE = 0.3
+"""Seconds after a zero in which no lower rank is heard: `free base`."""
 QUICK = 0.1
 """The longest hand-over in seconds."""
 MOST = 1.0
@@ -113,3 +116,34 @@ def test_a_gamepad_drives_while_it_moves(site: Site) -> None:
     assert any("moved (/gamepad)" in reason for reason in reasons), reasons
     explained = ("policy", "explain", "--host", OCU, "--node", "/planner", "--publish", "/cmd_vel")
     assert "no higher rank of base does" in site.appliance.rosrv(*explained).stdout
+
+
+def test_a_hundred_hand_overs_are_quick_and_never_mixed(site: Site) -> None:
+    """A gamepad takes over from a planner that moves all the time, and lets go: nodes of rospy, 20 commands a second."""
+    site.planner.send("0.3")
+    site.driver.wait_for(event="received", publisher="/rosrv")
+    site.appliance.rosrv("drive", "free", "base")
+    assert site.heard("/planner") == {"/planner"}
+    taken: list[float] = []
+    given: list[float] = []
+    for _ in range(100):
+        mark, told = site.base.mark(), site.gamepad.mark()
+        site.gamepad.send("0.5")
+        heard = site.base.wait_for(event="received", publisher="/gamepad", since=mark)
+        first = len(site.base.events)
+        taken.append(heard["at"] - site.gamepad.wait_for(event="commanded", since=told)["at"])
+        site.base.wait_for_count(4, event="received", publisher="/gamepad", since=mark)
+        told = site.gamepad.mark()
+        site.gamepad.send("0")
+        let_go = site.gamepad.wait_for(event="commanded", speed=0.0, since=told)["at"]
+        heard = site.base.wait_for(event="received", publisher="/planner", since=first)
+        given.append(heard["at"] - let_go - FREE)
+        order = [event["publisher"] for event in site.base.events[mark:] if "publisher" in event]
+        at = order.index("/gamepad")
+        changes = sum(one != other for one, other in zip(order[at:], order[at + 1 :], strict=False))
+        assert changes <= 1, order
+    for name, seconds in (("to the gamepad", taken), ("back, after `free`", given)):
+        print(f"{name}: p50 {statistics.median(seconds) * 1e3:.1f} ms, max {max(seconds) * 1e3:.1f} ms")
+    assert min(given) > 0, "the planner was heard before the time of `free` was over"
+    assert statistics.median(taken) < QUICK
+    assert max(taken) < QUICK + MOST

@@ -41,7 +41,7 @@ class Relay:
     def publish(self, message: OwnPublished) -> None:
         self.published.append(message)
 
-    def publish_only(self, headers: Iterable[OwnHeaderStated]) -> None:
+    def publish_only(self, _owner: str, headers: Iterable[OwnHeaderStated]) -> None:
         self.topics = [header.topic for header in headers if header.latching]
 
     async def carried_out(self, topics: Collection[str]) -> None:
