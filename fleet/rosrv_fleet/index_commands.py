@@ -11,7 +11,7 @@ from appliance import __version__
 from appliance.audit.log.record_format import printable
 from appliance.audit.search.filter_options import FILTER, Since, Until
 from appliance.base import clock
-from appliance.base.timestamps import parse_timestamp
+from appliance.base.timestamps import in_local_zone, parse_timestamp
 from appliance.formats.machine_report import MachineReport
 from appliance.formats.report_words import host_words, page, report_lines
 from rosrv_fleet.collector import make_collector
@@ -66,7 +66,8 @@ def search(
 
 def _line(record: dict[str, Any]) -> str:
     names = ("robot", "time", "severity", "decision", "event", "host", "caller_id", "resource", "reason")
-    return "  ".join(printable(str(record[name])) for name in names if record.get(name))
+    shown = record | {"time": in_local_zone(record["time"])}
+    return "  ".join(printable(str(shown[name])) for name in names if shown.get(name))
 
 
 @report_app.command("interventions")

@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 import typer
 
+from appliance.base.timestamps import in_local_zone
 from appliance.formats.fleet_membership import Invitation
 from rosrv_fleet.config import load_config
 from rosrv_fleet.enrolment import Robot, RobotGroup, check_name
@@ -164,7 +165,7 @@ def list_robots(config: Config = DEFAULT_CONFIG, *, as_json: Json = False) -> No
 def _robot_line(robot: Robot, fields: dict[str, str | None]) -> str:
     words = [fields[name] or "-" for name in ("name", "state", "group", "key", "certificate")]
     words += [f"heard {fields['heard'] or 'never'}", f"valid until {fields['certificate_ends']}"]
-    return "  ".join([*words, *([f"appliance {fields['appliance']}"] if robot.others else [])])
+    return in_local_zone("  ".join([*words, *([f"appliance {fields['appliance']}"] if robot.others else [])]))
 
 
 def _utc(seconds: float | None) -> str | None:

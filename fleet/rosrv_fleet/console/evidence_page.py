@@ -2,15 +2,14 @@
 
 from collections.abc import Mapping
 
-from appliance.audit.log.record_format import rfc3339
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.console.frame import Column, field, link, moment, row, table, text
+from rosrv_fleet.console.frame import Column, field, link, local_time, moment, row, table, text
 from rosrv_fleet.evidence.store import StoredEvidence
 
 FILTERS = ("robot", "id")
 _COLUMNS = (
     Column("Robot"),
-    Column("From (UTC)"),
+    Column("From"),
     Column("Until"),
     Column("Recording"),
     Column("Records", number=True),
@@ -38,7 +37,7 @@ def _bundle(one: StoredEvidence, *, may_get: bool) -> str:
         _COLUMNS,
         (
             link("/evidence", one.robot, robot=one.robot),
-            *(text(rfc3339(at)[:19].replace("T", " ")) for at in (one.since, one.until)),
+            *(text(local_time(at)) for at in (one.since, one.until)),
             text(one.recording),
             f"{one.records:,}",
             f"{one.bytes:,}",

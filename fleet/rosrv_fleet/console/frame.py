@@ -3,7 +3,6 @@
 Functions escape the strings that they get, except `body`, `rows`, `cells`, and labels that are constants.
 """
 
-import datetime
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Literal, NamedTuple
@@ -13,6 +12,7 @@ from fastapi.responses import HTMLResponse
 
 from appliance.audit.log.record_format import printable
 from appliance.base import clock
+from appliance.base.timestamps import local_text
 from rosrv_fleet.tokens import OperatorToken
 
 # With `no-referrer`, browsers send `Origin: null` with the console's own forms.
@@ -126,4 +126,10 @@ def since(at: float) -> str:
 
 
 def moment(at: float) -> str:
-    return f"{datetime.datetime.fromtimestamp(at, datetime.UTC):%Y-%m-%d %H:%M:%S}"
+    """Return seconds since the epoch as a time in the collector's zone, with its offset."""
+    return local_time(int(at) * 10**9)
+
+
+def local_time(time: int, digits: int = 0) -> str:
+    """Return nanoseconds since the epoch in the collector's zone, with its offset; the search takes this text."""
+    return local_text(time, digits=digits).replace("T", " ")

@@ -59,7 +59,7 @@ def groups_page(service: BundleService) -> str:
 
 
 def _expires(at: float) -> str:
-    return f'<p class="muted">The signed metadata expire at {moment(at)} UTC.</p>'
+    return f'<p class="muted">The signed metadata expire at {moment(at)}.</p>'
 
 
 def _group(state: dict[str, Any]) -> str:

@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from appliance.audit.search.filter_options import filter_given, in_utc
+from appliance.audit.search.filter_options import filter_given
 from appliance.audit.search.query import FilterError
-from appliance.base.timestamps import TimestampError
+from appliance.base.timestamps import TimestampError, parse_timestamp
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.console.frame import Column, alert, badge, choice, field, link, row, table, text
+from rosrv_fleet.console.frame import Column, alert, badge, choice, field, link, local_time, row, table, text
 from rosrv_fleet.evidence.store import StoredEvidence
 from rosrv_fleet.search import (
     FleetPage,
@@ -26,7 +26,7 @@ _ROWS = 100
 _COLUMNS = tuple(
     map(
         Column,
-        ("Time (UTC)", "Robot", "Decision", "Event", "Host", "Caller", "Resource", "Reason", "Evidence"),
+        ("Time", "Robot", "Decision", "Event", "Host", "Caller", "Resource", "Reason", "Evidence"),
     )
 )
 
@@ -50,7 +50,6 @@ def _result(collector: Collector, viewer: str, asked: Mapping[str, str]) -> str:
     if asked["decision"] in dict(_DECISIONS) and asked["decision"]:
         words[asked["decision"]] = True
     try:
-        words |= {name: in_utc(words.get(name)) for name in ("since", "until")}
         wanted = FleetFilter(asked["robot"] or None, filter_given(**words))
         with collector.searches.turn(viewer) as database:
             waiting = collector.store.waiting(MOST_WAITING)
@@ -78,7 +77,7 @@ def _record(record: dict[str, Any], bundles: Sequence[StoredEvidence]) -> str:
     return row(
         _COLUMNS,
         (
-            text(record["time"][:23].replace("T", " ")),
+            text(local_time(parse_timestamp(record["time"], 0), 3)),
             text(record["robot"]),
             badge("bad" if decision == "deny" else "plain", decision) if decision else "",
             *(text(word or "") for word in words),

@@ -1,6 +1,5 @@
 """`rosrv-fleet rollout`: start, watch, stop and revert rollouts over the collector's REST."""
 
-import datetime
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from appliance.base.counted import counted
+from appliance.base.timestamps import local_text
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
 from rosrv_fleet.output import say, say_json
 
@@ -91,7 +91,7 @@ def _problems(group: dict[str, Any]) -> str:
 
 
 def _time(seconds: float) -> str:
-    return f"{datetime.datetime.fromtimestamp(seconds, datetime.UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return local_text(int(seconds) * 10**9, digits=0).replace("T", " ")
 
 
 def _show(group: dict[str, Any]) -> None:
