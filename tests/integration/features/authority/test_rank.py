@@ -147,7 +147,7 @@ def test_a_hundred_hand_overs_are_quick_and_never_mixed(
     record_property("ms", {name: _figures(seconds) for name, seconds in (("taken", taken), ("given", given))})
     assert min(given) > 0, "the planner was heard before the time of `free` was over"
     assert statistics.median(taken) < QUICK
-    assert max(taken) < QUICK + MOST
+    assert max(taken + given) < QUICK + MOST
 
 
 def _figures(seconds: list[float]) -> str:

@@ -30,7 +30,7 @@ class Relay:
         self.told.append((message.topic, count))
 
 
-def test_viewers_are_told_when_they_change() -> None:
+def test_a_change_of_the_number_is_published() -> None:
     relay, changes = Relay(), list[int]()
     orders = RelayOrders(cast("Any", relay), cast("Any", None), lambda: changes.append(1))
     orders.publish_only("authority", [OwnHeaderStated("/rosrv/driver/base", "", "", "", latching=True)])
