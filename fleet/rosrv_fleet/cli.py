@@ -16,7 +16,7 @@ from appliance.audit.log.record_format import printable
 from appliance.audit.search.filter_options import FilteredCommand
 from appliance.audit.search.query import FilterError
 from appliance.base.counted import counted
-from appliance.base.timestamps import TimestampError, in_local_zone
+from appliance.base.timestamps import TimestampError
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import LEAST_SILENT_SECONDS, FleetConfigError, load_config
