@@ -1,5 +1,10 @@
 import json
+import os
+import pty
 import re
+import select
+import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +14,7 @@ from websockets.sync.client import connect
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.waiting import eventually
 
@@ -207,3 +213,32 @@ def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
         mark = echo.mark()
         appliance.kill("control")
         echo.wait_for_text(STOPS, since=mark)
+
+
+def test_a_terminal_shows_a_call_with_a_bell_and_its_end(appliance: Appliance, robot: Host) -> None:
+    """`rosrv approve --watch` on a terminal, and a call that is held while it runs."""
+    ours, theirs = pty.openpty()
+    command = (ROSRV, "approve", "--watch", "--state", str(appliance.state))
+    watching = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
+    os.close(theirs)
+    shown = bytearray()
+
+    def has(text: str) -> bool:
+        while select.select([ours], [], [], 0.05)[0]:
+            shown.extend(os.read(ours, 4096))
+        return text in shown.decode()
+
+    try:
+        twist = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
+        number = number_in(agent(robot, twist, answer="status")["msg"])
+        eventually(lambda: has(f"rosrv approve {number} --for 30s"), "the terminal shows the call")
+        assert "\a" in shown.decode()
+        appliance.rosrv("approval", "refuse", number)
+        eventually(lambda: has("refused"), "the terminal shows that it was refused")
+        assert shown.decode().count("\a") == 1, "only a call that waits rings"
+        watching.send_signal(signal.SIGINT)
+        assert watching.wait(20) == 0
+    finally:
+        watching.kill()
+        watching.wait()
+        os.close(ours)
