@@ -26,13 +26,18 @@ export function Drive() {
 
 function Group(/** @type {{group: any, again: () => void}} */ { group, again }) {
   const [open, setOpen] = useState(/** @type {keyof typeof SAID | ""} */ (""));
-  const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${SAID[verb]}…</${Button}>`;
+  const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${wordOf(verb, group)}…</${Button}>`;
   return html`<tr data-group=${group.group}>
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
     <td data-label="Holder"><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> <${Given} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
     <td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>
     <td><div class="row row-end">${group.ranks.length ? button("give", { disabled: !isStuck(group), why: "No lower rank waits for a person" }) : html`${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
+}
+
+/** The verb on a button: a group with a rank is freed, without a host. @param {keyof typeof SAID} verb @param {any} group */
+function wordOf(verb, group) {
+  return group.ranks.length ? "Free" : SAID[verb];
 }
 
 function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => void, close: () => void}} */ { verb, group, again, close }) {
@@ -52,14 +57,14 @@ function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => 
   };
   const text = {
     take: "The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.",
-    give: group.ranks.length ? "The group is handed back: the next node that moves drives. Leave the host empty." : "The holder's authority ends. The group goes to this host, or without one to the first that waits.",
+    give: group.ranks.length ? "The group is handed back: the next node that moves drives." : "The holder's authority ends. The group goes to this host, or without one to the first that waits.",
     ask: "The host waits for the group. It gets the group once that is free, if the policy lets it take the group.",
   }[verb];
   const submit = (/** @type {Event} */ event) => {
     event.preventDefault();
     if (host || give) go();
   };
-  return html`<${Dialog} title=${`${SAID[verb]} ${group.group}`} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="primary" disabled=${!host && !give} why="Name a host" onClick=${go}>${SAID[verb]}</${Button}>`}>
-    <p>${text}</p><form onSubmit=${submit}><${Field} label="Host" mono value=${host} set=${setHost} list=${id} hint="an address, or the name of a host" /></form>
+  return html`<${Dialog} title=${`${wordOf(verb, group)} ${group.group}`} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="primary" disabled=${!host && !give} why="Name a host" onClick=${go}>${wordOf(verb, group)}</${Button}>`}>
+    <p>${text}</p>${!group.ranks.length && html`<form onSubmit=${submit}><${Field} label="Host" mono value=${host} set=${setHost} list=${id} hint="an address, or the name of a host" /></form>`}
     <datalist id=${id}>${hosts.map((one) => html`<option key=${one} value=${one}></option>`)}</datalist></${Dialog}>`;
 }
