@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -133,8 +133,8 @@ class Person:
     begins: int
     leaves: float = math.inf
     """When the person turns back, in ms."""
-    before: Point = (0.0, 0.0)
-    """The place a step ago."""
+    places: list[Point] = field(default_factory=list)
+    """The place at each step of the world, the last one first."""
     in_way: bool = False
     stepped_in: bool = False
     """Whether the person came from beside the base's way, nearer than the separation distance."""
@@ -152,6 +152,8 @@ class SeparationWorld(DrivenWorld):
     preset: ClassVar[str] = "separation"
     returns = False
     """Whether a scanner that was silent may send again."""
+    stood = True
+    """Whether the base stood a step ago."""
     not_yet: ClassVar[Mapping[str, str]] = {
         "switch": "a base that drove without the guard may be so fast that no stop prevents a collision"
     }
@@ -326,6 +328,7 @@ class SeparationWorld(DrivenWorld):
     def _touch(self) -> None:
         for person in self.persons:
             self._follow(person)
+        self.stood = math.hypot(*self.base.velocity) <= 0.01
         places = [(*geometry.nearest_on(wall, self.base.x, self.base.y), 0.0) for wall in self.walls]
         places += [(one.x, one.y, PERSON_RADIUS) for one in self.persons if not one.stepped_in]
         vx, vy = self.base.velocity
@@ -344,7 +347,10 @@ class SeparationWorld(DrivenWorld):
 
     def _follow(self, person: Person) -> None:
         """Note whether a person steps into the base's way from beside it, so near that no moving base can stop."""
-        before, person.before = person.before, (person.x, person.y)
+        person.places = [(person.x, person.y), *person.places[:100]]
+        # The motion of a base that stood was judged a lag ago.
+        steps = 1 + self.base.lag // 10 if self.stood else 1
+        before = person.places[min(steps, len(person.places) - 1)]
         is_in = self._in_way(person.x, person.y)
         if not is_in:
             person.stepped_in = False

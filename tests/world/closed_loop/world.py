@@ -19,7 +19,8 @@ The declared assumptions:
 - A sensor sends at least every `silent` while it works, and the guard's host runs its timers when they are due.
 - A person walks at most at `person`, straight at the base, and stops for nothing; only a base that moves towards
   a person or a wall that it touches collides. A person who steps into the base's way from beside it, nearer than
-  the separation distance, is not protected: the guard lets a base drive along a wall.
+  the separation distance, is not protected: the guard lets a base drive along a wall. For a base that begins to move,
+  this counts from the command, which it executes after its lag.
 - Between the base's outline and the `margin` are at least 6 cm, for the angles between the rays.
 - A link that was cut delivers at once what it held: within 10 ms.
 - A position is exact, or wrong by less than half of the `margin`. A scan or a position is never frozen.
