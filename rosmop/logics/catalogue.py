@@ -53,7 +53,7 @@ def compile_property(  # noqa: PLR0917  parts of a property, in the order of the
     events: Sequence[str],
     origin: Position,
     logic_position: Position | None = None,
-    times: Mapping[str, int] = MappingProxyType({}),
+    times: Mapping[str, int] | None = None,
 ) -> CompiledProperty:
     """Compile a property. Raises `FormulaError`.
 
@@ -66,7 +66,7 @@ def compile_property(  # noqa: PLR0917  parts of a property, in the order of the
             _REFUSED.get(logic.lower()) or f"unknown logic `{logic}`{suggestion(logic.lower(), list(LOGICS))}"
         )
         raise FormulaError([Diagnostic(logic_position or origin, "error", text)])
-    source = Source(logic.lower(), formula, tuple(events), origin, found.suppresses, times)
+    source = Source(logic.lower(), formula, tuple(events), origin, found.suppresses, dict(times or {}))
     if not events:
         raise source.error(0, "a property needs at least one event in its specification")
     return found.compile(source)

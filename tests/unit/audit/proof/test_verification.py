@@ -306,7 +306,7 @@ def test_a_schema_that_is_not_text_is_an_error(log: Path) -> None:
 def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogUnreadableError, match=r"audit\.db: there is no audit log"):
         verify(tmp_path / "audit.db")
-    with pytest.raises(LogUnreadableError, match="no such directory"):
+    with pytest.raises(LogUnreadableError, match="is not a state directory"):
         verify(tmp_path / "nowhere" / "audit.db")
 
 

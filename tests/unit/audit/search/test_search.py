@@ -256,7 +256,7 @@ def test_invalid_pages_are_errors(log: AuditLog, path: Path, arguments: dict[str
 def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogUnreadableError, match=r"no audit log yet.*--state"):
         search(tmp_path / "audit.db", Filter())
-    with pytest.raises(LogUnreadableError, match=r"no such directory.*--state"):
+    with pytest.raises(LogUnreadableError, match=r"is not a state directory \(--state\)"):
         search(tmp_path / "none" / "audit.db", Filter())
 
 
