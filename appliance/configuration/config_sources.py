@@ -242,6 +242,10 @@ class _Gathered:
         if kind == "invalid_key":
             path = (*path[:-1], str(path[-1]))
         place = self._place_of(path)
+        if path[-1:] == ("[key]",):  # pydantic's mark: not the value of a mapping is wrong, but its key
+            *section, key, _mark = path
+            wanted = context["error"] if kind == "value_error" and context else f"must be {must_be(error)}"
+            return Mistake(place, f"{_about(tuple(section), place)}the key {key!r}: {wanted}")
         if kind in ("unexpected_keyword_argument", "invalid_key"):
             return Mistake(place, _unknown_key(path))
         if kind == "missing":

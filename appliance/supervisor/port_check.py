@@ -56,6 +56,10 @@ def require_free(host: str, port: int) -> None:
             sock.bind(address)
             sock.listen()
         except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise StartError(
+                    f"cannot listen on {host}:{port}: no interface of this machine has {host}; `ip address` lists them"
+                ) from error
             if error.errno != errno.EADDRINUSE:
                 raise StartError(f"cannot listen on {host}:{port}: {error.strerror}") from error
             raise PortInUseError(

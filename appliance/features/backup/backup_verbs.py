@@ -13,6 +13,7 @@ from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
 from appliance.cli.typed_confirmation import Confirm, confirm_state
 from appliance.features.backup.purge import purge as remove
+from appliance.features.backup.purge import require_state_directory
 from appliance.features.backup.restore import restore as put_back
 from rosmop.tool.terminal import printable, refused, say
 
@@ -80,6 +81,11 @@ def purge(
 
     Example: rosrv purge --state /var/lib/rosrv
     """
+    if state.is_dir():
+        try:
+            require_state_directory(state)
+        except BackupError as error:
+            raise _failed(str(error)) from None
     confirm_state(state, confirm, f"This erases everything in {printable(str(state))} permanently")
     try:
         files, written = remove(state)

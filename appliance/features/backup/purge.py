@@ -15,6 +15,16 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
+def require_state_directory(state: Path) -> None:
+    """Raise `BackupError` if the folder is not a state directory, before an operator is asked to erase it."""
+    try:
+        reason = foreign(state.absolute())
+    except OSError as error:
+        reason = f"{state}: {error.strerror}"
+    if reason is not None:
+        raise BackupError(reason)
+
+
 def purge(state: Path) -> tuple[int, int]:
     """Erase the state directory; return how many files were removed, and how many of them were overwritten.
 

@@ -11,6 +11,7 @@ from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
 from appliance.features.guards.driver_outcomes import CONSENT, QUESTION, REQUEST, RESTARTED, status_of
 from appliance.features.guards.guard_answers import DriverCheck
+from appliance.features.guards.presets import DRIVER_CHECK, GuardError
 from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
 from rosmop.tool.terminal import say
 
@@ -54,6 +55,8 @@ def check_driver(
     """
     seconds = span_given("--for", longest, "2s", _VERB)
     request = DriverCheckBegin(topic, by, seconds, span_given("--wait", wait, "30s or 5m", _VERB))
+    _require_bounds("--for", "longest", seconds)
+    _require_bounds("--wait", "patience", request.patience)
     _require_consent(seconds, yes=yes)
     check = appliance.ask_or_exit(request)
     if not appliance.as_json:
@@ -62,6 +65,13 @@ def check_driver(
         check = appliance.ask_or_exit(DriverCheckWanted())
     _say_outcome(check, seconds, as_json=appliance.as_json)
     raise typer.Exit(status_of(check.outcome))
+
+
+def _require_bounds(option: str, name: str, seconds: float) -> None:
+    try:
+        DRIVER_CHECK.parameter(name).checked(f"{seconds:g}")
+    except GuardError as error:
+        raise usage_error(f"{option}: {error}", _VERB) from None
 
 
 def _require_consent(seconds: float, *, yes: bool) -> None:

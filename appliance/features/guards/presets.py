@@ -9,6 +9,7 @@ import operator
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 
 from appliance.base.shipped import SHIPPED
@@ -223,7 +224,9 @@ def _require_topic(preset: Preset, name: str, topic: str) -> None:
 def _require_type(preset: Preset, name: str, kind: str, topic: str) -> None:
     types = preset.topics[name]
     if kind not in types and not (ANY_TYPE in types and _TYPE.fullmatch(kind)):
-        raise GuardError(f"{topic} has the type {kind}; {preset.name} works with {works_with(types)}")
+        near = get_close_matches(kind, types, 1, 0.8)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise GuardError(f"{topic} has the type {kind}; {preset.name} works with {works_with(types)}{hint}")
 
 
 def _written(head: Head, body: str) -> str:

@@ -93,8 +93,9 @@ class SessionTable:
         spellings = {name, *(f"{_PREFIX}{one}" for one in (name, name_of(name)))}
         ended = [one for one in self.sessions() if one.name in spellings]
         if not ended:
-            names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"
-            raise UnknownThingError(f"no person is signed in as {name[:140]!r}; there are: {names}")
+            names = ", ".join(sorted({one.name for one in self.sessions()})[:20])
+            known = f"no person is signed in as {name[:140]!r}; signed in: {names}" if names else ""
+            raise UnknownThingError(known or "no person is signed in")
         self._drop(*(one.id for one in ended))
         return ended
 

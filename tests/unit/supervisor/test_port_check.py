@@ -31,7 +31,7 @@ def test_a_port_is_free_again_when_only_old_connections_linger() -> None:
 
 
 def test_an_address_of_another_machine_is_an_error() -> None:
-    with pytest.raises(StartError, match=r"cannot listen on 192\.0\.2\.1:1"):
+    with pytest.raises(StartError, match=r"no interface of this machine has 192\.0\.2\.1"):
         require_free("192.0.2.1", 1)
 
 

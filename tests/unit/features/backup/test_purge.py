@@ -97,3 +97,11 @@ def test_the_command_asks_for_the_path_again(state: Path) -> None:
     done = run(app, ["purge", "--state", str(state)], input=f"{state}\n")
     assert (done.exit_code, "is erased: 5 files" in done.output) == (0, True)
     assert not state.exists()
+
+
+def test_another_folder_is_refused_before_the_question(tmp_path: Path) -> None:
+    (tmp_path / "passwd").write_text("root")
+    answer = CliRunner().invoke(app, ["purge", "--state", str(tmp_path)], input=f"{tmp_path}\n")
+    assert answer.exit_code == 1
+    assert "This erases" not in answer.output
+    assert (tmp_path / "passwd").exists()

@@ -3,10 +3,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph, Topic
 from appliance.channel.messages import MonitorEvent
+from appliance.cli.main import app
 from appliance.control.errors import SenselessError
 from appliance.features.guards import driver_outcomes as sentences
 from appliance.features.guards.driver_check import NAME, DriverChecks
@@ -211,3 +213,11 @@ async def test_a_check_that_is_refused_or_in_shadow_mode_does_not_begin(manager:
 def test_the_console_asks_and_warns_as_the_command_does(sentence: str) -> None:
     page = (Path(sentences.__file__).parent / "console" / "driver.js").read_text()
     assert sentence.replace("{:g}", "${seconds}") in page
+
+
+def test_a_time_out_of_range_is_refused_before_the_warning() -> None:
+    arguments = ["guard", "check-driver", "/cmd_vel", "--by", "/odom", "--for", "20s", "--yes"]
+    answer = CliRunner().invoke(app, arguments)
+    assert answer.exit_code == 2
+    assert "--for: longest=20 is outside of 0.2..10 s" in answer.output
+    assert "driven slowly" not in answer.output

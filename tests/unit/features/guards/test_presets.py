@@ -209,3 +209,11 @@ def test_a_preset_has_its_place_in_the_order_and_on_the_page() -> None:
     section = page.partition("## Presets")[2].partition("\n## ")[0]
     for name in PRESETS:
         assert section.count(f"\n| `{name}` |") == 2, f"{name}: add a row to both tables of docs/guards.md"
+
+
+def test_a_mistyped_type_is_answered_with_the_nearest() -> None:
+    guard = Guard(
+        "speed", PRESETS["speed"], {"command": "/cmd_vel"}, types={"command": "geometry_msgs/Twits"}
+    )
+    with pytest.raises(GuardError, match=r"did you mean geometry_msgs/Twist\?"):
+        text_of(guard)
