@@ -1,4 +1,4 @@
-"""Isolation `netns`: run the appliance in a separate namespace on a bare host (docs/reference/network.md).
+"""Isolation `netns`: run the appliance in a separate namespace on a bare host (docs/reference/processes.md).
 
 1. A connection arrives with the address of the machine that made it: the first translation wins, and the chain
    ROSRV-KEEP, which keeps the source, comes before those of other programs. If a forwarded packet still has an

@@ -95,7 +95,7 @@ def test_a_flood_ends_in_the_container() -> None:
     assert appliance["mem_limit"] == appliance["memswap_limit"] == "2g"
     assert 100 <= appliance["pids_limit"] <= 1000
     settings = resolve(None, environment(), {})
-    others = 500 << 20  # docs/reference/network.md
+    others = 500 << 20  # docs/reference/processes.md
     assert 4 * settings.relay.memory_bytes + others < 2 << 30
 
 
