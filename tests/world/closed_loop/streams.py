@@ -280,7 +280,8 @@ class RateWorld(World):
             self.broken("L3", "a stop is dropped")
         slower = self._slower(wanted, self.before)
         if got is not None and self.moves(got) and not slower:
-            self.motions.append(self.now)
+            # After a hold, a restart or an `enable`, a burst may come again.
+            self.motions = [*(at for at in self.motions if at >= self.fresh_from), self.now]
             for count in range(self.burst + 1, min(30, len(self.motions)) + 1):
                 seconds = (self.motions[-1] - self.motions[-count]) / 1000
                 if count > self.burst + 1 + seconds / self.interval + 1e-6:
