@@ -1,5 +1,6 @@
 """The commands `rosrv backup`, `restore` and `purge`."""
 
+import contextlib
 import shlex
 from pathlib import Path
 from typing import Annotated
@@ -81,11 +82,12 @@ def purge(
 
     Example: rosrv purge --state /var/lib/rosrv
     """
-    if state.is_dir():
-        try:
-            require_state_directory(state)
-        except BackupError as error:
-            raise _failed(str(error)) from None
+    try:
+        with contextlib.suppress(PermissionError):  # which `confirm_state` reports
+            if state.is_dir():
+                require_state_directory(state)
+    except BackupError as error:
+        raise _failed(str(error)) from None
     confirm_state(state, confirm, f"This erases everything in {printable(str(state))} permanently")
     try:
         files, written = remove(state)

@@ -105,3 +105,13 @@ def test_another_folder_is_refused_before_the_question(tmp_path: Path) -> None:
     assert answer.exit_code == 1
     assert "This erases" not in answer.output
     assert (tmp_path / "passwd").exists()
+
+
+def test_an_unreadable_place_is_an_error_with_advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_dir(_path: Path) -> bool:
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path))
+
+    monkeypatch.setattr(Path, "is_dir", is_dir)
+    answer = CliRunner().invoke(app, ["purge", "--state", str(tmp_path)])
+    assert answer.exit_code == 1
+    assert "run this as root" in answer.output
