@@ -136,8 +136,8 @@ def constants_of(
 
 
 def unknown_monitors(names: Collection[str], checked: CheckedSpecifications) -> str:
-    known = ", ".join(checked.monitors) or "none is loaded"
-    return f"no monitor is named {', '.join(names)}; there are: {known}"
+    known = f"there are: {', '.join(checked.monitors)}" if checked.monitors else "none is loaded"
+    return f"no monitor is named {', '.join(names)}; {known}"
 
 
 def _absent(now: InForce, words: Mapping[str, _Word]) -> dict[str, _Word]:

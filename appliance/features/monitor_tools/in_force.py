@@ -213,10 +213,9 @@ def set_given(
         rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
         found = [row for row in rows if row.name == name]
         if not found:
-            known = ", ".join(row.name for row in rows) or "none is loaded"
-            raise usage_error(
-                f"no monitor is named {printable(name)}; there are: {known}", "rosrv monitor set"
-            )
+            names = ", ".join(row.name for row in rows)
+            known = f"there are: {names}" if names else "none is loaded"
+            raise usage_error(f"no monitor is named {printable(name)}; {known}", "rosrv monitor set")
         given = found[0].given
     if appliance.as_json:
         for one in given:

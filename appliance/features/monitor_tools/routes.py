@@ -59,8 +59,9 @@ class _Looking:
 
 
 def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
-    known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
-    return ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
+    names = ", ".join(monitor.name for monitor in loaded.monitors)
+    known = f"there are: {names}" if names else "none is loaded"
+    return ProblemError(404, "unknown", f"no monitor is named {name}; {known}")
 
 
 def routes(services: Services) -> Routes:

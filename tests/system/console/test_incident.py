@@ -224,6 +224,6 @@ def test_a_monitor_in_shadow_mode_says_what_it_would_drop_and_is_promoted(
         count = page.locator(".figures div").filter(has_text="Would have dropped").locator("dd")
         expect(count).to_have_text(re.compile("[1-9]"))
         expect(page.get_by_role("region", name="Latest actions")).to_contain_text("/loud")
-        press(page.get_by_role("button", name="Promote"))
+        press(page.get_by_role("button", name="Enforce"))
         expect(page.get_by_role("switch", name="hush enabled")).to_have_attribute("aria-checked", "true")
         appliance.recorded(event="message dropped", resource="/loud")

@@ -24,7 +24,7 @@ import { useStore } from "../store.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
 import { counters, countOf, stateOf } from "./state.js";
-import { MonitorSwitch, Promote, Resume } from "./switches.js";
+import { Enforce, MonitorSwitch, Resume } from "./switches.js";
 
 /** @param {{name: string, row: any, monitors: any}} given `row` is undefined for a monitor that is not loaded */
 export function MonitorPage({ name, row, monitors }) {
@@ -33,7 +33,7 @@ export function MonitorPage({ name, row, monitors }) {
   const [removing, setRemoving] = useState(false);
   const head = html`<div class="head"><${Link} to="/console/monitors" class="button plain" aria-label="All monitors"><${Icon} name="back" /></${Link}><h1><${Given} value=${name} most=${80} /></h1>
     ${row && html`<${Badge} word=${stateOf(row)} /><span class="head-sub"><${Given} value=${row.file} mono most=${80} /></span>
-      <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.shadow || !row.enabled) && html`<${Promote} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
+      <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.shadow || !row.enabled) && html`<${Enforce} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
         <${Button} role="admin" tone="danger" onClick=${() => setRemoving(true)}>Remove</${Button}></div>`}</div>`;
   if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. Its actions are still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
   const held = row.held && html`<${Notice} tone="deny" role="alert" title="It holds its topics, and drops every message there">${row.why_held || "its relay process was restarted"}. When it is safe, resume it: <code>rosrv monitor resume ${name}</code></${Notice}>`;

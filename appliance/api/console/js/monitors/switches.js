@@ -20,18 +20,18 @@ export function MonitorSwitch({ row, monitors }) {
   return html`<${Switch} role="operator" on=${on} label=${`${row.name} enabled`} change=${change} />`;
 }
 
-/** Promote from shadow mode, or (disabled) move into shadow mode. @param {{row: any, monitors: any}} given */
-export function Promote({ row, monitors }) {
+/** Enforce from shadow mode, or (disabled) move into shadow mode. @param {{row: any, monitors: any}} given */
+export function Enforce({ row, monitors }) {
   const change = async () => {
     try {
       await monitors.change(row.name, { shadow: !row.shadow });
-      done(row.shadow ? `${row.name} is promoted` : `${row.name} is in shadow mode`, row.shadow ? "It acts from now on." : "It only records what it would have done.");
+      done(row.shadow ? `${row.name} is enforced` : `${row.name} is in shadow mode`, row.shadow ? "It acts from now on." : "It only records what it would have done.");
     } catch (failure) {
       failed(failure);
     }
     await monitors.again();
   };
-  return html`<${Button} small role="operator" onClick=${change}><${Icon} name=${row.shadow ? "up" : "play"} size=${14} />${row.shadow ? "Promote" : "Try"}</${Button}>`;
+  return html`<${Button} small role="operator" onClick=${change}><${Icon} name=${row.shadow ? "up" : "play"} size=${14} />${row.shadow ? "Enforce" : "Try"}</${Button}>`;
 }
 
 /** @param {{row: any, monitors: any}} given */

@@ -17,7 +17,7 @@ import { useStore } from "../store.js";
 import { MonitorPage } from "./monitor.js";
 import { LoadSpecification } from "./load.js";
 import { counters, stateOf, useMonitors } from "./state.js";
-import { MonitorSwitch, Promote, Resume } from "./switches.js";
+import { Enforce, MonitorSwitch, Resume } from "./switches.js";
 
 export function Monitors() {
   const { rest: chosen } = useStore(place);
@@ -54,7 +54,7 @@ function MonitorTable(/** @type {{monitors: any}} */ { monitors }) {
     <tbody>${monitors.body.monitors.map((/** @type {any} */ one) => html`<tr key=${one.name} data-monitor=${one.name}>
       <td data-label="On"><${MonitorSwitch} row=${one} monitors=${monitors} /></td>
       <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(one.name)}`}><strong><${Given} value=${one.name} most=${60} /></strong></${Link}><div class="muted small"><${Given} value=${one.file} most=${60} /></div></td>
-      <td data-label="State"><${Badge} word=${stateOf(one)} />${one.off_until && html`<div class="small muted">until <${Moment} at=${one.off_until} /></div>`}${one.shadow && html`<div class="held"><${Promote} row=${one} monitors=${monitors} /></div>`}${one.held && html`<div class="held"><${Resume} row=${one} monitors=${monitors} /></div>`}</td>
+      <td data-label="State"><${Badge} word=${stateOf(one)} />${one.off_until && html`<div class="small muted">until <${Moment} at=${one.off_until} /></div>`}${one.shadow && html`<div class="held"><${Enforce} row=${one} monitors=${monitors} /></div>`}${one.held && html`<div class="held"><${Resume} row=${one} monitors=${monitors} /></div>`}</td>
       <td data-label="Watches"><div>${[...one.topics, ...one.services].slice(0, 3).map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${60} /></div>`)}${one.topics.length + one.services.length > 3 && html`<div class="muted small">and ${one.topics.length + one.services.length - 3} more</div>`}</div></td>
       <td class="number" data-label="Events">${count(one.events)}</td><td class="number" data-label="Verdicts">${count(one.verdicts)}</td><td class="number" data-label="Dropped">${one.shadow ? html`<span class="muted" title="would have dropped">(${count(one.would_drop)})</span>` : count(one.drops)}</td><td class="number" data-label="Changed">${one.shadow ? html`<span class="muted" title="would have changed">(${count(one.would_change)})</span>` : count(one.changes)}</td>
       <td class="number" data-label="Faults">${one.faults ? html`<${Badge} word=${count(one.faults)} tone="deny" />` : "0"}</td>
