@@ -750,13 +750,7 @@ class EstopWorld(World):
         edge = on and not button.on and button.heard != NEVER
         if not self.switched_off:
             button.on, button.heard = on, self.now
-        if (
-            edge
-            and self.needs_reset
-            and not self._pressed()
-            and not self.guard.holds
-            and not self.switched_off
-        ):
+        if edge and self.needs_reset and not self._pressed() and not self.switched_off:
             self.edges[node] = self.now
             hands = [one for one, at in self.edges.items() if self.now - at <= 2000]
             if len(hands) >= (2 if self.hands else 1):
