@@ -407,7 +407,7 @@ def _run(one: Mapping[str, Any], results: Mapping[str, Any]) -> str:
     laws = f"{broken} broke a law" if broken else "none broke a law"
     return (
         f"{one['worlds']:,} worlds from seed {results['first_seed']}, {one['seconds']:,} s, {laws}{near}"
-        f" ({results['date']}, commit `{results['commit']}`)"
+        f" ({results['date']}, commit `{one.get('commit', results['commit'])}`)"
     )
 
 

@@ -81,6 +81,19 @@ def joined(runs: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def corrected(run: dict[str, Any], again: dict[str, Any]) -> dict[str, Any]:
+    """Return `run` with the rows of `again`, which ran the same worlds later, after a correction of the rig."""
+    rows, later = _rows(run), _rows(again)
+    for name, row in later.items():
+        if any(row.get(key) != rows[name].get(key) for key in ("digest", "worlds")):
+            raise ValueError(f"the later run of {name} has other worlds, or another text")
+    if again["first_seed"] != run["first_seed"]:
+        raise ValueError("the later run begins with another seed")
+    told = {name: {**row, "commit": again["commit"]} for name, row in later.items()}
+    pairs = told.pop(PAIRS, run[PAIRS])
+    return {**run, "presets": {**run["presets"], **told}, PAIRS: pairs}
+
+
 def _fixed(run: dict[str, Any], key: str) -> Any:
     return run[key] if key == "commit" else {name: row["digest"] for name, row in run["presets"].items()}
 
@@ -123,12 +136,20 @@ def main(arguments: list[str]) -> int:
         "--alone", default="", metavar="TOPIC", help="with --replay: where a second node publishes alone"
     )
     parser.add_argument("--join", nargs="+", type=Path, help="add these runs, instead of running worlds")
+    parser.add_argument(
+        "--again",
+        type=Path,
+        help="with --join: the same worlds of some presets, run after a correction of the rig",
+    )
     chosen = parser.parse_args(arguments)
     if chosen.join:
         if not chosen.json:
             parser.error("--join needs --json FILE for the sum")
         runs = sorted((json.loads(one.read_text()) for one in chosen.join), key=itemgetter("first_seed"))
-        chosen.json.write_text(json.dumps(joined(runs), indent=1) + "\n", encoding="utf-8")
+        run = joined(runs)
+        if chosen.again:
+            run = corrected(run, json.loads(chosen.again.read_text()))
+        chosen.json.write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
         return 0
     if chosen.replay:
         preset, seed = chosen.replay

@@ -6,7 +6,7 @@ import pytest
 from appliance.features.guards.presets import PRESETS
 from tests.support.examples import ALL
 from tests.support.rows import require_rows
-from tests.world.closed_loop.__main__ import joined
+from tests.world.closed_loop.__main__ import corrected, joined
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
 from tests.world.closed_loop.world import COMMAND
 from tests.world.closed_loop.worlds import (
@@ -148,3 +148,19 @@ def test_a_seed_gives_the_same_world_again(preset: str) -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_planted_fault_is_found(name: str) -> None:
     assert FAULTS[name].first(10 * WITHIN if ALL else WITHIN) is not None
+
+
+def run_of(commit: str, worlds: int, broken: int, *, pairs: bool = False) -> dict[str, Any]:
+    row = {"digest": "d", "worlds": worlds, "seconds": 9, "closest": None, "violations": {"L3": broken}}
+    told = row if pairs else None
+    return {"commit": commit, "date": "2026-11-28", "first_seed": 7, "presets": {"rate": row}, "pairs": told}
+
+
+def test_a_later_run_replaces_the_rows_of_the_same_worlds() -> None:
+    run = corrected(run_of("first", 60, 2, pairs=True), run_of("later", 60, 0))
+    assert run["commit"] == "first" and run["presets"]["rate"]["commit"] == "later"
+    assert run["presets"]["rate"]["violations"] == {"L3": 0} and run["pairs"]["violations"] == {"L3": 2}
+    with pytest.raises(ValueError, match="other worlds"):
+        corrected(run_of("first", 60, 2), run_of("later", 59, 0))
+    with pytest.raises(ValueError, match="another seed"):
+        corrected({**run_of("first", 60, 2), "first_seed": 8}, run_of("later", 60, 0))
