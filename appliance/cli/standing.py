@@ -110,7 +110,7 @@ class StandingJudge:
 
 
 def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
-    """Wait until the robot of the appliance on this machine stands, and say its signs; else exit with status 1."""
+    """Wait until the robot of this machine's appliance stands, and print how that is known; exit with 1 otherwise."""
     if not isinstance(appliance.way, AdminSocket):
         raise usage_error(
             "--when-standing listens to the robot's topics: run it on the appliance's machine", verb

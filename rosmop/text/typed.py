@@ -32,10 +32,10 @@ class _Chosen(NamedTuple):
     row: tree.RoleRow
 
 
-def made(typed: tree.TypedFile, library: Callable[[], Roles]) -> tree.SpecificationFile:
+def made(typed: tree.TypedFile, shipped: Callable[[], Roles]) -> tree.SpecificationFile:
     """Return the specifications with their types and values. Raises `SpecificationError` with all errors.
 
-    `library()` returns the roles that each file has beside its own.
+    `shipped()` returns the roles that each file has beside its own.
     """
     presets = {one.preset: one for one in typed.presets}
     findings = [*_unknown_presets(typed), *_repeated_roles(typed)]
@@ -43,7 +43,7 @@ def made(typed: tree.TypedFile, library: Callable[[], Roles]) -> tree.Specificat
     for one in typed.specifications:
         preset = presets.get(one.known.name if isinstance(one, tree.TypedSpecification) else one.name)
         try:
-            specifications.append(_Maker(typed, one, preset, library).specification())
+            specifications.append(_Maker(typed, one, preset, shipped).specification())
         except SpecificationError as error:
             findings += error.findings
     if findings:
@@ -79,7 +79,7 @@ class _Maker:
     typed: tree.TypedFile
     written: tree.Specification | tree.TypedSpecification
     preset: tree.PresetStatement | None
-    library: Callable[[], Roles]
+    shipped: Callable[[], Roles]
     findings: list[Diagnostic] = field(default_factory=list)
     topics: dict[str, _Chosen] = field(default_factory=dict)
     tables: list[tree.Declaration] = field(default_factory=list)
@@ -217,7 +217,7 @@ class _Maker:
 
     def _role(self, name: str, place: Position) -> tree.RoleDeclaration | None:
         """Return a role with the values and rows of those that it extends."""
-        roles = {**self.library(), **{role.name: role for role in self.typed.roles}}
+        roles = {**self.shipped(), **{role.name: role for role in self.typed.roles}}
         chain: list[tree.RoleDeclaration] = []
         while name:
             role = roles.get(name)

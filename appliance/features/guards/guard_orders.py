@@ -362,9 +362,8 @@ class GuardOrders:
         file = monitors.checked.monitors[name]
         text = monitors.sources.files[file]
         given = monitors.givens.states(monitors.checked, name)
-        topics = PRESETS[
-            preset.name
-        ].given_topics  # without the one that cancels goals, which follows from the goal
+        # The topic that cancels goals is not among them: it follows from the goal's.
+        topics = PRESETS[preset.name].given_topics
         return GuardRow(
             name=name,
             preset=preset.name,

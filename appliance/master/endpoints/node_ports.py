@@ -215,7 +215,7 @@ class AdvertisedAddresses:
         self._fixed = fixed
         self._tunnels = tunnels
         self._route_to = route_to
-        # By host: the address, and until when it stands; that of an unanswered question only for a while.
+        # By host: the address, and how long it is valid. After a question without an answer, it is asked again soon.
         self._routes: dict[Address, tuple[str | None, float]] = {}
 
     def address_for(self, peer: Peer) -> str:
