@@ -10,10 +10,10 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from appliance.features.guards.evidence import text_digest
 from appliance.features.guards.presets import PRESETS, Preset
+from tests.world.closed_loop.results import Row, Rows, parsed, present_digests
 from tests.world.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS
 
 ROOT = Path(__file__).parents[1]
@@ -303,7 +303,11 @@ _COMMON = (
 
 def page() -> str:
     return "\n".join(
-        (_HEAD.format(relay=RELAY_MS, pairs=_pairs()) + "".join(_times()), *_presets(), *_common())
+        (
+            _HEAD.format(relay=RELAY_MS, pairs=_simulated(PAIRS, _results())) + "".join(_times()),
+            *_presets(),
+            *_common(),
+        )
     )
 
 
@@ -370,8 +374,8 @@ def _proofs() -> dict[str, tuple[str, str]]:
     return {name.strip("`"): (proved, open_) for name, proved, open_ in rows}
 
 
-def _results() -> dict[str, Any]:
-    return json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+def _results() -> Rows:
+    return parsed(json.loads(RESULTS.read_text(encoding="utf-8"))) if RESULTS.exists() else {}
 
 
 def _left_out(name: str) -> str:
@@ -382,33 +386,26 @@ def _left_out(name: str) -> str:
     return "; ".join(f"{', '.join(events)}: {why}" for why, events in by_reason.items())
 
 
-def _pairs() -> str:
-    results = _results()
-    found = results.get(PAIRS)
-    return _run(found, results) if found else "no long run yet"
-
-
-def _simulated(name: str, results: Mapping[str, Any]) -> str:
-    if not results:
-        return "no long run yet"
+def _simulated(name: str, results: Rows) -> str:
     if name in NOT_MODELLED:
         return f"no: {NOT_MODELLED[name]}"
-    one = results["presets"].get(name)
-    if one is None:
+    row = results.get(name)
+    if row is None:
         return "no long run yet"
-    if one["digest"] != text_digest(PRESETS[name].text):
-        return f"not since its text changed ({results['date']}, commit `{results['commit']}`)"
-    return _run(one, results)
+    if row.digest != present_digests()[name]:
+        return f"not since its text changed ({row.date})"
+    return run_line(row)
 
 
-def _run(one: Mapping[str, Any], results: Mapping[str, Any]) -> str:
-    near = "" if one["closest"] is None else f", closest {one['closest'] * 100:.1f} cm"
-    broken = sum(one["violations"].values())
+def run_line(row: Row) -> str:
+    """Return a row of the results in one line, with the worlds of each commit."""
+    near = "" if row.closest is None else f", closest {row.closest * 100:.1f} cm"
+    broken = sum(row.violations.values())
     laws = f"{broken} broke a law" if broken else "none broke a law"
-    return (
-        f"{one['worlds']:,} worlds from seed {results['first_seed']}, {one['seconds']:,} s, {laws}{near}"
-        f" ({results['date']}, commit `{one.get('commit', results['commit'])}`)"
-    )
+    counts = f"commit `{next(iter(row.commits))}`"
+    if len(row.commits) > 1:
+        counts = ", ".join(f"{worlds:,} of commit `{one}`" for one, worlds in row.commits.items())
+    return f"{row.worlds:,} worlds from seed {row.first_seed}, {row.seconds:,} s, {laws}{near} ({row.date}, {counts})"
 
 
 if __name__ == "__main__":

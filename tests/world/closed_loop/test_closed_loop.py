@@ -1,12 +1,10 @@
 import re
-from typing import Any
 
 import pytest
 
 from appliance.features.guards.presets import PRESETS
 from tests.support.examples import ALL
 from tests.support.rows import require_rows
-from tests.world.closed_loop.__main__ import corrected, joined
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
 from tests.world.closed_loop.world import COMMAND
 from tests.world.closed_loop.worlds import (
@@ -90,25 +88,6 @@ def test_a_guard_that_takes_any_node_for_its_source_is_found(preset: str, topic:
     assert any(one.law == "L4" for violations in found for one in violations)
 
 
-def test_runs_of_one_commit_are_added() -> None:
-    def run(seed: int, commit: str = "c") -> dict[str, Any]:
-        row = {"worlds": 300, "seconds": 9, "closest": seed / 1000, "violations": {"L1": 1}}
-        return {
-            "commit": commit,
-            "date": "d",
-            "first_seed": seed,
-            "presets": {"a": {"digest": "x", **row}},
-            PAIRS: row,
-        }
-
-    both = joined([run(1000), run(1300)])
-    added = {"worlds": 600, "seconds": 18, "closest": 1.0, "violations": {"L1": 2}}
-    assert both == {**run(1000), "presets": {"a": {"digest": "x", **added}}, PAIRS: added}
-    for other in (run(1300, "d"), run(1299), run(1301)):
-        with pytest.raises(ValueError, match="run"):
-            joined([run(1000), other])
-
-
 LAWS_OF = {
     "deadman": {"L3", "L4", "L6"}, "speed": {"L1", "L2"}, "separation": {"L1", "L2", "L3"}, "fence": {"L2", "L3"},
     "sensor": {"L2"}, "estop": {"L2", "L3", "L4"}, "arm": {"L2"}, "rate": {"L3"}, "agree": {"L2"},
@@ -148,19 +127,3 @@ def test_a_seed_gives_the_same_world_again(preset: str) -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_planted_fault_is_found(name: str) -> None:
     assert FAULTS[name].first(10 * WITHIN if ALL else WITHIN) is not None
-
-
-def run_of(commit: str, worlds: int, broken: int, *, pairs: bool = False) -> dict[str, Any]:
-    row = {"digest": "d", "worlds": worlds, "seconds": 9, "closest": None, "violations": {"L3": broken}}
-    told = row if pairs else None
-    return {"commit": commit, "date": "2026-11-28", "first_seed": 7, "presets": {"rate": row}, "pairs": told}
-
-
-def test_a_later_run_replaces_the_rows_of_the_same_worlds() -> None:
-    run = corrected(run_of("first", 60, 2, pairs=True), run_of("later", 60, 0))
-    assert run["commit"] == "first" and run["presets"]["rate"]["commit"] == "later"
-    assert run["presets"]["rate"]["violations"] == {"L3": 0} and run["pairs"]["violations"] == {"L3": 2}
-    with pytest.raises(ValueError, match="other worlds"):
-        corrected(run_of("first", 60, 2), run_of("later", 59, 0))
-    with pytest.raises(ValueError, match="another seed"):
-        corrected({**run_of("first", 60, 2), "first_seed": 8}, run_of("later", 60, 0))

@@ -9,7 +9,7 @@ from tests.support.features.guards.running_guard import Change, unchanged
 from tests.world.closed_loop.arms import JointsWorld
 from tests.world.closed_loop.measured import OverspeedWorld, StandstillWorld
 from tests.world.closed_loop.motion import FenceWorld, SeparationWorld
-from tests.world.closed_loop.pairs import paired
+from tests.world.closed_loop.pairs import SIDES, WITHOUT, paired
 from tests.world.closed_loop.people import EnableWorld, ModeWorld
 from tests.world.closed_loop.streams import (
     AgreeWorld,
@@ -35,6 +35,8 @@ WORLDS: dict[str, type[World]] = {
 PAIRS = "pairs"
 """Stands for a preset where worlds have two guards, of presets that the seed chooses."""
 _PAIRS = paired(WORLDS)
+IN_PAIRS = (WORLDS.keys() - WITHOUT.keys()) | SIDES.keys()
+"""The presets that take part in pairs."""
 
 NOT_MODELLED = {
     "answer": "it cancels goals of an action, whose server moves the robot; there is no velocity to follow",
