@@ -19,7 +19,8 @@ from typing import Annotated, NamedTuple, Protocol
 import msgspec
 
 from appliance.audit.log.columns import StoredColumns, from_columns, packed, to_columns
-from appliance.audit.log.log_database import LogUnreadableError, chained_rows, number_of_records, reading
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_queries import chained_rows, number_of_records
 from appliance.audit.log.record_format import LogEntry, entry_of
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.checkpoints import last_removal

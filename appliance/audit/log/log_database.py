@@ -124,45 +124,6 @@ def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[
         raise LogUnreadableError(f"{path}: cannot be read: {error}{advice}") from error
 
 
-def record_extent(connection: sqlite3.Connection) -> tuple[int, int]:
-    """Return the sequences of the first and the last record; 1 and 0 for an empty log."""
-    query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
-    first, last = connection.execute(query).fetchone()
-    return int(first), int(last)
-
-
-def record_hash(connection: sqlite3.Connection, sequence: int) -> bytes | None:
-    rows = connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,))
-    return next((digest for (digest,) in rows), None)
-
-
-def chained_rows(connection: sqlite3.Connection, after: int, upto: int) -> sqlite3.Cursor:
-    """Yield the columns of each record after `after`, in order, and its hash."""
-    return connection.execute(
-        f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
-        (after, upto),
-    )
-
-
-def number_of_records(connection: sqlite3.Connection, after: int, upto: int) -> int:
-    query = "SELECT count(*) FROM record WHERE sequence > ? AND sequence <= ?"
-    return int(connection.execute(query, (after, upto)).fetchone()[0])
-
-
-def first_time(connection: sqlite3.Connection, after: int, upto: int) -> int:
-    """Return the time of the first record after `after`, in nanoseconds since the epoch; 0 without a record."""
-    query = "SELECT time FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence LIMIT 1"
-    row = connection.execute(query, (after, upto)).fetchone()
-    return 0 if row is None else int(row[0])
-
-
-def last_detail(connection: sqlite3.Connection, event: str) -> bytes | None:
-    """Return the detail of the last record of an event."""
-    query = "SELECT detail FROM record WHERE event = ? ORDER BY sequence DESC LIMIT 1"
-    row = connection.execute(query, (event,)).fetchone()
-    return None if row is None else row[0]
-
-
 def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connection:
     """Return a connection with these settings to a database that is a log."""
     connection = sqlite3.connect(

@@ -13,7 +13,8 @@ from typing import Annotated
 import msgspec
 
 from appliance.audit.log.columns import StoredColumns, content_hash
-from appliance.audit.log.log_database import LogUnreadableError, chained_rows, reading, record_hash
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_queries import chained_rows, record_hash
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.audit.proof.checkpoints import last_removal
 from appliance.audit.proof.copies import SignedCheckpoint, select_signed

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from appliance.audit.log.log_database import last_detail
+from appliance.audit.log.log_queries import last_detail
 from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import ASKED_AT_ONCE, signature_is_valid
 from appliance.audit.proof.chain_findings import FindingKind, LogFinding

@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 from appliance.audit.log.columns import StoredColumns, from_columns
 from appliance.audit.log.ids import ID_LENGTH
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, open_for_reading, reading
+from appliance.audit.log.log_queries import record_extent
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.search.equality import FOLDED, equal_key
 from appliance.audit.search.query import (
@@ -135,7 +136,8 @@ class LogSnapshot:
 
 
 def last_sequence(path: Path) -> int:
-    return _reading(path, _last_sequence)
+    _first, last = _reading(path, record_extent)
+    return last
 
 
 def recorded_in_full(path: Path, entry: LogEntry) -> LogEntry | None:
@@ -163,14 +165,14 @@ class Follower:
             text_condition(wanted.text)
         self._path = path
         self._wanted = wanted
-        self._after = _reading(path, _last_sequence) if after is None else after
+        self._after = last_sequence(path) if after is None else after
 
     @property
     def position(self) -> int:
         return self._after
 
     def poll(self, limit: int = 1000) -> list[LogEntry]:
-        head = _reading(self._path, _last_sequence)
+        head = last_sequence(self._path)
         if head <= self._after:
             self._after = min(self._after, head)
             return []
@@ -214,11 +216,6 @@ def _reading(path: Path, read: Callable[[sqlite3.Connection], _Found]) -> _Found
         raise
     except (sqlite3.Error, ValueError, TypeError, RecursionError, MemoryError) as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}; run 'rosrv audit verify'") from error
-
-
-def _last_sequence(connection: sqlite3.Connection) -> int:
-    (last,) = connection.execute("SELECT coalesce(max(sequence), 0) FROM record").fetchone()
-    return int(last)
 
 
 def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> SearchPage:

@@ -21,8 +21,18 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from appliance.audit.log.columns import StoredColumns
-from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_queries import (
+    last_of,
+    last_signed,
+    log_id,
+    policies_of,
+    record_id,
+    records_of,
+    sequence_of,
+    sequences_in_period,
+    stored_record,
+)
 from appliance.audit.log.signatures import pinned_key_path
 from appliance.audit.proof.chain_proofs import ChainReader, stored_line
 from appliance.base import clock
@@ -50,11 +60,6 @@ _PAGE = 500
 _APART = 1000  # a larger distance between two records begins a new run
 _MOMENT = (1980, 1, 1, 0, 0, 0)  # the time of every member: the earliest that a ZIP file can store
 _POLICY, _SPECIFICATIONS = "policy loaded", "specifications loaded"
-_LOAD = "SELECT event, revision, detail FROM record WHERE sequence = ?"
-_LOADS = "SELECT sequence FROM record INDEXED BY record_event WHERE sequence BETWEEN ? AND ? AND event = ?"
-_REVISIONS = "SELECT DISTINCT revision FROM record WHERE sequence BETWEEN ? AND ? AND revision > 0"
-_CLOSED = "SELECT sequence, detail FROM record WHERE event = 'recording closed' AND sequence <= ?"
-_LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE event = ? AND sequence < ?"
 
 
 def verifier_program() -> str:
@@ -128,49 +133,41 @@ class _Bundle:
         self._names = names
         with reading(log) as connection:
             connection.execute("BEGIN")
-            self._find(connection.execute)
+            self._find(connection)
         self.count = sum(last - first + 1 for first, last in self._runs)
 
-    def _find(self, execute: Callable[..., sqlite3.Cursor]) -> None:
-        (self._id,) = execute("SELECT id FROM log").fetchone()
-        (sealed,) = execute("SELECT max(sequence) FROM checkpoint WHERE signature IS NOT NULL").fetchone()
-        found = execute(
-            "SELECT sequence FROM record INDEXED BY record_time WHERE time >= ? AND time < ? AND sequence <= ?"
-            " ORDER BY sequence LIMIT ?",
-            (*self._span, sealed or 0, MOST_RECORDS + 1),
-        ).fetchall()
-        self._runs = _runs([sequence for (sequence,) in found])
+    def _find(self, log: sqlite3.Connection) -> None:
+        self._id = log_id(log)
+        _number, sealed = last_signed(log)
+        found = sequences_in_period(log, *self._span, upto=sealed, limit=MOST_RECORDS + 1)
+        self._runs = _runs(found)
         if not found:
             raise BundleError("the log has no record in that period", "unknown")
         if len(found) > MOST_RECORDS:
             raise BundleError(f"more than {MOST_RECORDS} records match: export a shorter period", "request")
         begin = self._runs[0][0]
-        loads = {execute(_LAST_LOAD, (event, begin)).fetchone()[0] for event in (_POLICY, _SPECIFICATIONS)}
+        loads = {last_of(log, event, begin) for event in (_POLICY, _SPECIFICATIONS)}
         self._policies: set[int] = set()
-        for run in self._runs:
-            loads |= {sequence for (sequence,) in execute(_LOADS, (*run, _SPECIFICATIONS))}
-            for (revision,) in execute(_REVISIONS, run).fetchall():
+        for first, last in self._runs:
+            loads |= {row.sequence for row in records_of(log, _SPECIFICATIONS, after=first - 1, upto=last)}
+            for revision in policies_of(log, first, last):
                 self._policies.add(revision)
-                loads.add(
-                    execute(f"{_LAST_LOAD} AND revision = ?", (_POLICY, run[1] + 1, revision)).fetchone()[0]
-                )
-        loads.discard(None)
+                loads.add(last_of(log, _POLICY, last + 1, revision))
+        alone = {sequence for sequence in loads if sequence is not None}
         self._specifications: set[int] = set()
-        for sequence in loads:
-            event, revision, detail = execute(_LOAD, (sequence,)).fetchone()
-            if event == _POLICY:
-                self._policies.add(revision)
-            else:
-                self._specifications.add(json.loads(detail)["revision_of_specifications"])
+        for load in filter(None, (stored_record(log, sequence) for sequence in alone)):
+            if load.event == _SPECIFICATIONS:
+                self._specifications.add(json.loads(load.detail)["revision_of_specifications"])
+            elif load.revision is not None:
+                self._policies.add(load.revision)
         if self._recording is not None:
-            loads |= {
-                sequence
-                for sequence, detail in execute(_CLOSED, (sealed,))
-                if json.loads(detail).get("recording") == self._recording.id
+            alone |= {
+                row.sequence
+                for row in records_of(log, "recording closed", upto=sealed)
+                if json.loads(row.detail).get("recording") == self._recording.id
             }
         edges = {edge for first, last in self._runs for edge in (first - 1, last + 1) if edge <= sealed}
-        there = {edge for edge in edges if execute(_LOAD, (edge,)).fetchone()}
-        self._alone = sorted(loads | there)
+        self._alone = sorted(alone | {edge for edge in edges if record_id(log, edge) is not None})
 
     def manifest(self) -> dict[str, Any]:
         manifest: dict[str, Any] = {
@@ -282,21 +279,20 @@ def _records(log: Path, sequences: Iterable[int]) -> Iterator[bytes]:
 
 
 def _line(connection: sqlite3.Connection, places: ChainReader, sequence: int, following: int) -> bytes:
-    query = f"SELECT {COLUMNS} FROM record WHERE sequence = ?"  # noqa: S608  fixed names
-    row = connection.execute(query, (sequence,)).fetchone()
+    row = stored_record(connection, sequence)
     chain = places.place(sequence, following)
     if row is None or chain is None:
         raise LogUnreadableError(
             f"record {sequence} was removed by retention during the export: export again"
         )
-    return stored_line(StoredColumns(*row), chain)
+    return stored_line(row, chain)
 
 
 def _proof(log: Path, record: str) -> bytes:
     with reading(log) as connection:
-        (sequence,) = connection.execute(
-            "SELECT max(sequence) FROM record WHERE id = ?", (record,)
-        ).fetchone()
+        sequence = sequence_of(connection, record)
+    if sequence is None:
+        raise LogUnreadableError(f"{log}: has no record {record} of this export; run 'rosrv audit verify'")
     return b"".join(_records(log, [sequence]))
 
 

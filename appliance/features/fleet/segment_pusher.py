@@ -22,7 +22,8 @@ from typing import Annotated
 import msgspec
 import structlog
 
-from appliance.audit.log.log_database import LogUnreadableError, first_time, reading, record_extent
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_queries import first_time, last_signed, log_id, record_extent
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
@@ -284,10 +285,8 @@ class SegmentPusher:
 
 def _newest_signed(log: Path) -> tuple[str, int]:
     with reading(log, advice="") as connection:
-        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
-        query = "SELECT coalesce(max(number), 0) FROM checkpoint WHERE signature IS NOT NULL"
-        (number,) = connection.execute(query).fetchone()
-    return str(log_id), int(number)
+        number, _sequence = last_signed(connection)
+        return log_id(connection), number
 
 
 def _removed(log: Path) -> int:
@@ -312,6 +311,5 @@ def _is_passed_over(log: Path, number: int) -> bool:
 def _waiting(log: Path, sequence: int) -> tuple[int, int]:
     """Return the last sealed sequence, and the time of the first sealed record after `sequence` (0: none)."""
     with reading(log, advice="") as connection:
-        query = "SELECT coalesce(max(sequence), 0) FROM checkpoint WHERE signature IS NOT NULL"
-        (sealed,) = connection.execute(query).fetchone()
-        return int(sealed), first_time(connection, sequence, sealed)
+        _number, sealed = last_signed(connection)
+        return sealed, first_time(connection, sequence, sealed)

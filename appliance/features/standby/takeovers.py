@@ -7,10 +7,11 @@ noticed, although epochs may have gaps.
 import sqlite3
 from bisect import bisect_left, bisect_right
 from itertools import islice
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
+from appliance.audit.log.log_queries import decision_between, first_of, record_hash, records_of
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import SignedCheckpoint
 
@@ -86,11 +87,7 @@ class TakeoverLog:
         self._places = [takeover.sequence for takeover in self.takeovers]
 
     def _read(self) -> None:
-        rows = self._connection.execute(
-            "SELECT sequence, time, event, CAST(detail AS BLOB) FROM record WHERE event IN (?, ?) AND sequence <= ?"
-            " ORDER BY sequence",
-            (TOOK_OVER, HANDED_OVER, self.result.last),
-        )
+        rows = records_of(self._connection, TOOK_OVER, HANDED_OVER, upto=self.result.last)
         for sequence, time, event, detail in rows:
             _require_integers(sequence, time)
             try:
@@ -112,18 +109,13 @@ class TakeoverLog:
         return next((one.sequence - 1 for one in later if one.detail.epoch > epoch), self.result.last)
 
     def last_decision(self, after: int, through: int) -> DecisionPlace | None:
-        return self._decision("DESC", after, through)
+        return self._decision(after, through, "last")
 
     def first_decision(self, after: int, through: int) -> DecisionPlace | None:
-        return self._decision("ASC", after, through)
+        return self._decision(after, through, "first")
 
-    def _decision(self, order: str, after: int, through: int) -> DecisionPlace | None:
-        # Retention writes old denials again, with their old time and `kept`; a quote inside a string is escaped.
-        row = self._connection.execute(
-            "SELECT sequence, time FROM record WHERE +event = 'decision' AND sequence > ? AND sequence <= ?"  # noqa: S608  a fixed word
-            f""" AND instr(CAST(detail AS TEXT), '"kept":') = 0 ORDER BY sequence {order} LIMIT 1""",
-            (after, through),
-        ).fetchone()
+    def _decision(self, after: int, through: int, end: Literal["first", "last"]) -> DecisionPlace | None:
+        row = decision_between(self._connection, after, through, end)
         if row is None:
             return None
         _require_integers(*row)
@@ -136,15 +128,14 @@ class TakeoverLog:
         return self._first(STAYED, after, through)
 
     def _first(self, event: str, after: int, through: int) -> int | None:
-        query = "SELECT min(sequence) FROM record WHERE event = ? AND sequence > ? AND sequence <= ?"
-        (place,) = self._connection.execute(query, (event, after, through)).fetchone()
+        place = first_of(self._connection, event, after, through)
         if place is not None:
             _require_integers(place)
-        return place  # type: ignore[no-any-return]  # checked above
+        return place
 
     def hash_at(self, sequence: int) -> bytes | None:
-        row = self._connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,)).fetchone()
-        return row[0] if row is not None and isinstance(row[0], bytes) else None
+        digest = record_hash(self._connection, sequence)
+        return digest if isinstance(digest, bytes) else None
 
     def checkpoint_text(self, number: int) -> bytes:
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()

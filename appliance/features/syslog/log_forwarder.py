@@ -8,12 +8,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import structlog
 
-from appliance.audit.log.log_database import LogUnreadableError, reading, record_extent
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_queries import (
+    first_after_id,
+    last_checkpoint,
+    log_id,
+    record_extent,
+    record_id,
+)
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.proof.copies import signed_checkpoints
@@ -167,8 +174,7 @@ class LogForwarder:
 
 def _extent(path: Path) -> tuple[int, int, str]:
     with reading(path, advice="") as connection:
-        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
-        return *record_extent(connection), str(log_id)
+        return *record_extent(connection), log_id(connection)
 
 
 def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
@@ -178,21 +184,15 @@ def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
     id than the last sent record is new.
     """
     with reading(path, advice="") as connection:
-
-        def ask(query: str, *values: object) -> Any:
-            row = connection.execute(query, values).fetchone()
-            return None if row is None else row[0]
-
-        found = ask("SELECT id FROM record WHERE sequence = ?", position.sequence)
+        found = record_id(connection, position.sequence)
         _first, head = record_extent(connection)
         is_there = not position.record or found is None or found == position.record
         if is_there and position.sequence <= head:
             return position
-        later = "SELECT min(sequence) - 1 FROM record WHERE id > ?"
-        before = ask(later, position.record) if position.record else None
-        sequence = min(position.sequence, head) if before is None else int(before)
-        number = ask("SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?", sequence)
+        new = first_after_id(connection, position.record) if position.record else None
+        sequence = min(position.sequence, head) if new is None else new - 1
+        number = last_checkpoint(connection, sequence)
     _log.warning(
         "the audit log was restored from a copy: forwarding continues from its end", sequence=sequence
     )
-    return ForwardingPosition(position.log, sequence, min(position.checkpoint, int(number)))
+    return ForwardingPosition(position.log, sequence, min(position.checkpoint, number))
