@@ -30,8 +30,8 @@ SUBJECTS: Mapping[str, tuple[str, ...]] = {
     ),
     "alarms": ("alarm acknowledged", "alarm silenced", "alarm sounds again"),
     "software": (
-        "appliance started", "appliance stopped", "process started", "bundle in force", "bundle refused",
-        "rest certificate replaced", "switchover ordered", "took over", "handed over",
+        "appliance started", "appliance stopped", "process started", "bundle in force", "bundle ordered",
+        "bundle refused", "rest certificate replaced", "switchover ordered", "took over", "handed over",
     ),
     "adoption of the robot's graph": ("graph adopted", "graph released"),
     "records": ("recording removed", "evidence exported", "log set aside"),
@@ -137,6 +137,7 @@ CHANGES: Mapping[str, StateChange] = {
     "appliance stopped": StateChange("runs", "stopped"),
     "process started": StateChange("ended unexpectedly", "runs"),
     "bundle in force": _text("{earlier}", "{bundle}"),
+    "bundle ordered": NOTHING_CHANGED,
     "bundle refused": StateChange("{stays}", "{stays}"),
     "rest certificate replaced": _text(earlier="earlier"),
     "switchover ordered": NOTHING_CHANGED,

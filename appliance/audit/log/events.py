@@ -189,6 +189,7 @@ EVENTS: dict[str, str] = {
     " (`rosrv audit acknowledge`); `detail` has its id, and the number and hash of its last signed checkpoint.",
     "signature refused": "The signer rejected a checkpoint, or its signature is invalid or by another key.",
     "bundle in force": "A bundle of the fleet passed its commit-confirm and is in force; `detail.bundle` names it.",
+    "bundle ordered": "An operator let this robot try a bundle that waited for an order; `detail.bundle` names it.",
     "bundle refused": "A bundle of the fleet was refused, or rolled back during commit-confirm; `detail.findings` has"
     " the reasons. The last good one stays in force.",
     "bundle metadata rejected": "The collector serves bundles or metadata that are not accepted: badly signed, expired,"
@@ -228,7 +229,8 @@ SEVERITIES: dict[str, Severity] = {
         Severity.NOTICE: (
             "approval ended", "approval given", "approval refused", "approval used", "approval wanted",
             "authority asked", "authority handed over", "host block ended", "motion stopped", "host unblocked",
-            "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
+            "appliance started", "appliance stopped", "bundle in force", "bundle ordered", "clock not synchronised",
+            "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "driver checked", "guard loaded", "monitor resumed",
             "monitor set",

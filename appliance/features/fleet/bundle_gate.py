@@ -7,6 +7,7 @@
 4. A refused bundle changes nothing; the last good one stays in force.
 5. A bundle whose monitors would hold topics with traffic is not loaded yet: the robot would get no command, not even
    a stop.
+6. With `bundles.wait_for_order`, each try of a bundle needs an order of an operator on the robot.
 """
 
 import asyncio
@@ -141,6 +142,8 @@ class BundleGate:
         self._offered: BundleOffered | None = None
         self._there = asyncio.Event()
         self._waits = ""
+        self._for_order: BundleOffered | None = None
+        self._ordered: BundleOffered | None = None
         self._fingerprinted: tuple[object, str] = (None, "")
 
     def status(self) -> BundlesState | None:
@@ -162,7 +165,17 @@ class BundleGate:
             checked=self._poll.checked or None,
             trouble=trouble,
             rejected=self._poll.rejected,
+            for_order=self._waiting_for_order,
         )
+
+    def order(self, path: str, who: str) -> bool:
+        """Let the bundle that waits for an order be tried; return whether `path` waits."""
+        if self._for_order is None or self._waiting_for_order != path:
+            return False
+        self._ordered, self._for_order = self._for_order, None
+        self._trail.happened("bundle ordered", f"{path} is to be tried", who=who, bundle=path)
+        self._there.set()
+        return True
 
     async def run(self) -> None:
         if self._record.trial is not None:
@@ -177,7 +190,10 @@ class BundleGate:
             except TimeoutError:
                 continue
             self._there.clear()
+            ordered, self._ordered = self._ordered, None
             offered, self._offered = self._offered, None
+            if ordered is not None:
+                await self._take(ordered, ordered=True)
             if offered is not None:
                 await self._take(offered)
 
@@ -218,6 +234,11 @@ class BundleGate:
         return "" if ended or not self._poll.offered else self._waits
 
     @property
+    def _waiting_for_order(self) -> str:
+        """Return the bundle that waits for an order, or ""."""
+        return self._for_order.path if self._for_order is not None and self._waiting else ""
+
+    @property
     def _changed(self) -> bool:
         record = self._record
         if not record.in_force or record.trial is not None:
@@ -245,7 +266,7 @@ class BundleGate:
 
     # --- the gate ---
 
-    async def _take(self, offered: BundleOffered) -> None:
+    async def _take(self, offered: BundleOffered, *, ordered: bool = False) -> None:
         record, contents = self._record, offered.contents
         refused = record.refused
         # The process may have offered the bundle again before it heard of the trial.
@@ -254,7 +275,7 @@ class BundleGate:
             refused and (refused.path, refused.sha256),
         ):
             return
-        self._waits = ""
+        self._waits, self._for_order = "", None
         if self._unconfirmed:
             self._waits = _UNCONFIRMED_CHANGE
             return
@@ -267,6 +288,10 @@ class BundleGate:
             return
         if held:
             self._waits = f"{offered.path} waits until no message passes for a minute: {held[0]}"
+            return
+        if self._fleet.bundles.wait_for_order and not ordered:
+            self._for_order = offered
+            self._waits = f"{offered.path} waits for an order: rosrv fleet take"
             return
         trial = Trial(
             offered.path,

@@ -2,11 +2,14 @@
 
 from appliance.channel.messages import ForwardingLink
 from appliance.control.core import ControlPart, Core
+from appliance.control.errors import SenselessError
 from appliance.control.links.forwarder_link import ForwarderLink
+from appliance.control.operators.request_method import RequestMethod
 from appliance.features.fleet.bundle_gate import BundleGate
 from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.features.fleet.bundle_link import BundleLink
 from appliance.features.fleet.fleet_of_pair import compare_fleets
+from appliance.features.fleet.requests import BundleTake, OrderedBundle
 from appliance.features.fleet.settings import POLLER, PUSHER, Fleet
 
 _LONGEST_BUNDLE = 16 << 20
@@ -33,9 +36,16 @@ async def begin(core: Core) -> ControlPart:
             deprived,
         ),
     )
+
+    async def take(order: BundleTake, who: str) -> OrderedBundle:
+        if not gate.order(order.path, who):
+            raise SenselessError(f"{order.path} does not wait for an order; see rosrv status")
+        return OrderedBundle(order.path, fleet.bundles.confirm_seconds)
+
     core.links.attach(PUSHER, pushed.link, ForwardingLink)
     core.links.attach(POLLER, gate.link, BundleLink, longest=_LONGEST_BUNDLE)
     return ControlPart(
+        (RequestMethod(BundleTake, take, who=True),),
         work={"the bundles": gate.run},
         status=lambda: {"collector": pushed.status(), "bundles": gate.status()},
     )

@@ -49,8 +49,12 @@ FEATURE = Feature(
     ),
     verbs={
         "fleet": Group(
-            "Push the audit log to a collector of many robots.",
-            {"join": Verb(f"{_VERBS}:join"), "leave": Verb(f"{_VERBS}:leave")},
+            "Push the audit log to a collector of many robots, and take its bundles.",
+            {
+                "join": Verb(f"{_VERBS}:join"),
+                "leave": Verb(f"{_VERBS}:leave"),
+                "take": Verb("appliance.features.fleet.take_verb:take"),
+            },
             after="standby",
         )
     },

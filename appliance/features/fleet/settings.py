@@ -55,6 +55,10 @@ class Bundles:
         default=30.0,
         description="for which a new bundle must stay healthy; otherwise it is rolled back automatically",
     )
+    wait_for_order: bool = key(
+        default=False,
+        description="a new bundle waits until `rosrv fleet take`, for example until the robot stands",
+    )
 
     def __post_init__(self) -> None:
         if self.root is not None and not (self.site and self.group):

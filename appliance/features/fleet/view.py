@@ -31,6 +31,7 @@ class BundlesState(msgspec.Struct, frozen=True):
     ]
     trouble: Annotated[str, doc("why no bundles are taken now, or empty if they are")]
     rejected: Annotated[bool, doc("the collector serves metadata that are not accepted")]
+    for_order: Annotated[str, doc("the bundle that waits for `rosrv fleet take`, or empty if none does")] = ""
 
 
 _COLLECTOR_METRICS = (

@@ -173,6 +173,8 @@ def new(
         bool, typer.Option("--shadow", help="Only record what the guard would have done")
     ] = False,
     confirm_within: ConfirmWithin = None,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
     hold: _Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
@@ -190,9 +192,11 @@ def new(
     if dry_run:
         _plan(appliance, GuardTry(preset, topics, types, guard, given, shadow, hold=hold))
         return
-    within = seconds_within(confirm_within, "guard")
+    confirmed = seconds_within(confirm_within, "guard")
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv guard")
     body = appliance.ask_or_exit(
-        GuardNew(preset, topics, given, types, guard, shadow, confirm_within=within, hold=hold)
+        GuardNew(preset, topics, given, types, guard, shadow, confirm_within=confirmed, hold=hold)
     )
     _say_changed(appliance, body)
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
@@ -222,6 +226,8 @@ def set_values(
         ),
     ] = False,
     since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
     hold: _Hold = False,
 ) -> None:
     """Set parameters of a guard while it runs. It keeps its state, unless limits of joints or a deadline are set.
@@ -237,6 +243,8 @@ def set_values(
         _plan(appliance, GuardTry(name=name, values=wanted, hold=hold))
         _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since)
         return
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv guard")
     in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
     constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
     if in_text:
@@ -256,7 +264,13 @@ def set_values(
 
 @speaks
 def enforce(
-    appliance: Appliance, name: _Name, *, confirm_within: ConfirmWithin = None, dry_run: _DryRun = False
+    appliance: Appliance,
+    name: _Name,
+    *,
+    confirm_within: ConfirmWithin = None,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
+    dry_run: _DryRun = False,
 ) -> None:
     """Bring a guard from shadow mode into force. It keeps its state.
 
@@ -269,6 +283,8 @@ def enforce(
         return
     _guard(appliance, name)
     order = admin.MonitorShadow([name], False, confirm_within=seconds_within(confirm_within, "guard"))
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv guard")
     body = appliance.answer_or_exit(order)
     say(f"in force: {', '.join(body.names) or 'no change'}")
     if body.began:

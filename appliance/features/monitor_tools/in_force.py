@@ -15,6 +15,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import printable, say
 
@@ -91,11 +92,15 @@ def enable(
         bool,
         typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
     ] = False,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Enable monitors. With --shadow they only record what they would have done.
 
     Example: rosrv monitor enable safeTrigger --shadow
     """
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv monitor")
     if shadow:
         _switch(appliance, admin.MonitorShadow(names, True), _SHADOW)
     else:
@@ -104,7 +109,13 @@ def enable(
 
 @speaks
 def enforce(
-    appliance: Appliance, names: _Names, *, force: Force = False, confirm_within: ConfirmWithin = None
+    appliance: Appliance,
+    names: _Names,
+    *,
+    force: Force = False,
+    confirm_within: ConfirmWithin = None,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Bring monitors from shadow mode into force. They keep their state.
 
@@ -115,6 +126,8 @@ def enforce(
     Example: rosrv monitor enforce safeTrigger
     """
     seconds = seconds_within(confirm_within, "monitor")
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv monitor")
     _switch(appliance, admin.MonitorShadow(names, False, force=force, confirm_within=seconds), "enabled")
 
 
@@ -161,13 +174,17 @@ def reload(
     shadow: Shadow = False,
     force: Force = False,
     hold: Hold = False,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Load the folder of specifications again. Specifications that are not in it stay loaded and are listed.
 
     Example: rosrv monitor reload
     """
-    within = seconds_within(confirm_within, "monitor")
-    order = admin.MonitorReload(prune=prune, confirm_within=within, force=force, shadow=shadow, hold=hold)
+    seconds = seconds_within(confirm_within, "monitor")
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv monitor")
+    order = admin.MonitorReload(prune=prune, confirm_within=seconds, force=force, shadow=shadow, hold=hold)
     body = appliance.answer_or_exit(order)
     say_replaced(body)
     if body.kept:
@@ -199,6 +216,9 @@ def set_given(
             metavar="NAME=VALUE…", help="Constants that are given to it, such as vMax=0.3", show_default=False
         ),
     ] = None,
+    *,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Set constants that are given to a monitor while it runs. Without values, print everything given to it.
 
@@ -207,7 +227,10 @@ def set_given(
     Example: rosrv monitor set speed vMax=0.3
     """
     if values:
-        answer = appliance.answer_or_exit(admin.MonitorGive(name, _all_assigned(values, "NAME=VALUE")))
+        order = admin.MonitorGive(name, _all_assigned(values, "NAME=VALUE"))
+        if when_standing:
+            stand_or_exit(appliance, within, "rosrv monitor")
+        answer = appliance.answer_or_exit(order)
         given = answer.given
     else:
         rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors

@@ -10,6 +10,7 @@ from appliance.channel.admin import AdminAnswer
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.monitor_tools.in_force import Force, Hold, Shadow, given_to_monitors
 from appliance.features.monitor_tools.sources_to_send import read_to_send
 from rosmop.form.findings import SpecificationError
@@ -39,6 +40,8 @@ def load(
             "--set", metavar="MONITOR.NAME=VALUE", help="Constant or topic given to a monitor (repeatable)"
         ),
     ] = None,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
 ) -> None:
     """Load specifications while the robot runs; files of the same name are replaced.
 
@@ -66,4 +69,6 @@ def load(
         hold=hold,
         given=given_to_monitors(given or []),
     )
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv monitor")
     say_replaced(appliance.answer_or_exit(order))

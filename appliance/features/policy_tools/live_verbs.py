@@ -16,6 +16,7 @@ from appliance.channel.answers.policy_answers import Loaded
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within, verbs_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import loaded_by, say_json
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.terminal import printable, say
 
 
@@ -47,7 +48,13 @@ def show(
 
 
 @speaks
-def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
+def reload(
+    appliance: Appliance,
+    confirm_within: ConfirmWithin = None,
+    *,
+    when_standing: WhenStanding = False,
+    within: Within = WITHIN,
+) -> None:
     """Reload the policy file: check it, run its tests, enforce it, and revoke rights that it no longer grants.
 
     An invalid file changes nothing: all errors are shown and the exit status is 1.
@@ -55,6 +62,8 @@ def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
     Example: rosrv policy reload --confirm-within 5m
     """
     order = PolicyReload(seconds_within(confirm_within, "policy"))
+    if when_standing:
+        stand_or_exit(appliance, within, "rosrv policy")
     say_loaded(appliance.answer_or_exit(order))
 
 

@@ -11,6 +11,7 @@ from appliance.base import clock
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
 from appliance.cli.output import say_json, usage_error
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
@@ -65,16 +66,19 @@ def status(
 
 
 @speaks
-def switch(appliance: Appliance) -> None:
+def switch(appliance: Appliance, *, when_standing: WhenStanding = False, within: Within = WITHIN) -> None:
     """Make the standby the active appliance, for example before an update: a planned switchover.
 
-    Give the order on the active appliance, or on the standby's own machine. It waits until the standby is active, at
-    most 20 s. Exit status: 0 switched over, 1 not, with the reason, 2 no appliance runs.
+    Give the order on the active appliance, or on the standby's own machine; with --when-standing, on the active one.
+    It waits until the standby is active, at most 20 s. Exit status: 0 switched over, 1 not, with the reason, 2 no
+    appliance runs.
 
     Example: rosrv standby switch
     """
     before = appliance.ask_or_exit(StandbyWanted())
     name = before.other.name if before.role == "active" else before.name
+    if when_standing:
+        stand_or_exit(appliance, within, _VERB)
     typer.echo(f"{_VERB}: {printable(name)} is to take over from {_holder(before)}", err=True)
     lost = ""
     try:

@@ -5,12 +5,12 @@ from tests.support.rows import require_rows
 
 COMPARISON = Path(__file__).parents[2] / "integration" / "cli" / "test_both_ways.py"
 # These verbs are tested over REST elsewhere, with their preconditions (a recording, a host's key, a pair); `limits` has
-# numbers that change, a report has the time, and `audit acknowledge`, `adopt` and `release` are refused over REST. The
-# last three have options with these names that do not
-# select the appliance.
+# numbers that change, a report has the time, and `audit acknowledge`, `adopt`, `release` and `fleet take` are refused
+# over REST. The last three have options with these names that do not select the appliance.
 ELSEWHERE = {
     "monitor replay", "record messages", "record fetch", "host add", "host kit", "policy check", "monitor diff",
     "standby status", "standby switch", "limits", "door add", "audit acknowledge", "adopt", "release",
+    "fleet take",
     "report interventions", "up", "selftest", "protect",
 }  # fmt: skip
 

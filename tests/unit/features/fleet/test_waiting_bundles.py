@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -83,7 +84,7 @@ class _Part:
 
 
 class _Robot:
-    def __init__(self) -> None:
+    def __init__(self, fleet: Fleet = _FLEET) -> None:
         self.policies, self.monitors = _Part(), _Part()
         self.hosts = SimpleNamespace(bundled="", take_bundle=self._take_hosts)
         self.trail = FakeTrail()
@@ -98,7 +99,7 @@ class _Robot:
             "trail": self.trail,
             "health": lambda _deprived: _HEALTHY,
         }  # fmt: skip
-        self.gate = BundleGate(_FLEET, **parts)
+        self.gate = BundleGate(fleet, **parts)
         near, self.poller = memory_link(BundleLink)
         self.gate.link.attach(near)
 
@@ -192,3 +193,47 @@ async def test_a_bundle_that_would_hold_moving_topics_tells_the_collector_so(rob
         robot.poll(offered=True)
         await asyncio.sleep(2)
         assert "waits until no message passes for a minute: /cmd_vel" in robot.stated[-1].waits
+
+
+async def test_a_bundle_waits_for_an_order_and_each_try_needs_one() -> None:
+    robot = _Robot(replace(_FLEET, bundles=replace(_FLEET.bundles, wait_for_order=True)))
+    async with robot.running():
+        robot.poll(offered=True)
+        await asyncio.sleep(_CONFIRM_SECONDS)
+        assert robot.state.for_order == _OFFER.path
+        assert "waits for an order: rosrv fleet take" in robot.stated[-1].waits
+        assert not robot.gate.order("site-a/arms/1.tar", "olga")
+        assert robot.gate.order(_OFFER.path, "olga")
+        await asyncio.sleep(5)
+        assert robot.state.trying == _OFFER.path
+        robot.policies.change("olga")  # ends this try
+        await asyncio.sleep(5)
+        robot.poll(offered=True)
+        await asyncio.sleep(5)
+        assert (robot.state.trying, robot.state.for_order) == ("", _OFFER.path)
+        assert robot.gate.order(_OFFER.path, "olga")
+        await asyncio.sleep(_CONFIRM_SECONDS + 5)
+        assert robot.state.in_force == _OFFER.path
+        assert robot.trail.events == ["bundle ordered", "bundle ordered", "bundle in force"]
+        assert not robot.gate.order(_OFFER.path, "olga")
+
+
+async def test_a_bundle_that_is_withdrawn_waits_for_no_order() -> None:
+    robot = _Robot(replace(_FLEET, bundles=replace(_FLEET.bundles, wait_for_order=True)))
+    async with robot.running():
+        robot.poll(offered=True)
+        await asyncio.sleep(2)
+        robot.poll(offered=False)  # the collector withdraws it
+        await asyncio.sleep(2)
+        assert not robot.state.for_order
+        assert not robot.gate.order(_OFFER.path, "olga")
+
+
+async def test_a_bundle_that_would_hold_moving_topics_does_not_wait_for_an_order_yet() -> None:
+    robot = _Robot(replace(_FLEET, bundles=replace(_FLEET.bundles, wait_for_order=True)))
+    async with robot.running():
+        robot.monitors.held = ["/cmd_vel"]
+        robot.poll(offered=True)
+        await asyncio.sleep(2)
+        assert not robot.state.for_order
+        assert "no message passes for a minute" in robot.trouble

@@ -1,0 +1,35 @@
+"""The command `rosrv fleet take`."""
+
+from msgspec.structs import asdict
+
+from appliance.channel.admin import StatusWanted
+from appliance.cli.connection.target import Appliance, speaks_here
+from appliance.cli.output import say_json
+from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
+from appliance.features.fleet.requests import BundleTake
+from appliance.features.fleet.view import BundlesState
+from rosmop.tool.terminal import printable, refused, say
+
+_VERB = "rosrv fleet"
+
+
+@speaks_here
+def take(appliance: Appliance, *, when_standing: WhenStanding = False, within: Within = WITHIN) -> None:
+    """Try the bundle that waits for an order, as `fleet.bundles.wait_for_order` wants it. Exit status 1 if none waits.
+
+    With --when-standing, the bundle comes into force only if the robot stands. `rosrv status` shows the result.
+
+    Example: sudo rosrv fleet take --when-standing --within 600
+    """
+    state: BundlesState | None = asdict(appliance.ask_or_exit(StatusWanted())).get("bundles")
+    if state is None or not state.for_order:
+        why = "" if state is None or not state.trouble else f": {state.trouble}"
+        raise refused([printable(f"{_VERB}: no bundle waits for an order{why}")])
+    if when_standing:
+        stand_or_exit(appliance, within, _VERB)
+    body = appliance.ask_or_exit(BundleTake(state.for_order))
+    if appliance.as_json:
+        say_json(body)
+        return
+    say(printable(f"{body.path} is tried, and stays if the robot is healthy for {body.confirm_seconds:g} s"))
+    say("rosrv status shows whether it is in force")
