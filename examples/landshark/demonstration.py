@@ -276,7 +276,7 @@ def demonstrate(
                 console.print(
                     f"  {command} demo --hold    keeps everything running for you to explore", soft_wrap=True
                 )
-                console.print("  docs/next-to-your-robot.md    how to put the appliance next to your robot")
+                console.print("  docs/install.md    how to put the appliance beside your robot")
             else:
                 console.print(
                     f"\nEverything keeps running until Ctrl-C: the master is {MASTER_URI} on these hosts.\n"

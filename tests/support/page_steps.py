@@ -2,7 +2,7 @@
 
     <!-- on: robot, stays -->
 
-`fails` marks a block that ends with an error, `stays` one that keeps running.
+`fails` marks a block that ends with an error, `stays` one that keeps running. "…" in the output stands for any text.
 """
 
 import re
@@ -27,8 +27,12 @@ class Step:
 def steps(page: str) -> list[Step]:
     text = (DOCS / page).read_text()
     found = [
-        Step(one["host"], one["how"], one["script"], tuple((one["shown"] or "").splitlines()))
+        Step(one["host"], one["how"], one["script"], tuple(_parts(one["shown"] or "")))
         for one in _STEP.finditer(text)
     ]
     assert text.count("```sh") == len(found)
     return found
+
+
+def _parts(shown: str) -> list[str]:
+    return [part.strip() for line in shown.splitlines() for part in line.split("…") if part.strip()]

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "iec-62443.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "threat-model.md"
 # A network device at SL 2. CR 2.3, 5.4 and 7.5 require nothing of a component; CR 2.7 begins at SL 3.
 REQUIRED = """
 CR 1.1, CR 1.1 RE 1, CR 1.2, CR 1.3, CR 1.4, CR 1.5, NDR 1.6, NDR 1.6 RE 1, CR 1.7, CR 1.8, CR 1.9, CR 1.10, CR 1.11,

@@ -29,7 +29,7 @@ ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--output", "
 
 
 def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
-    """Enrol a host as in docs/next-to-your-robot.md: endpoint in `.env`, and the kit from standard output."""
+    """Enrol a host as in docs/install.md: endpoint in `.env`, and the kit from standard output."""
     (alone.directory / ".env").write_text(f"ROSRV_ENDPOINT={MACHINE}\n")
     alone("up", "--detach", "--no-build")
     alone.wait_healthy()
