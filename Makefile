@@ -10,10 +10,6 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := conftest.py appliance roswire rosmop fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
-# What takes longer than half a second waits for `make test`; the rules on the source, tests/unit/test_*.py, do not wait.
-LONG_UNIT := $(filter-out tests/unit/test_% tests/unit/support/%,$(shell grep '^tests/unit\|^tests/world\|^rosmop' tests/long.txt))
-# The files among them with tests that name a missing row, which `make check` runs.
-COMPLETE = $(shell grep --files-with-matches 'mark\.complete' $(LONG_UNIT))
 DETERMINISTIC := -m "not nightly and not real" tests/unit tests/world rosmop/tests
 # Files with tests that are marked `real`.
 REAL = $(shell grep --recursive --files-with-matches --include='test_*.py' 'mark\.real' tests/unit tests/integration tests/system)
@@ -40,8 +36,7 @@ static:
 	$(BIN)/lint-imports
 
 unit:
-	$(PYTEST) $(DETERMINISTIC) $(addprefix --ignore=,$(LONG_UNIT)) -n $$(nproc) --quiet
-	$(PYTEST) -m complete $(COMPLETE) --quiet
+	$(PYTEST) $(DETERMINISTIC) --quick -n $$(nproc) --quiet
 
 test: setup ## check, all tests that chance cannot fail, and at most 100 cases with real nodes (root: network namespaces)
 	$(MAKE) --jobs=3 --output-sync=target static units real

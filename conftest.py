@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from collections.abc import Generator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import structlog
 
 from appliance.base import clock
 from tests.support.determinism import WATCH, may_depend_on_chance
+from tests.support.long_files import is_left_out, waits
 from tests.support.virtual_clock import VirtualClock
 
 _MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
@@ -18,13 +20,23 @@ _WALL = 1_893_456_000.0  # seconds since the epoch: the same date for each run, 
 _NIGHTLY = ("tests/integration/", "tests/system/", "tests/package/", "tests/proofs/")  # unless marked `real`
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--quick", action="store_true", help="leave out the files of tests/long.txt, as `make check` does"
+    )
+
+
 def pytest_configure() -> None:
     """Watch for all that depends on chance, before a test module can import a function that is replaced."""
     WATCH.install()
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    return True if config.getoption("--quick") and is_left_out(collection_path) else None
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark tests with real nodes as nightly, and limit the number of cases marked `real`."""
     real = [item for item in items if item.get_closest_marker("real")]
     if len(real) > _MOST_REAL:
@@ -32,6 +44,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.startswith(_NIGHTLY) and not item.get_closest_marker("real"):
             item.add_marker(pytest.mark.nightly)
+    if config.getoption("--quick"):
+        quick = [one for one in items if one.get_closest_marker("complete") or not waits(_file(one))]
+        config.hook.pytest_deselected(items=[one for one in items if one not in set(quick)])
+        items[:] = quick
+
+
+def _file(item: pytest.Item) -> str:
+    return item.nodeid.partition("::")[0]
 
 
 def _watched(item: pytest.Item) -> Generator[None, Any, Any]:

@@ -12,19 +12,10 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from distribution import counts
 from distribution.checkout import ROOT
-from distribution.counts import (
-    Count,
-    classes,
-    functions,
-    length,
-    main,
-    name_of,
-    no_collector,
-    nodes,
-    parsed,
-    python_files,
-)
+from distribution.counts import Count, classes, functions, length, main, name_of, nodes, parsed, python_files
+from distribution.fact_cache import facts_of_files
 
 _LONG_HELPER = 40  # lines
 _CALL = re.compile(r"(?<!def )\b(\w+)\(")
@@ -51,8 +42,8 @@ class _File(NamedTuple):
 
 @cache
 def _files() -> tuple[_File, ...]:
-    with no_collector():
-        return tuple(map(_facts, python_files(("tests", "rosmop/tests"))))
+    paths = python_files(("tests", "rosmop/tests"))
+    return tuple(facts_of_files(_File, _facts, paths, code=(__file__, counts.__file__)).values())
 
 
 def _facts(path: Path) -> _File:

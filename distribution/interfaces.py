@@ -12,18 +12,10 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from distribution import counts
 from distribution.checkout import ROOT
-from distribution.counts import (
-    Count,
-    functions,
-    main,
-    name_of,
-    no_collector,
-    nodes,
-    parsed,
-    python_files,
-    statements,
-)
+from distribution.counts import Count, functions, main, name_of, nodes, parsed, python_files, statements
+from distribution.fact_cache import facts_of_files
 
 _NAMED = "doors, approvals, authority, sso, guards, standby or recorder"
 _CERTIFICATES = (
@@ -65,8 +57,8 @@ class _File(NamedTuple):
 @cache
 def _product() -> tuple[_File, ...]:
     paths = python_files(("appliance", "roswire", "rosmop", "fleet/rosrv_fleet"), without="rosmop/tests")
-    with no_collector():
-        return tuple(map(_facts, paths))
+    code = (__file__, counts.__file__)
+    return tuple(facts_of_files(_File, _facts, paths, code=code, context=_modules()).values())
 
 
 def _facts(path: Path) -> _File:

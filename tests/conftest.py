@@ -13,6 +13,7 @@ from appliance.network.namespaces import has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.examples import examples
+from tests.support.long_files import LONG
 from tests.support.nodes import RosSession, has_ros
 from tests.support.own_namespace import own_loopback
 from tests.support.processes import ThisMachine
@@ -128,6 +129,5 @@ def pytest_collection_finish() -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the files of tests/long.txt first, in the order of the list."""
-    names = Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines()
-    rank = {name: number for number, name in enumerate(names)}
-    items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(names)))
+    rank = {name: number for number, name in enumerate(LONG)}
+    items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(LONG)))

@@ -35,11 +35,11 @@ class AutojumpLoop(asyncio.BaseEventLoop):
 
     _thread_id: int | None  # of the thread that runs the loop
 
-    def __init__(self, machine: VirtualClock) -> None:
+    def __init__(self, machine: VirtualClock, most_jumps: int = _MOST_JUMPS) -> None:
         super().__init__()
         self.machine = machine
         self._selector = self  # `BaseEventLoop` selects when it has run what was ready
-        self._jumps = 0
+        self._jumps, self._most_jumps = 0, most_jumps
 
     def time(self) -> float:
         return self.machine.now_ns() / 1e9
@@ -49,8 +49,8 @@ class AutojumpLoop(asyncio.BaseEventLoop):
             raise DeadlockError(f"deadlock: {self._waiting()}")
         if timeout > 0:
             self._jumps += 1
-            if self._jumps > _MOST_JUMPS:
-                raise DeadlockError(f"{_MOST_JUMPS} timers have passed in vain: {self._waiting()}")
+            if self._jumps > self._most_jumps:
+                raise DeadlockError(f"{self._most_jumps} timers have passed in vain: {self._waiting()}")
             self.machine.advance_ns(math.ceil(timeout * 1e9))
         # A timer is due if it is later by less than this: after a year, a float has steps of more than a nanosecond.
         self._clock_resolution = max(1e-9, 2 * math.ulp(self.time()))
@@ -130,14 +130,16 @@ def _place(coroutine: Any) -> str:
 
 
 @contextlib.contextmanager
-def autojump(machine: VirtualClock | None = None) -> Iterator[Callable[[], AutojumpLoop]]:
+def autojump(
+    machine: VirtualClock | None = None, *, most_jumps: int = _MOST_JUMPS
+) -> Iterator[Callable[[], AutojumpLoop]]:
     """Yield a factory of loops. `machine` becomes the clock of the block; the default is the test's own."""
     present = clock.source()
     machine = machine or (present if isinstance(present, VirtualClock) else VirtualClock())
     with clock.using(machine):
-        yield lambda: AutojumpLoop(machine)
+        yield lambda: AutojumpLoop(machine, most_jumps)
 
 
-def run(main: Coroutine[Any, Any, _Result]) -> _Result:
-    with autojump() as new_loop, asyncio.Runner(loop_factory=new_loop) as runner:
+def run(main: Coroutine[Any, Any, _Result], *, most_jumps: int = _MOST_JUMPS) -> _Result:
+    with autojump(most_jumps=most_jumps) as new_loop, asyncio.Runner(loop_factory=new_loop) as runner:
         return runner.run(main)

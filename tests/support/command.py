@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -48,6 +49,6 @@ def table(verbs: Verbs | None = None) -> Iterator[tuple[str, Verb]]:
             yield name, one
 
 
-def commands() -> Iterator[tuple[str, Any]]:
-    for name, verb in table():
-        yield name, loaded(verb, name.split()[-1])
+@cache
+def commands() -> tuple[tuple[str, Any], ...]:
+    return tuple((name, loaded(verb, name.split()[-1])) for name, verb in table())

@@ -1,5 +1,6 @@
 import re
 from dataclasses import is_dataclass
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, get_type_hints
@@ -17,6 +18,7 @@ from distribution import command_line_page, settings_page
 from rosmop.tool.command import app as rosmop_app
 from tests.support.command import commands
 from tests.support.page_steps import steps
+from tests.support.sources import files_of_tests
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -131,9 +133,13 @@ def test_settings_that_pages_name_exist() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_tests_that_pages_name_are_there(page: Path) -> None:
     named = set(re.findall(r"`(test_\w+)(?:\[[^`]*\])?`", page.read_text()))
-    files = (*(ROOT / "tests").rglob("*.py"), *(ROOT / "rosmop/tests").rglob("*.py"))
-    texts = [file.read_text() for file in files] if named else []
-    assert [name for name in named if not any(f"def {name}(" in text for text in texts)] == []
+    assert named <= names_of_tests()
+
+
+@cache
+def names_of_tests() -> frozenset[str]:
+    texts = (file.read_text(encoding="utf-8") for file in files_of_tests())
+    return frozenset(name for text in texts for name in re.findall(r"def (test_\w+)\(", text))
 
 
 def test_tests_that_the_assurance_names_are_there() -> None:
@@ -150,11 +156,16 @@ def test_every_operation_of_rest_is_on_its_page() -> None:
     assert not missing, f"describe in docs/reference/rest.md: {', '.join(missing)}"
 
 
-@pytest.mark.parametrize("page", WITH_LINKS[:-1], ids=lambda page: page.name)
-def test_commands_of_pages_exist(page: Path) -> None:
-    options = {
+@cache
+def options_of_verbs() -> dict[str, set[str]]:
+    return {
         name: {one for each in verb.params for one in (*each.opts, "--help")} for name, verb in commands()
     }
+
+
+@pytest.mark.parametrize("page", WITH_LINKS[:-1], ids=lambda page: page.name)
+def test_commands_of_pages_exist(page: Path) -> None:
+    options = options_of_verbs()
     groups = {name.split()[0] for name in options}
     calls = [call.strip() for code in _CODE.findall(page.read_text()) for call in _CALL.findall(code)]
     assert [call for call in calls if call not in groups and not _exists(call, options)] == []

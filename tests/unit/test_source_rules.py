@@ -1,4 +1,4 @@
-"""Rules on the source, in one pass over all files: each file is parsed once, and every rule sees its nodes.
+"""Rules on the source, in one pass over all files: a file that changed is parsed once, and every rule sees its nodes.
 
 A row of `RULES` has the folders, a function that yields facts of a file, a function that judges the facts of all
 files, and sources that the rule must reject and accept.
@@ -9,12 +9,16 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
-from distribution.counts import no_collector, nodes
+from distribution import counts
+from distribution.counts import name_of, nodes
+from distribution.fact_cache import facts_of_files
 from tests.support.sources import ROOT
+from tests.unit import test_plain_english
 from tests.unit.test_plain_english import FOLDERS, bad_habits, said_in
 
 PRODUCT = ("appliance/", "rosmop/", "roswire/")
@@ -385,12 +389,13 @@ def printed(source: Source) -> Iterator[tuple[int, str]]:
     for node in source.nodes:
         match node:
             case ast.Constant(value=str(text)):
-                yield node.lineno, text
+                pass
             case ast.JoinedStr(values=values):
-                yield (
-                    node.lineno,
-                    "\0".join(str(one.value) for one in values if isinstance(one, ast.Constant)),
-                )
+                text = "\0".join(str(one.value) for one in values if isinstance(one, ast.Constant))
+            case _:
+                continue
+        if " " in text:
+            yield node.lineno, text.encode(errors="replace").decode()  # lone surrogates
 
 
 def quoted(seen: Sequence[Seen]) -> Iterator[str]:
@@ -532,12 +537,11 @@ RULES = {
 
 def test_the_source_keeps_its_rules() -> None:
     seen: dict[str, list[Seen]] = {name: [] for name in RULES}
-    with no_collector():
-        for file in sorted({path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}):
-            source = parsed(str(file.relative_to(ROOT)), file.read_text())
-            for name, rule in RULES.items():
-                if applies(rule, source.path):
-                    seen[name] += (Seen(source.path, line, what) for line, what in rule.see(source))
+    paths = sorted({path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")})
+    code = (__file__, test_plain_english.__file__, counts.__file__)
+    for path, facts in facts_of_files(dict[str, list[tuple[int, str]]], seen_in, paths, code=code).items():
+        for name, rows in facts.items():
+            seen[name] += (Seen(path, line, what) for line, what in rows)
     assert len(seen["class names"]) > 1000
     found = [finding for name, rule in RULES.items() for finding in rule.judge(seen[name])]
     assert not found, "\n".join(found)
@@ -567,6 +571,11 @@ def test_a_slot_that_another_file_fills_is_found(begin: str, value: str) -> None
 
 def parsed(path: str, text: str) -> Source:
     return Source(path, text, nodes(ast.parse(text)))
+
+
+def seen_in(path: Path) -> dict[str, list[tuple[int, str]]]:
+    source = parsed(name_of(path), path.read_text())
+    return {name: list(rule.see(source)) for name, rule in RULES.items() if applies(rule, source.path)}
 
 
 def applies(rule: Rule, path: str) -> bool:

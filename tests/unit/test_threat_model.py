@@ -1,5 +1,6 @@
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
@@ -42,10 +43,15 @@ def _runs(tests: Path, path: str, name: str) -> bool:
     file = tests.parent / path if path.startswith("rosmop/") else tests / path
     if not path.endswith(".py") or not file.is_file():
         return False
-    functions = [
-        node
+    marks = _marks(file).get(name)
+    return not name or (marks is not None and not re.search(r"\b(skip|xfail)\b", marks))
+
+
+@cache
+def _marks(file: Path) -> dict[str, str]:
+    """Return the decorators of each function."""
+    return {
+        node.name: " ".join(map(ast.unparse, node.decorator_list))
         for node in ast.parse(file.read_text()).body
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name == name
-    ]
-    marks = [ast.unparse(mark) for function in functions for mark in function.decorator_list]
-    return not name or (bool(functions) and not re.search(r"\b(skip|xfail)\b", " ".join(marks)))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }

@@ -1,4 +1,4 @@
-import ast
+import re
 from pathlib import Path
 
 from appliance.quotas import table
@@ -18,7 +18,6 @@ from distribution.quotas_page import all_rows, allowed, page
 
 ROOT = Path(__file__).parents[3]
 WITHOUT_NUMBER = {RVMASTER_FAREWELLS.thing, LIMITED_TOPIC.thing}
-_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def test_the_page_is_up_to_date() -> None:
@@ -49,8 +48,7 @@ def test_each_row_is_attacked_by_a_test_that_exists() -> None:
         for place in row.shown_by:
             file, _, name = place.partition("::")
             folder = ROOT if file.startswith("rosmop/") else ROOT / "tests"
-            tree = ast.parse((folder / file).read_text())
-            assert name in {node.name for node in ast.walk(tree) if isinstance(node, _FUNCTIONS)}, place
+            assert re.search(rf"^ *(?:async )?def {name}\(", (folder / file).read_text(), re.MULTILINE), place
 
 
 def test_the_reduction_of_a_message_over_budget_is_that_of_the_relay() -> None:

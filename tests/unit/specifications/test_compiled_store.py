@@ -9,6 +9,7 @@ import pytest
 from appliance.channel.messages import Contents, ContentsFound, ContentsWanted, PartsMade, PartsWanted
 from appliance.specifications import compiled_store
 from appliance.specifications.compiled_store import LIBRARIES, SOURCES, CompiledStore, toolchain
+from distribution.counts import statements
 
 QUESTION = ContentsWanted(0, {"a.rv": "text", "b.rv": "more"}, {}, at_start=True)
 ANSWER = ContentsFound(7, Contents({"a": "a.rv"}, topics={"/t": frozenset({"a"})}, compiled=b"code"))
@@ -72,7 +73,7 @@ def test_the_digest_of_the_toolchain_covers_all_that_the_compiler_imports() -> N
         if name in found or file is None:
             continue
         found.add(name)
-        for node in ast.walk(ast.parse(file.read_bytes())):
+        for node in statements(ast.parse(file.read_bytes())):
             names = [one.name for one in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = [node.module, *(f"{node.module}.{one}" for one in names)]

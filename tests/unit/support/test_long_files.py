@@ -1,23 +1,24 @@
-import subprocess
-from pathlib import Path
-
-import pytest
-
-TESTS = Path(__file__).parents[2]
+from tests.support.long_files import LONG, is_left_out, waits
+from tests.support.sources import ROOT
 
 
 def test_every_long_file_exists() -> None:
-    names = (TESTS / "long.txt").read_text(encoding="utf-8").splitlines()
-    assert [name for name in names if not name.startswith("#") and not (TESTS.parent / name).is_file()] == []
+    assert [name for name in LONG if not (ROOT / name).is_file()] == []
 
 
-@pytest.mark.nightly
 def test_rules_on_the_source_run_with_make_check() -> None:
     """They are slow, but a commit that passes `make check` must not fail in CI because of a word in a comment."""
-    command = subprocess.run(
-        ["make", "--dry-run", "unit"], cwd=TESTS.parent, capture_output=True, text=True, check=True
-    ).stdout
-    ignored = [word for word in command.split() if word.startswith("--ignore=")]
-    assert "--ignore=tests/unit/audit/log/test_log.py" in ignored
-    rules = ("--ignore=tests/unit/test_", "--ignore=tests/unit/support/")
-    assert [word for word in ignored if word.startswith(rules)] == []
+    assert waits("tests/unit/audit/log/test_log.py")
+    assert not waits("tests/unit/test_source_rules.py")
+    assert "tests/unit/test_source_rules.py" in LONG
+
+
+def test_a_long_file_with_missing_rows_to_name_is_collected() -> None:
+    complete = ROOT / "rosmop/tests/logics/test_catalogue.py"
+    assert waits("rosmop/tests/logics/test_catalogue.py") and not is_left_out(complete)
+    assert is_left_out(ROOT / "tests/unit/audit/log/test_log.py")
+
+
+def test_make_check_leaves_out_the_long_files() -> None:
+    [recipe] = [line for line in (ROOT / "Makefile").read_text().splitlines() if "--quick" in line]
+    assert "$(DETERMINISTIC)" in recipe

@@ -34,6 +34,7 @@ from appliance.formats.machine_report import (
     read_records,
 )
 from appliance.formats.report_words import page, report_lines
+from distribution.counts import nodes, statements
 
 HOUR = 3_600_000_000_000
 ALWAYS = Period(0, 1000 * HOUR)
@@ -318,7 +319,7 @@ def calls() -> list[tuple[Path, str, ast.Call]]:
         text = file.read_text(encoding="utf-8")
         if file.parent.name in ("logbook", "formats") or not any(f"{name}(" in text for name in _RECORDERS):
             continue
-        for node in ast.walk(ast.parse(text)):
+        for node in nodes(ast.parse(text)):
             if (
                 isinstance(node, ast.Call)
                 and isinstance(node.func, ast.Attribute)
@@ -330,7 +331,7 @@ def calls() -> list[tuple[Path, str, ast.Call]]:
 
 def _fields(code: ast.AST) -> Iterator[str]:
     """Yield the names of the detail's fields that code states: as keywords, or as keys of a dict."""
-    for node in ast.walk(code):
+    for node in nodes(code):
         if isinstance(node, ast.keyword) and node.arg is not None:
             yield node.arg
         if isinstance(node, ast.Dict):
@@ -348,7 +349,7 @@ def _helper(file: Path, name: str) -> set[str]:
     """Return the fields that a method adds, which records several events."""
     found = (
         node
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for node in statements(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.FunctionDef)
     )
     return {field for node in found if node.name == name for field in _fields(node)}
