@@ -6,14 +6,17 @@ events whose calls do not show them, such as the log's own records and the actio
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import appliance
 from appliance.audit.log.events import EVENTS, SEVERITIES
 from appliance.audit.log.record import Severity
 from appliance.audit.log.repetition import ABOUT, PARAMETERS
+from distribution import counts
+from distribution.checkout import ROOT
+from distribution.fact_cache import facts_of_files
 
 _FIELDS = frozenset(
     {
@@ -91,12 +94,31 @@ class EventUse(NamedTuple):
     denies: bool
 
 
+class _Recorded(NamedTuple):
+    """The events that a module records."""
+
+    uses: tuple[EventUse, ...]
+    written: frozenset[str]
+
+
+@cache
+def _modules() -> tuple[_Recorded, ...]:
+    paths = sorted((ROOT / "appliance").rglob("*.py"))
+    usual = map(str, sorted(SEVERITIES.items()))
+    code = (__file__, counts.__file__)
+    return tuple(facts_of_files(_Recorded, _recorded, paths, code=code, context=usual).values())
+
+
+def _recorded(path: Path) -> _Recorded:
+    text = path.read_text(encoding="utf-8")
+    within, place = counts.nodes(ast.parse(text)), path.relative_to(ROOT / "appliance")
+    calls = (node for node in within if isinstance(node, ast.Call))
+    uses = tuple(use for node in calls for use in _use(node, f"{place}:{node.lineno}"))
+    return _Recorded(uses, frozenset(_written(within)))
+
+
 def uses() -> Iterator[EventUse]:
-    root = Path(appliance.__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call):
-                yield from _use(node, f"{path.relative_to(root)}:{node.lineno}")
+    return (use for module in _modules() for use in module.uses)
 
 
 def written() -> frozenset[str]:
@@ -104,16 +126,15 @@ def written() -> frozenset[str]:
 
     A name that is only compared, or only printed, records nothing.
     """
-    return frozenset(
-        name
-        for path in Path(appliance.__file__).parent.rglob("*.py")
-        for name in written_by(path.read_text(encoding="utf-8"))
-    )
+    return frozenset(name for module in _modules() for name in module.written)
 
 
 def written_by(text: str) -> Iterator[str]:
     """Yield the events that a module records."""
-    nodes = [*ast.walk(ast.parse(text))]
+    return _written(counts.nodes(ast.parse(text)))
+
+
+def _written(nodes: Sequence[ast.AST]) -> Iterator[str]:
     events = [event for node in nodes if isinstance(node, ast.Call) and (event := _event(node)) is not None]
     yield from (name for event in events for name in _texts(event))
     if any(not [*_texts(event)] for event in events):

@@ -3,6 +3,7 @@
 import inspect
 import re
 import typing
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from appliance.features.table import TOOLS
 
 ROOT = Path(__file__).parents[3]
 FOLDERS = sorted(path.parent.name for path in (ROOT / "appliance/features").glob("*/feature.py"))
+_FEATURE = re.compile(r"\bappliance\.features\.(\w+)")
 WORLD = ROOT / "tests/world"  # simulates the whole product, also as one of two appliances
 
 
@@ -20,15 +22,22 @@ def test_each_folder_is_a_row() -> None:
     assert sorted(tool.name for tool in TOOLS) == FOLDERS
 
 
+@cache
+def features_in_tests() -> dict[str, set[str]]:
+    """Return the features that each file of tests names, outside of the world."""
+    return {
+        str(path.relative_to(ROOT)): set(_FEATURE.findall(path.read_text(encoding="utf-8")))
+        for path in (ROOT / "tests").rglob("*.py")
+        if WORLD not in path.parents
+    }
+
+
 @pytest.mark.parametrize("name", FOLDERS)
 def test_no_other_test_imports_a_feature(name: str) -> None:
-    imported = re.compile(rf"\bappliance\.features\.{name}\b")
     knowing = [
-        str(path.relative_to(ROOT))
-        for path in (ROOT / "tests").rglob("*.py")
-        if not re.search(rf"(features|system)/{name}/", str(path))
-        and WORLD not in path.parents
-        and imported.search(path.read_text(encoding="utf-8"))
+        file
+        for file, features in features_in_tests().items()
+        if name in features and not re.search(rf"(features|system)/{name}/", file)
     ]
     assert not knowing, f"only tests in a folder features/{name} may import {name}: move them from {knowing}"
 

@@ -10,6 +10,7 @@ from appliance.configuration.settings import Settings
 from appliance.features.selftest import file_checks, machine_checks
 from appliance.network.namespaces import read_only_settings
 from appliance.supervisor.restore_mark import set_mark
+from distribution.counts import functions, statements
 
 ROOT = Path(__file__).parents[4] / "appliance"
 TWINS = {
@@ -39,11 +40,11 @@ def raised() -> set[str]:
     """Return the functions that raise `StartError`."""
     found: set[str] = set()
     for file in ROOT.rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                calls = (one.exc for one in ast.walk(node) if isinstance(one, ast.Raise))
-                names = [getattr(one.func, "id", "") for one in calls if isinstance(one, ast.Call)]
-                found |= {f"{file.relative_to(ROOT)}:{node.name}"} if "StartError" in names else set()
+        text = file.read_text()
+        for function in functions(ast.parse(text if "StartError" in text else "")):
+            calls = (one.exc for one in statements(function) if isinstance(one, ast.Raise))
+            names = [getattr(one.func, "id", "") for one in calls if isinstance(one, ast.Call)]
+            found |= {f"{file.relative_to(ROOT)}:{function.name}"} if "StartError" in names else set()
     return found
 
 
