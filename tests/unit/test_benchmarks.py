@@ -22,12 +22,10 @@ def test_each_program_has_a_reader() -> None:
     programs = {path.stem: path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
     pages = [ROOT / "benchmarks" / "RESULTS.md", *(ROOT / "docs").rglob("*.md")]
     tests = [path for path in files_of_tests() if path.name != "test_benchmarks.py"]
-    texts = [path.read_text() for path in (*pages, *tests)]
+    text = "\n".join(path.read_text() for path in (*pages, *tests))
     named = {
-        name
-        for name in programs
-        if any(re.search(rf"\bbenchmarks[./]{name}\b|`{name}\.py", text) for text in texts)
-    }
+        one or other for one, other in re.findall(r"\bbenchmarks[./](\w+)|`(\w+)\.py", text)
+    } & programs.keys()
     while more := {
         name
         for name in programs.keys() - named

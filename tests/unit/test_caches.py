@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.sources import LANGUAGE_TESTS, ROOT
+
 FOLDERS = ("appliance", "roswire", "rosmop", "fleet/rosrv_fleet")
 CACHES = {"cache", "lru_cache", "functools.cache", "functools.lru_cache"}
 NEVER = "cannot fail"
@@ -72,7 +73,10 @@ def _is_cache(expression: ast.expr) -> bool:
 
 def test_each_cache_says_what_becomes_of_a_failure() -> None:
     files = [
-        file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py") if "tests" not in file.parts
+        file
+        for folder in FOLDERS
+        for file in (ROOT / folder).rglob("*.py")
+        if LANGUAGE_TESTS not in file.parents
     ]
     found = {one for file in files for one in caches(file)}
     assert found == FAILURES.keys()
@@ -272,7 +276,7 @@ def test_each_dictionary_that_is_asked_and_filled_has_its_rule() -> None:
         f"{name}::{attribute}": text
         for folder in FOLDERS
         for file in (ROOT / folder).rglob("*.py")
-        if "tests" not in file.parts and not OF_OPERATORS.match(name := str(file.relative_to(ROOT)))
+        if LANGUAGE_TESTS not in file.parents and not OF_OPERATORS.match(name := str(file.relative_to(ROOT)))
         for text in [file.read_text(encoding="utf-8")]
         for attribute in kept_by_hand(file)
     }

@@ -16,9 +16,9 @@ from rosrv_fleet.cli import app as fleet_app
 from appliance.cli import main
 from distribution.counts import no_collector, nodes
 from rosmop.tool.command import app as rosmop_app
+from tests.support.sources import LANGUAGE_TESTS, ROOT
 
 _UsageError: Any = typer.BadParameter.__mro__[1]  # which typer does not export
-ROOT = Path(__file__).parents[2]
 GIVEN = "\x01"  # a value that the program fills in
 _WORD = r"(?:\\?\"[^\"\n]*\"|'[^'\n]*'|[^\s`\"';()<>|,&]|,(?=\S))+"
 _PROPOSED = re.compile(rf"(?<![\w./-])(rosrv-fleet|rosrv|rosmop) ([a-z][a-z-]*(?: {_WORD})*(?: (?=[\"']))?)")
@@ -56,7 +56,7 @@ def proposals() -> dict[str, str]:
     found: dict[str, str] = {}
     files = [file for folder in ("appliance", "fleet", "rosmop") for file in (ROOT / folder).rglob("*.py")]
     for file in [*files, *ROOT.glob("appliance/**/console/**/*.js")]:
-        if "tests" in file.parts:
+        if LANGUAGE_TESTS in file.parents:
             continue
         for text in texts(file):
             for program, call in _PROPOSED.findall(text):
