@@ -22,7 +22,8 @@ _Done = TypeVar("_Done")
 ConfirmWithin = Annotated[
     str | None,
     typer.Option(
-        help="Commit-confirm: roll back after this time (30s, 5m, 1h) unless you run the command `confirm`"
+        help="Commit-confirm: roll back after this time (30s, 5m, 1h) unless you run `rosrv policy confirm`, or for"
+        " monitors and guards `rosrv monitor confirm`"
     ),
 ]
 

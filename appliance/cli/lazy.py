@@ -19,7 +19,16 @@ from rosmop.tool.terminal import flowed
 
 _HELP_OPTIONS = ["-h", "--help"]
 _FOLDERS = ("--state", "--monitors", "--other")
-_TIMES = ("--since", "--until", "--before", "--after", "--within", "--confirm-within", "--at", "--for")
+_METAVARS = {
+    **dict.fromkeys(("--since", "--until", "--at"), "TIME"),
+    **dict.fromkeys(
+        ("--for", "--within", "--confirm-within", "--before", "--after", "--every", "--grace"), "DURATION"
+    ),
+    **dict.fromkeys(("--other", "--witness", "--fixed"), "ADDRESS"),
+    "--listen": "HOST:PORT",
+    "--note": "TEXT",
+    "--ports": "FIRST-LAST",
+}
 
 
 def application(
@@ -151,12 +160,13 @@ def loaded(verb: Verb, name: str) -> Any:
 def _metavar(option: TyperOption, kind: str) -> str | None:
     """Return the word for an option's value, one for each kind of value; None keeps typer's."""
     name = next(one for one in option.opts if one.startswith("--"))
-    if name in _TIMES and kind == "<str>":
-        return "TIME"
+    if name in _METAVARS and kind == "<str>":
+        return _METAVARS[name]
     words = {
         "<path>": "DIR" if name in _FOLDERS else "FILE",
         "<str>": name.lstrip("-").upper(),
         "<int>": "N",
+        "<int range>": "N",
     }
     return words.get(kind.replace("list[", "").replace("]", ""))
 

@@ -14,7 +14,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -22,6 +22,7 @@ from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.connection.target import Appliance
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import usage_error
 from appliance.configuration.settings import load_resolved
 from appliance.network.interfaces import addresses_by_interface
@@ -60,12 +61,28 @@ _OTHER_COMMANDS = ("ackermann_msgs/", "control_msgs/", "mavros_msgs/", "std_msgs
 WhenStanding = Annotated[
     bool,
     typer.Option(
-        "--when-standing", help="Wait until the robot was commanded to stand and its odometry is zero"
+        "--when-standing", help="Wait until the last command was zero and the odometry shows no motion"
     ),
 ]
-Within = Annotated[
-    float, typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds that --when-standing waits")
-]
+
+
+def _seconds(given: str | float) -> float:
+    """Return the seconds of --within; typer also converts the default."""
+    return given if isinstance(given, float) else bounded_span("--within", given, "1s", "1h", bare="s")
+
+
+def longest_wait(end: str) -> Any:
+    """Return the option --within, in seconds, with the default `WITHIN`."""
+    return typer.Option(
+        "--within",
+        parser=_seconds,
+        metavar="DURATION",
+        show_default="2m",
+        help=f"The longest wait {end}, 1s to 1h",
+    )
+
+
+Within = Annotated[float, longest_wait("of --when-standing")]
 
 
 class NotStandingError(Exception):

@@ -30,7 +30,7 @@ from appliance.channel.status_summary import process_names
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
-from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
+from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
 from appliance.features.views import pair_view, states_of
 from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
@@ -38,7 +38,6 @@ from rosmop.tool.tables import table_of
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
 _MOST_TROUBLES = 5
-_WATCH_SECONDS = 2.0
 _COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
@@ -49,13 +48,9 @@ def status(
     *,
     watch: Watch = False,
     every: Annotated[
-        float | None,
+        str | None,
         typer.Option(
-            metavar="SECONDS",
-            min=LEAST_SECONDS,
-            max=LONGEST_SECONDS,
-            help="With --watch: the time between two statuses (default: 2)",
-            show_default=False,
+            help="With --watch: the time between two statuses, 1s to 1h (default: 2s)", show_default=False
         ),
     ] = None,
 ) -> None:
@@ -65,13 +60,11 @@ def status(
 
     Exit status: 0 in service, 1 needs attention, 2 not running; with --watch that of the last status.
 
-    Example: rosrv status --watch --every 5
+    Example: rosrv status --watch --every 5s
     """
-    if every is not None and not watch:
-        raise usage_error("--every needs --watch", "rosrv status")
+    each = seconds_between(every, "rosrv status", watch=watch)
     try:
         if watch:
-            each = every or _WATCH_SECONDS
             raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
         view = appliance.body_or_exit(_answer(appliance))
     except NotRunningError as error:

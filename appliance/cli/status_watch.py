@@ -17,13 +17,23 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.timestamps import local_text
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
-from appliance.cli.output import say_json
+from appliance.cli.durations import bounded_span
+from appliance.cli.output import say_json, usage_error
 from rosmop.tool.terminal import printable
 
 Watch = Annotated[bool, typer.Option("--watch", help="Redraw it until Ctrl-C, in place on a terminal")]
-LEAST_SECONDS, LONGEST_SECONDS = 1.0, 3600.0
+_SECONDS = 2.0
 _INTERRUPTED, _AWAY = 130, 2
 _MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment
+
+
+def seconds_between(every: str | None, verb: str, *, watch: bool) -> float:
+    """Return the seconds of --every; exit with status 2 if it has no use or is out of bounds."""
+    if every is None:
+        return _SECONDS
+    if not watch:
+        raise usage_error("--every needs --watch", verb)
+    return bounded_span("--every", every, "1s", "1h", verb, bare="s")
 
 
 class StatusView(NamedTuple):

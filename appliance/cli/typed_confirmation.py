@@ -1,20 +1,28 @@
-"""Ask for the state directory again before an order that cannot be undone."""
+"""Ask for the state directory before an order that cannot be undone."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from appliance.cli.output import usage_error
 from rosmop.tool.terminal import printable, refused
 
-Confirm = Annotated[
-    str | None,
-    typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
-]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask; needs --state")]
+Confirm = Annotated[str | None, typer.Option("--confirm", metavar="DIR", hidden=True)]
+"""The former form of `Yes`."""
 
 
-def confirm_state(state: Path, given: str | None, consequence: str) -> None:
-    """Exit with status 1 unless the operator types the state directory, or has given it."""
+def confirm_state(context: typer.Context, state: Path, consequence: str) -> None:
+    """Exit with status 1 unless the operator types the state directory, or has agreed with --yes."""
+    given = context.params["confirm"]
+    if given is not None:
+        typer.echo("--confirm DIR is now --yes, with --state DIR", err=True)
+    elif context.params["yes"]:
+        source = context.get_parameter_source("state")
+        if source is None or source.name != "COMMANDLINE":
+            raise usage_error(f"--yes needs the directory: --state {state}", f"rosrv {context.info_name}")
+        given = str(state)
     try:
         found = state.is_dir()
     except PermissionError as error:

@@ -65,9 +65,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         Path | None, typer.Option(help="State directory: everything that survives a restart")
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help="HOST:PORT of RVMaster for ROS_MASTER_URI; port 0: any")
+        str | None, typer.Option(help="Where RVMaster listens, for ROS_MASTER_URI; port 0: any")
     ] = None,
-    rosmaster_port: Annotated[int | None, typer.Option(help="Port of the ROS master; with 0, any")] = None,
+    rosmaster_port: Annotated[int | None, typer.Option(help="Port of the ROS master; 0: any")] = None,
     isolation: Annotated[
         str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)
     ] = None,
@@ -78,7 +78,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     mediation: Annotated[
         str | None, typer.Option(help="full, or monitored: nodes get real URIs (with --relay monitored)")
     ] = None,
-    api: Annotated[str | None, typer.Option(help="HOST:PORT of REST; port 0: any; or off")] = None,
+    api: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Where REST listens; port 0: any; or off")
+    ] = None,
     api_tls: Annotated[
         str | None, typer.Option(help="on, or off: clear text, on a loopback address only")
     ] = None,

@@ -274,7 +274,7 @@ def demonstrate(
             command = shutil.which("rosrv") or Path(sys.executable).with_name("rosrv")
             if not hold:
                 console.print(
-                    f"  {command} demo --hold    keeps everything running for you to explore", soft_wrap=True
+                    f"  {command} demo --keep    keeps everything running for you to explore", soft_wrap=True
                 )
                 console.print("  docs/install.md    how to put the appliance beside your robot")
             else:

@@ -1,4 +1,4 @@
-"""Two ways of the robot from above, as `rosrv demo --picture` saw them: `python -m examples.landshark.ways WAYS SVG`.
+"""Two ways of the robot from above, as `rosrv demo --output` saw them: `python -m examples.landshark.ways WAYS SVG`.
 
 WAYS is a JSON file, `{"without": [[x, y], ...], "guarded": [[x, y], ...]}` in metres. With `cut` and `stopped`, it also
 has the paths of a robot whose link is cut.

@@ -46,7 +46,8 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         svg: Svg = None,
     ) -> None:
         """`--prove` needs the packages z3-solver and wasmtime, and takes up to a few seconds for each event. It prints
-        what is proved for each event. Exit status 1 if the code of an event differs from its meaning.
+        what is proved for each event. Exit status 1 if the compiled code of an event differs from its
+        specification.
         """
         status = check_command.check(
             program, files, msg or [], as_json=as_json, prove=prove, why_slow=why_slow, dot=dot, svg=svg

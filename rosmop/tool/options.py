@@ -72,7 +72,10 @@ Svg = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automat
 Output = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE", help="Write the messages that subscribers would have received, for one recording"
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="File for the messages that subscribers would have received, for one recording",
     ),
 ]
 Topics = Annotated[
@@ -82,11 +85,15 @@ Topics = Annotated[
 Out = Annotated[
     Path | None,
     typer.Option(
-        "--output", metavar="FILE.rv", help="Write a new file; message definitions go into msg/ beside it"
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="File (.rv), must not exist; message definitions go into msg/ beside it",
     ),
 ]
 HoldOut = Annotated[
-    float, typer.Option(min=0.0, max=0.9, help="The fraction of the recordings that tests the result")
+    float,
+    typer.Option(min=0.0, max=0.9, metavar="SHARE", help="The share of the recordings that tests the result"),
 ]
 FailUnder = Annotated[
     float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit with 1 below this percentage")

@@ -1,4 +1,4 @@
-"""Accept the names that options had in 0.2.0, for the release that renames them."""
+"""Accept the former names of options, for the release that renames them."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,21 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-FORMER_OPTIONS: Mapping[str, str] = {"--out": "--output", "--expires": "--for", "--most": "--limit"}
+FORMER_OPTIONS: Mapping[str, str] = {
+    "--out": "--output",
+    "--expires": "--for",
+    "--most": "--limit",
+    "--write": "--output",
+    "--html": "--output",
+    "--picture": "--output",
+    "--seconds": "--within",
+    "--wait": "--within",
+    "--days": "--for",
+    "--again": "--force",
+    "--moving": "--force",
+    "--hold": "--keep",
+}
+"""A name is replaced only for a command that has the new one and not the former one."""
 
 
 def renamed(command: Any, args: list[str]) -> list[str]:

@@ -63,6 +63,6 @@ def test_a_silent_topic_ends_and_blocks_no_other_request(appliance: Appliance, r
     eventually(
         lambda: appliance.rosrv("topic", "info", "/quiet", check=False).returncode == 0, lambda: "no topic"
     )
-    done = appliance.rosrv("topic", "echo", "/quiet", "--seconds", "0.5", check=False)
+    done = appliance.rosrv("topic", "echo", "/quiet", "--within", "0.5s", check=False)
     assert done.returncode == 1
     assert "no message of /quiet in 0.5 s" in done.stderr

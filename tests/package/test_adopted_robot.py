@@ -117,7 +117,7 @@ def boots_adopted(debian: BootedDebian, order: str, drop_ins: dict[str, str]) ->
 
 def the_power_fails_in_the_middle(debian: BootedDebian) -> None:
     """After the next boot, the graph is where the record wants it, and each node is heard."""
-    for command in ("rosrv release --moving", "rosrv adopt"):
+    for command in ("rosrv release --force", "rosrv adopt"):
         for seconds in (0.8, 1.6):
             debian.begin(command)
             threading.Event().wait(seconds)

@@ -77,7 +77,7 @@ def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) 
 def test_its_demonstration_works(rosrv: Path, tmp_path: Path) -> None:
     need_root()
     needs(has_ros(), "ROS 1 (run `make setup`)")
-    done = run(rosrv, "demo", "--json", "--picture", str(tmp_path / "way.svg"), folder=tmp_path, seconds=280)
+    done = run(rosrv, "demo", "--json", "--output", str(tmp_path / "way.svg"), folder=tmp_path, seconds=280)
     assert done.returncode == 0, done.stdout + done.stderr
     assert all(row["good"] for row in map(json.loads, done.stdout.splitlines()))
     assert (tmp_path / "way.svg").read_text().startswith(("<svg", "<?xml"))

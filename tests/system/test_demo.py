@@ -44,7 +44,7 @@ def require_no_hosts(pid: int) -> None:
 
 def test_demo(tmp_path: Path, temporary: Path) -> None:
     picture = tmp_path / "drive.svg"
-    command = [ROSRV, "demo", "--json", "--picture", str(picture)]
+    command = [ROSRV, "demo", "--json", "--output", str(picture)]
     output: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env=os.environ | {"TMPDIR": str(temporary)}, **output) as demo:
         results_text, story = demo.communicate(timeout=LIMIT)

@@ -38,10 +38,12 @@ def filter_given(
         str | None,
         typer.Option(
             "--host",
-            help="Peer: an address, network or glob; with a running appliance also a host's name",
+            help="Address, network or glob of the peer; with a running appliance also a host's name",
         ),
     ] = None,
-    caller: Annotated[str | None, typer.Option("--caller", help="Name that the node gave; a glob")] = None,
+    caller: Annotated[
+        str | None, typer.Option("--caller", help="Name of the calling node, as it gave it; a glob")
+    ] = None,
     event: Annotated[str | None, typer.Option("--event", help="Name of the event; a glob")] = None,
     category: Annotated[
         str | None, typer.Option("--category", help="Category of the request; a glob")
@@ -59,7 +61,7 @@ def filter_given(
         str | None,
         typer.Option(
             "--who",
-            help="Author: the name of a token or person, operator for this machine, disk for a file; or a glob",
+            help="Author: a token's or person's name, `operator` (this machine), `disk` (a file), or a glob",
         ),
     ] = None,
 ) -> Filter:

@@ -49,14 +49,14 @@ def adopt(
     appliance: Appliance,
     *,
     check: Annotated[
-        bool, typer.Option("--check", help="Only show what would change, and what would stop it")
+        bool, typer.Option("--check", help="Only show the changes, and what prevents them")
     ] = False,
     status: Annotated[bool, typer.Option("--status", help="Show the adoption")] = False,
     audit_only: Annotated[
         bool,
         typer.Option(
             "--audit-only",
-            help="Deny nothing at first: needs a policy with `audit-only`, or the shipped policy, which gets it",
+            help="Deny nothing at first. The policy must have `audit-only = all`; the shipped policy gets it",
         ),
     ] = False,
     when_standing: WhenStanding = False,
@@ -64,9 +64,9 @@ def adopt(
 ) -> None:
     """Take over the graph of a running robot from its own ROS master, without restarting a node. Needs root.
 
-    The robot's nodes are registered with the appliance, and their connections are cut, so that they come through it.
-    Each start of the appliance does this again; `rosrv release` gives the graph back. Exit status 1 if something
-    stops it.
+    The robot's nodes are registered with the appliance, and their connections are cut, so that they connect again
+    through it. Each start of the appliance does this again; `rosrv release` gives the graph back. Exit status 1 if
+    something prevents it.
 
     Example: rosrv adopt --check
     """

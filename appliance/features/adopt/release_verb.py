@@ -13,7 +13,13 @@ from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_here
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.standing import WITHIN, NotStandingError, link_address, wait_until_standing
+from appliance.cli.standing import (
+    WITHIN,
+    NotStandingError,
+    link_address,
+    longest_wait,
+    wait_until_standing,
+)
 from appliance.features.adopt.adopt_answers import GiveBackReport
 from appliance.features.adopt.dead_release import release_dead
 from appliance.features.adopt.operator_orders import RELEASE, ordered
@@ -33,24 +39,21 @@ def release(
         bool,
         typer.Option(
             "--dead",
-            help="Give the graph back from the stored state: the appliance has crashed, and stays off",
+            help="The appliance has crashed and stays off: give the graph back from its stored state",
         ),
     ] = False,
-    moving: Annotated[
+    force: Annotated[
         bool,
         typer.Option(
-            "--moving", help="Release even if monitors are enabled and the robot is not known to stand"
+            "--force", help="Release even if monitors are enabled and the robot is not known to stand"
         ),
     ] = False,
-    within: Annotated[
-        float,
-        typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds to wait until the robot stands"),
-    ] = WITHIN,
+    within: Annotated[float, longest_wait("until the robot stands")] = WITHIN,
 ) -> None:
     """Give the graph of an adopted robot back to its own ROS master, without restarting a node. Needs root.
 
     The appliance runs on, but the robot's nodes no longer use it. While monitors are enabled, it waits until the robot
-    stands, because their guards end with the release. Without a master of its own, the robot gets one.
+    stands, because guards end with the release. Without a master of its own, the robot gets one.
 
     Example: rosrv release
     """
@@ -62,7 +65,7 @@ def release(
         if dead:
             report = asyncio.run(release_dead(state))
         else:
-            if not moving:
+            if not force:
                 _stand(appliance, within)
             report = _ordered(appliance, state)
         remove_drop_ins()
@@ -124,5 +127,5 @@ def _stand(appliance: Appliance, within: float) -> None:
         )
     except NotStandingError as error:
         raise NetworkError(
-            f"monitors are enabled, and {error}. Nothing was changed; --moving releases anyway"
+            f"monitors are enabled, and {error}. Nothing was changed; --force releases anyway"
         ) from None

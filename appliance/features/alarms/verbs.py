@@ -49,7 +49,7 @@ def silence(
     *,
     time: Annotated[
         str | None,
-        typer.Option("--for", metavar="TIME", help="For this time: 30m, 12h; at most 7d", show_default=False),
+        typer.Option("--for", help="For this time: 30m, 12h; at most 7d", show_default=False),
     ] = None,
     end: Annotated[bool, typer.Option("--end", help="End the silence, or an acknowledgement, now")] = False,
     note: _Note = "",

@@ -31,9 +31,7 @@ def approve(
     *,
     last: Annotated[
         str | None,
-        typer.Option(
-            "--for", metavar="TIME", help="Approve all calls of this name by this host for 1s to 1h"
-        ),
+        typer.Option("--for", help="Approve all calls of this name by this host for 1s to 1h"),
     ] = None,
     refused: Annotated[
         bool, typer.Option("--refuse", help="Former name of: rosrv approval refuse NUMBER", hidden=True)

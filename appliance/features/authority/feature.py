@@ -16,7 +16,7 @@ FEATURE = Feature(
     ),
     verbs={
         "drive": Group(
-            "Say which host may drive: one at a time holds each group of [Authority].",
+            "Assign the command groups of [Authority]: each has at most one host that drives.",
             {
                 "status": Verb(f"{_PLACE}verbs:status"),
                 "assign": Verb(f"{_PLACE}verbs:assign"),

@@ -72,7 +72,7 @@ def free(
 ) -> None:
     """Take a group from its holder. The first host that waits and may take the group gets it.
 
-    A group with a rank is handed back after its driver was lost: all its ranks may move again.
+    In a group with ranks, all hosts may drive again, also after a driver was lost.
 
     Example: rosrv drive free base
     """
@@ -81,7 +81,7 @@ def free(
 
 @speaks
 def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
-    """Let a host wait for a group. A host that may take the group gets it as soon as it is free.
+    """Let a host wait for a group, for a minute. A host that may take the group gets it as soon as it is free.
 
     Example: rosrv drive ask base --host host:agent-1
     """

@@ -12,7 +12,7 @@ from appliance.backup.create import back_up
 from appliance.base.counted import counted
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.typed_confirmation import Confirm, confirm_state
+from appliance.cli.typed_confirmation import Confirm, Yes, confirm_state
 from appliance.features.backup.purge import purge as remove
 from appliance.features.backup.purge import require_state_directory
 from appliance.features.backup.restore import restore as put_back
@@ -72,8 +72,11 @@ def restore(
 
 
 def purge(
+    context: typer.Context,
     state: State = DEFAULT_STATE,
-    confirm: Confirm = None,
+    *,
+    yes: Yes = False,  # noqa: ARG001  `confirm_state` reads it
+    confirm: Confirm = None,  # noqa: ARG001  as above
     as_json: Json = False,
 ) -> None:
     """Erase a state directory: audit log, policies, keys of the appliance and its hosts. Stop the appliance first.
@@ -88,7 +91,7 @@ def purge(
                 require_state_directory(state)
     except BackupError as error:
         raise _failed(str(error)) from None
-    confirm_state(state, confirm, f"This erases everything in {printable(str(state))} permanently")
+    confirm_state(context, state, f"This erases everything in {printable(str(state))} permanently")
     try:
         files, written = remove(state)
     except BackupError as error:

@@ -40,9 +40,7 @@ def block(
     *,
     time: Annotated[
         str | None,
-        typer.Option(
-            "--for", metavar="TIME", help="End the block after this time (30s, 10m, 1h, 2d; default: never)"
-        ),
+        typer.Option("--for", help="End the block after this time (30s, 10m, 1h, 2d; default: never)"),
     ] = None,
     note: Annotated[str, typer.Option(help="The reason, for other operators")] = "",
     force: Annotated[

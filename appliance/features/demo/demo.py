@@ -12,12 +12,14 @@ from rosmop.tool.terminal import refused
 
 
 def demo(
-    hold: Annotated[
-        bool, typer.Option("--hold", help="Keep everything running at the end, until Ctrl-C")
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep everything running at the end, until Ctrl-C")
     ] = False,
-    picture: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.svg", help="Draw the robot's paths from above, without and with monitors"),
+        typer.Option(
+            "--output", "-o", help="File (SVG) for a picture of the robot's paths, without and with monitors"
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
@@ -32,7 +34,7 @@ def demo(
     adopt: Annotated[
         bool,
         typer.Option(
-            "--adopt", help="Show instead a robot that drives while it is adopted and released: rosrv adopt"
+            "--adopt", help="Show `rosrv adopt` and `rosrv release` instead, on a robot that drives meanwhile"
         ),
     ] = False,
 ) -> None:
@@ -41,18 +43,20 @@ def demo(
     Exit status: 0 the robot obeyed only its operator (with --standby: the standby took over; with --adopt: it never
     stopped), 1 it did not.
 
-    Example: rosrv demo --hold --picture drive.svg
+    Example: rosrv demo --keep --output drive.svg
     """
     if not (SHIPPED / "examples").is_dir():
         raise refused([f"rosrv demo: the simulated robot is missing from {SHIPPED}: install rosrv again"])
-    if (standby or adopt) and picture is not None:
+    if (standby or adopt) and output is not None:
         raise refused(
-            ["rosrv demo: --picture draws the drives of the demonstration without --standby and --adopt"]
+            [
+                "rosrv demo: --output draws the drives of the demonstration without --standby and --adopt: leave it out"
+            ]
         )
     if standby and adopt:
-        raise refused(["rosrv demo: --standby and --adopt are two demonstrations"])
+        raise refused(["rosrv demo: --standby and --adopt are two demonstrations: give one"])
     sys.path.insert(0, str(SHIPPED))
     demonstration = importlib.import_module("examples.landshark.demonstration")
     raise typer.Exit(
-        demonstration.demonstrate(hold=hold, picture=picture, as_json=as_json, standby=standby, adopt=adopt)
+        demonstration.demonstrate(hold=keep, picture=output, as_json=as_json, standby=standby, adopt=adopt)
     )

@@ -292,5 +292,5 @@ def missing_port(port: int | None, role: ActiveRole) -> str:
     there = ", ".join(f"{one[0]}-{one[-1]}" if len(one) > 1 else str(one[0]) for one in role.ports)
     return (
         f"port {port} does not exist at {role.address}, the fixed address of the two appliances, so an agent there is"
-        f" cut off: use a free port of {there}, or make new kits: rosrv standby join … --again --ports …"
+        f" cut off: use a free port of {there}, or make new kits: rosrv standby join … --force --ports …"
     )

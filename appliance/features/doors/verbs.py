@@ -96,9 +96,7 @@ def ticket(
     appliance: Appliance,
     name: _Name,
     *,
-    time: Annotated[
-        str, typer.Option("--for", metavar="TIME", help="How long it is valid (30m, 8h, 7d)")
-    ] = "8h",
+    time: Annotated[str, typer.Option("--for", help="How long it is valid (30m, 8h, 7d)")] = "8h",
 ) -> None:
     """Make a ticket: a URL with which a person's browser or Foxglove opens the door. It is shown only here.
 

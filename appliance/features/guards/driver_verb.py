@@ -35,11 +35,9 @@ def check_driver(
         str,
         typer.Option("--by", metavar="TOPIC", help="Topic of the odometry", autocompletion=completion.topics),
     ],
-    longest: Annotated[
-        str, typer.Option("--for", metavar="TIME", help="Withhold motions at most for this time, up to 10s")
-    ] = "2s",
-    wait: Annotated[
-        str, typer.Option("--wait", metavar="TIME", help="Wait this long for a slow drive, up to 5m")
+    longest: Annotated[str, typer.Option("--for", help="How long motions are withheld, at most 10s")] = "2s",
+    within: Annotated[
+        str, typer.Option("--within", help="The longest wait for a slow drive, up to 5m")
     ] = "30s",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask; needed without a terminal")] = False,
 ) -> None:
@@ -54,9 +52,9 @@ def check_driver(
     Example: rosrv guard check-driver /cmd_vel --by /odom
     """
     seconds = span_given("--for", longest, "2s", _VERB)
-    request = DriverCheckBegin(topic, by, seconds, span_given("--wait", wait, "30s or 5m", _VERB))
+    request = DriverCheckBegin(topic, by, seconds, span_given("--within", within, "30s or 5m", _VERB))
     _require_bounds("--for", "longest", seconds)
-    _require_bounds("--wait", "patience", request.patience)
+    _require_bounds("--within", "patience", request.patience)
     _require_consent(seconds, yes=yes)
     check = appliance.ask_or_exit(request)
     if not appliance.as_json:

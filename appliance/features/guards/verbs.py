@@ -62,7 +62,9 @@ _DryRun = Annotated[
 ]
 _Hold = Annotated[
     bool,
-    typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
+    typer.Option(
+        "--hold", help="Load even if a monitor then blocks topics in use until `rosrv monitor resume`"
+    ),
 ]
 
 
@@ -178,10 +180,10 @@ def new(
     hold: _Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
-    """Make a guard from a preset and load it. Its text is also written into the folder of specifications.
+    """Make a guard from a preset and load it. Its file is also written into the folder of specifications.
 
-    A topic is refused if the robot lacks it, or if the preset does not know its type. `rosrv guard list` prints the
-    presets with their parameters.
+    The robot must have the topics, with types that the preset knows. `rosrv guard list` prints the presets with their
+    parameters.
 
     Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5
     """
@@ -225,7 +227,10 @@ def set_values(
             " recorder",
         ),
     ] = False,
-    since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
+    since: Annotated[
+        str,
+        typer.Option("--since", help="With --dry-run: from this time: 1h (ago), 14:03, a date, or RFC 3339"),
+    ] = "1h",
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
     hold: _Hold = False,
@@ -308,7 +313,7 @@ def upgrade(
     further: Annotated[
         list[str] | None,
         typer.Option(
-            "--topic", metavar="NAME=TOPIC", help="A topic that the present preset needs (repeatable)"
+            "--topic", metavar="NAME=TOPIC", help="A topic that the present preset also needs (repeatable)"
         ),
     ] = None,
     confirm_within: ConfirmWithin = None,
@@ -317,10 +322,10 @@ def upgrade(
     hold: _Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
-    """Make guards of an older version again from the present presets, with their topics and values.
+    """Replace guards of an older version by those of the present presets, with the same topics and values.
 
-    Each guard begins again: the base is stopped until the next command. A value that the present version does not
-    have or allow is refused with its name, and so is a topic that no node has; the other guards are upgraded.
+    Each guard starts without its state: the base is stopped until the next command. A guard whose value or topic the
+    present version refuses is not upgraded, and is named; the others are.
 
     Example: rosrv guard upgrade --dry-run
     """

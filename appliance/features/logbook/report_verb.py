@@ -10,7 +10,7 @@ import typer
 
 from appliance import __version__
 from appliance.audit.log.record_format import rfc3339
-from appliance.audit.search.filter_options import Since, Until
+from appliance.audit.search.filter_options import Since, Until, times_given
 from appliance.audit.search.query import Filter
 from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
@@ -52,33 +52,34 @@ def report_interventions(
     until: Until = None,
     after: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="From the end of an earlier report on (its --json output)"),
+        typer.Option(
+            metavar="FILE", help="Continue an earlier report, from its end: the file of its --json output"
+        ),
     ] = None,
     other: Other = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="Write one HTML page without scripts; must not exist"
+            "--output", "-o", metavar="FILE", help="File for one HTML page without scripts; must not exist"
         ),
     ] = None,
 ) -> None:
-    """Report who changed which safety setting of the machine, from what to what, and what limits the proof.
+    """Report who changed which safety setting of the machine, its values before and after, and the gaps of the proof.
 
     The report has all changes of the policy, guards, monitors, driving rights, approvals, blocks, doors, tokens, hosts,
     alarms and software, what was off or blocked and for how long, who drove, the interfaces of now, and the gaps of the
     log. It contains no secret and no value of a parameter. It does not verify the log: `rosrv audit verify` does, and
-    the report names its last result on this machine. With --other, it is about both appliances of a pair.
+    the report names its last result on this machine. With --other, it covers both appliances of a pair.
 
     Example: rosrv report interventions --since 2026-03-01 --until 2026-04-01 --output march.html
     """
     with Errors():
-        now = clock.wall_ns()
         if since is not None and after is not None:
             raise usage_error("give --since or --after, not both", verb=_VERB)
-        begin = (
-            _end_of(after) if after is not None else None if since is None else parse_timestamp(since, now)
-        )
-        end = now if until is None else parse_timestamp(until, now)
+        begin, end = times_given(since, until)
+        if after is not None:
+            begin = _end_of(after)
+        end = clock.wall_ns() if end is None else end
         found = _report(appliance, begin, end, other)
     if output is not None:
         write_new(output, page(found, appliance.host_in_words), verb=_VERB)

@@ -6,10 +6,10 @@ import msgspec
 import typer
 
 from appliance.audit.log.record_format import rfc3339
-from appliance.base import clock
-from appliance.base.timestamps import parse_timestamp
+from appliance.base.timestamps import in_local_zone
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.durations import time_given
 from appliance.cli.output import say_json, usage_error
 from appliance.features.logbook.log_source import OpenedLogs, Other, logs_of
 from appliance.formats.machine_report import ENDS_OF_DRIVING, Period, read_records
@@ -25,7 +25,7 @@ def who_drove(
     appliance: Appliance,
     *,
     at: Annotated[
-        str | None, typer.Option("--at", metavar="TIME", help="At this time: 5m (ago), 14:03, a date")
+        str | None, typer.Option("--at", help="At this time: 1h (ago), 14:03, a date, or RFC 3339")
     ] = None,
     between: Annotated[
         tuple[str, str] | None,
@@ -41,11 +41,10 @@ def who_drove(
     Example: rosrv who-drove --at 14:03
     """
     with Errors():
-        now = clock.wall_ns()
         if (at is None) == (between is None):
             raise usage_error("give --at TIME or --between TIME TIME", verb=_VERB)
-        first, last = between or (at or "", at or "")
-        begin, end = parse_timestamp(first, now), parse_timestamp(last, now)
+        option, (first, last) = ("--between", between) if between else ("--at", (at or "", at or ""))
+        begin, end = (time_given(option, text, _VERB) for text in (first, last))
         if begin > end:
             raise usage_error(f"--between: {first} is after {last}", verb=_VERB)
         logs = logs_of(appliance.audit(), other, _VERB)
@@ -61,7 +60,7 @@ def who_drove(
         order = f" by {row.by}" if row.by else ""
         place = f" at {row.appliance}" if row.appliance else ""
         host = host_words(row.state, row.names, appliance.host_in_words)
-        say(f"{row.what}: {host} since {row.since_utc}{place}{order}, {until}: {row.reason}")
+        say(in_local_zone(f"{row.what}: {host} since {row.since_utc}{place}{order}, {until}: {row.reason}"))
     if not rows and not appliance.as_json:
         say("the log has no record that a host held a group then", "yellow")
     raise typer.Exit(0 if rows else 1)

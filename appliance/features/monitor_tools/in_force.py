@@ -36,7 +36,9 @@ Shadow = Annotated[
 ]
 Hold = Annotated[
     bool,
-    typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
+    typer.Option(
+        "--hold", help="Load even if a monitor then blocks topics in use until `rosrv monitor resume`"
+    ),
 ]
 Force = Annotated[
     bool, typer.Option("--force", help="Load even if this cuts a topic whose publisher has another type")
@@ -138,7 +140,7 @@ def disable(
     *,
     time_off: Annotated[
         str | None,
-        typer.Option("--for", metavar="TIME", help="Enable them again after this time (30s, 10m, 2h, 1d)"),
+        typer.Option("--for", help="Enable them again after this time (30s, 10m, 2h, 1d)"),
     ] = None,
 ) -> None:
     """Disable monitors: messages pass them unchanged, and their variables keep their values.

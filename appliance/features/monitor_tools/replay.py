@@ -41,7 +41,7 @@ def replay_monitor(
         str | None,
         typer.Option(
             "--since",
-            help="Without --bag: read the flight recorder from this time on: 1h (ago), a date, or RFC 3339",
+            help="Without --bag: read the flight recorder from this time: 1h (ago), 14:03, a date, or RFC 3339",
             show_default=False,
         ),
     ] = None,
@@ -58,7 +58,7 @@ def replay_monitor(
     most: Annotated[
         int,
         typer.Option(
-            "--limit", min=0, metavar="N", help="Number of findings to show for each monitor, topic and kind"
+            "--limit", min=0, metavar="N", help="Largest number of findings for each monitor, topic and kind"
         ),
     ] = 10,
     margins: Annotated[
@@ -75,7 +75,7 @@ def replay_monitor(
 
     Read bags and MCAP files (--bag, --bags), or the running appliance's flight recorder (--since), with its recordings
     and its memory; gaps are reported. Each recording starts in the monitor's initial state. With --json, print up to
-    10,000 places for each recording, monitor, topic and kind. Exit status 3 if recordings failed.
+    10,000 findings for each recording, monitor, topic and kind. Exit status 3 if recordings failed.
 
     Example: rosrv monitor replay safeTrigger --since 1h
     """

@@ -63,16 +63,16 @@ def compare(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="--decisions: NDJSON of requests instead of the audit log: host, caller_id, category, resource",
+            help="With --decisions: requests as NDJSON (host, caller_id, category, resource) instead of the audit log",
         ),
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
 ) -> None:
-    """Show the changes between two policies: of text or, with --decisions, of decisions. Exit status 1 if any.
+    """Compare the texts of two policies or, with --decisions, their decisions. Exit status 1 if they differ.
 
-    With one file, compare the policy in force with it. With one revision, compare it with the policy in force. Without
-    arguments, show the changes of the revision in force. For two files, --decisions is assumed.
+    Give a file or a revision to compare it with the policy in force; nothing, to show the last change. Two files are
+    compared by their decisions.
 
     Example: rosrv policy diff next.ini
     """

@@ -71,10 +71,15 @@ def enforce(
     *,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would have been denied")] = False,
     since: Annotated[
-        str, typer.Option("--since", help="Compare with the requests from this time on: 7d (ago), a date")
+        str,
+        typer.Option(
+            "--since",
+            help="Compare with the requests from this time on: 7d (ago), 14:03, a date, or RFC 3339",
+        ),
     ] = "7d",
-    write: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="File for the changed policy; replaced if it exists"),
     ] = None,
     confirm_within: ConfirmWithin = None,
     when_standing: WhenStanding = False,
@@ -82,9 +87,10 @@ def enforce(
 ) -> None:
     """Enforce sections of the policy in force that are `audit-only`, after a comparison with the recorded requests.
 
-    The rights of nodes that run now are also compared: they may be older. With --dry-run, exit status 1 if a recorded
-    request would have been denied, or such a right would end. The policy file is not changed: a
-    reload brings its text back. A denial because another host holds a node name is not compared.
+    The rights of running nodes are compared too, because the record of a right may be older than the period. With
+    --dry-run, exit status 1 if a recorded request would have been denied, or a right of a running node would end. The
+    policy file is not changed: a reload brings its text back. A denial because another host holds a node name is not
+    compared.
 
     Example: rosrv policy enforce Publishers --confirm-within 5m
     """
@@ -99,16 +105,16 @@ def enforce(
     live = live_now(appliance)
     found = _compared(policy, period, live)
     _show(appliance, found, period, change)
-    if write is not None:
+    if output is not None:
         try:
-            write_told(write, change.text.encode())
+            write_told(output, change.text.encode())
         except OSError as error:
-            raise usage_error(f"cannot write {write}: {error.strerror}") from None
+            raise usage_error(f"cannot write {output}: {error.strerror}") from None
     if dry_run:
         raise typer.Exit(1 if found.denied or found.ended else 0)
     if when_standing and not body.site_keys:
         stand_or_exit(appliance, within, "rosrv policy")
-    _load(appliance, body, change, confirmed, written=write)
+    _load(appliance, body, change, confirmed, written=output)
 
 
 def _compared(policy: Policy, period: RecordedPeriod, live: list[LiveRight]) -> _Comparison:
@@ -184,7 +190,7 @@ def _load(
     if known.site_keys:
         target = str(written) if written is not None else "FILE"
         steps = f"sign it (rosrv sign {target} --key KEY), put it at {known.policy_file}, and run: rosrv policy reload"
-        first = "" if written is not None else "write the changed policy with --write FILE, "
+        first = "" if written is not None else "write the changed policy with --output FILE, "
         raise refused([f"rosrv policy: this appliance loads signed policies only: {first}{steps}"])
     body = appliance.ask_or_exit(PolicyLoad(change.text, f"enforces {names}", within, known.revision))
     if appliance.as_json:

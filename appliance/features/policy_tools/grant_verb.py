@@ -31,8 +31,8 @@ from rosmop.tool.terminal import printable, say
 def why(appliance: Appliance, record: RecordArgument) -> None:
     """Explain a record: its sender, events, values, line and recording, and the rule that would allow a denied request.
 
-    The listed events alone lead to a monitor's verdict. The appliance may be stopped; only the rule that would allow a
-    denied request needs the running appliance.
+    The listed events are those that led to a monitor's verdict. The appliance may be stopped; only the rule that would
+    allow a denied request needs the running appliance.
 
     Example: rosrv audit why 18e9aa02efc40abb0e51
     """
@@ -72,8 +72,9 @@ def grant(
     appliance: Appliance,
     record: RecordArgument,
     *,
-    write: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="File for the changed policy; replaced if it exists"),
     ] = None,
     tool: Annotated[
         bool,
@@ -86,7 +87,7 @@ def grant(
 
     A stock tool makes several calls, one after the other; with --tool the change allows all of them.
 
-    The change is checked with the policy's tests. Only --write and --load change anything. Exit status 1 if no rule
+    The change is checked with the policy's tests. Only --output and --load change anything. Exit status 1 if no rule
     can grant the request or a test fails.
 
     Example: rosrv policy grant 18e9aa02efc40abb0e51 --load --confirm-within 5m
@@ -101,13 +102,13 @@ def grant(
         _show(found, record)
     if found.findings or not found.added:
         raise typer.Exit(1)
-    if write is not None:
+    if output is not None:
         try:
-            write_told(write, _with_ends_of(write, found.text))
+            write_told(output, _with_ends_of(output, found.text))
         except OSError as error:
-            raise usage_error(f"cannot write {write}: {error.strerror}") from None
+            raise usage_error(f"cannot write {output}: {error.strerror}") from None
         if not appliance.as_json and not load:
-            say(f"written to {write}; the policy in force is unchanged until it is loaded")
+            say(f"written to {output}; the policy in force is unchanged until it is loaded")
     if load:
         order = PolicyLoad(found.text, f"grants record {record[:100]}", within, found.revision)
         body = appliance.ask_or_exit(order)

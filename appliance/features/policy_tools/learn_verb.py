@@ -39,31 +39,30 @@ def learn_policy(
     since: Since = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output", "-o", help="File; must not exist, but with --ask it may: then it is continued"
-        ),
+        typer.Option("--output", "-o", help="File, must not exist, except with --ask, which continues it"),
     ] = None,
     tests: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also write test cases for the used rights; must not exist"),
+        typer.Option(metavar="FILE", help="File for test cases of the used rights; must not exist"),
     ] = None,
     ask: Annotated[
         bool, typer.Option("--ask", help="Ask about each kind of right that the policy does not grant yet")
     ] = False,
     with_start: Annotated[
         bool,
-        typer.Option("--with-start", help="Grant what a start needs to nodes that were not seen to start"),
+        typer.Option(
+            "--with-start", help="Also grant what a start needs to nodes whose start is not in the log"
+        ),
     ] = False,
     robot: Robot = None,
 ) -> None:
     """Write a policy that grants the requests in the audit log and no others.
 
-    Run the robot with `audit-only = all` below [Options] first, and start it once in that time. Exit status 1 if the
-    log has no requests, or if nodes that were taken over while they ran were not seen to start (see --with-start).
-    Hosts have their names in /etc/hosts, and the running appliance's robot (`rosrv policy show`) is the group `robot`;
-    an address given with --robot that is not in it is written as an address.
+    First run the robot with `audit-only = all` below [Options], and start its nodes once in that time. Exit status 1
+    if the log has no requests, or if the log lacks the start of nodes that were adopted (see --with-start). Hosts get
+    their names from /etc/hosts, and the hosts of the running appliance's robot become the group `robot`.
 
-    --ask starts with the policy in force, asks on the terminal, and writes the changed policy, and its tests beside it.
+    --ask starts with the policy in force, asks on the terminal, and writes the changed policy with its tests.
 
     Example: rosrv policy learn --state /var/lib/rosrv --output learned.ini
     """

@@ -19,14 +19,14 @@ def list_unused(
     appliance: Appliance,
     *,
     since: Annotated[
-        str, typer.Option("--since", help="From this time: 30d (ago), a date, or RFC 3339")
+        str, typer.Option("--since", help="From this time: 30d (ago), 14:03, a date, or RFC 3339")
     ] = "30d",
     everything: Annotated[bool, typer.Option("--all", help="Also list the used rules")] = False,
 ) -> None:
-    """List the rules of the policy in force, and the hosts in them, that have no use since a time.
+    """List the rules of the policy in force, and the hosts in them, that were not used since a time.
 
-    Registrations that live now count as uses. A right is `unknown` instead of `unused` where its uses may be among
-    records that were removed, or that only count the requests of a host.
+    Registrations of running nodes count as uses. A right is `unknown` instead of `unused` if a use may be among
+    removed records, or among records that only count a host's requests.
 
     Example: rosrv policy unused --since 30d
     """

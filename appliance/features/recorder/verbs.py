@@ -11,14 +11,14 @@ import msgspec
 import typer
 
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.base import clock
+from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
 from appliance.base.counted import counted
-from appliance.base.timestamps import local_text, parse_timestamp
+from appliance.base.timestamps import local_text
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import span_given, time_given
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
 from appliance.features.recorder import requests as recording_requests
@@ -71,7 +71,7 @@ def now(
         str, typer.Option(help="Description of the event, for the recording and the audit log")
     ] = "",
 ) -> None:
-    """Record the messages of the seconds before and after now.
+    """Make a recording of the last and the next seconds.
 
     Example: rosrv record now --after 30s --note "the arm hit the door"
     """
@@ -121,11 +121,12 @@ def show_timeline(
     recording: _Id,
     *,
     since: Annotated[
-        str | None, typer.Option(help="From this time on (RFC 3339)", show_default=False)
+        str | None,
+        typer.Option(help="From this time: 1h (ago), 14:03, a date, or RFC 3339", show_default=False),
     ] = None,
-    until: Annotated[str | None, typer.Option(help="Up to this time (RFC 3339)", show_default=False)] = None,
+    until: Annotated[str | None, typer.Option(help="Up to this time", show_default=False)] = None,
     columns: Annotated[
-        int, typer.Option(min=1, max=MOST_COLUMNS, help="Number of columns to divide the time into")
+        int, typer.Option(min=1, max=MOST_COLUMNS, help="Columns that the time is divided into")
     ] = 60,
 ) -> None:
     """Show the messages on each topic and the events of a recording on one time line.
@@ -142,7 +143,7 @@ def show_timeline(
             )
         )
     else:
-        query = {"since": since, "until": until, "columns": columns}
+        query = {"since": _in_utc("--since", since), "until": _in_utc("--until", until), "columns": columns}
         found = _asked(way, f"{recording}/timeline", query, Timeline)
     if appliance.as_json:
         say_json(found)
@@ -159,8 +160,7 @@ def messages(
     at: Annotated[
         str | None,
         typer.Option(
-            help="A time (RFC 3339), a record in the recording, or a message's position"
-            " (default: its first trigger)",
+            help="A time, the id of a record in the recording, or a message's position (default: its first trigger)",
             show_default=False,
         ),
     ] = None,
@@ -188,7 +188,8 @@ def messages(
         appliance.ask_or_exit(recording_requests.RecordingRead(recording, topics))
         found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))
     else:
-        query = {"at": text, "topic": topics, "neighbours": neighbours}
+        point = text if is_record(text) or MessagePosition.parsed(text) else _in_utc("--at", text)
+        query = {"at": point, "topic": topics, "neighbours": neighbours}
         found = _asked(way, f"{recording}/messages", query, RecordedMessages)
     for number, message in enumerate(found.messages):
         if appliance.as_json:
@@ -300,10 +301,13 @@ def _read(what: Callable[[], _T]) -> _T:
 
 
 def _moment_given(option: str, text: str | None) -> int | None:
-    try:
-        return None if text is None else parse_timestamp(text, clock.wall_ns(), None)
-    except ValueError as error:
-        raise usage_error(f"{option}: {error}") from None
+    return None if text is None else time_given(option, text, "rosrv record")
+
+
+def _in_utc(option: str, text: str | None) -> str | None:
+    """Return a time for REST, where a time without a zone would be in UTC."""
+    moment = _moment_given(option, text)
+    return None if moment is None else rfc3339(moment)
 
 
 def _sender(sender: Sender, host_in_words: HostInWords) -> str:

@@ -21,7 +21,9 @@ def sign(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE…", help="Files whose text is signed", show_default=False)
     ],
-    key: Annotated[Path, typer.Option(metavar="KEY", help="The private key (ssh-keygen -t ed25519 -f KEY)")],
+    key: Annotated[
+        Path, typer.Option(metavar="FILE", help="The private key (ssh-keygen -t ed25519 -f FILE)")
+    ],
     as_json: Json = False,
 ) -> None:
     """Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.

@@ -66,7 +66,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
         raise refused(
             [
                 f"{_VERB}: this appliance is already {earlier.name} of a pair with {earlier.other}"
-                f" ({earlier.other_address}); --again makes new keys, and all machines must be set up again"
+                f" ({earlier.other_address}); --force makes new keys, and all machines must be set up again"
             ]
         )
     plan = _plan(options, _settings(options), earlier or left)

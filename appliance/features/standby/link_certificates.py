@@ -70,5 +70,5 @@ def replication_context(membership: Membership, folder: Path, *, server: bool) -
     except ssl.SSLError as error:
         raise OSError(
             f"the certificates of the two appliances cannot be used ({error}); on the active appliance, run"
-            " `rosrv standby join … --again`, and use the new kit"
+            " `rosrv standby join … --force`, and use the new kit"
         ) from error

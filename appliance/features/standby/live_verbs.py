@@ -12,14 +12,13 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
-from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
+from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
 from appliance.features.standby.standby_view import standby_view
 from rosmop.tool.terminal import printable, say
 
 _VERB = "rosrv standby"
-_WATCH_SECONDS = 2.0
 _SWITCH_SECONDS = 20.0
 _AGAIN_SECONDS = 0.2
 _SHOW_SECONDS = 2.0
@@ -31,13 +30,9 @@ def status(
     *,
     watch: Watch = False,
     every: Annotated[
-        float | None,
+        str | None,
         typer.Option(
-            metavar="SECONDS",
-            min=LEAST_SECONDS,
-            max=LONGEST_SECONDS,
-            help="With --watch: the time between two states (default: 2)",
-            show_default=False,
+            help="With --watch: the time between two states, 1s to 1h (default: 2s)", show_default=False
         ),
     ] = None,
 ) -> None:
@@ -48,13 +43,10 @@ def status(
 
     Example: rosrv standby status --watch
     """
-    if every is not None and not watch:
-        raise usage_error("--every needs --watch", _VERB)
+    each = seconds_between(every, _VERB, watch=watch)
     if watch:
         try:
-            raise typer.Exit(
-                watched(partial(_look, appliance), every or _WATCH_SECONDS, as_json=appliance.as_json)
-            )
+            raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
     view = standby_view(appliance.ask_or_exit(StandbyWanted()))

@@ -51,7 +51,7 @@ def join(
     follower: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=ADDRESS", help="Another computer that uses the fixed address. Repeatable."
+            metavar="NAME=ADDRESS", help="Another computer that uses the fixed address (repeatable)"
         ),
     ] = None,
     ports: Annotated[
@@ -72,12 +72,16 @@ def join(
         Path | None,
         typer.Option(
             "--output",
+            "-o",
             metavar="DIR",
             help="New folder for the files of the other machines; it has private keys",
         ),
     ] = None,
-    again: Annotated[
-        bool, typer.Option("--again", help="Replace an earlier membership; all machines are set up again")
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="Join even if this appliance is one of a pair; all machines are set up again"
+        ),
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -92,8 +96,8 @@ def join(
     """
     if file is not None:
         if any((address, other, witness, fixed, follower, ports, config, out)):
-            raise usage_error(f"{file} has all settings: give --state and --again only", _VERB)
-        join_second(file, state, again=again, as_json=as_json)
+            raise usage_error(f"{file} has all settings: give --state and --force only", _VERB)
+        join_second(file, state, again=force, as_json=as_json)
         return
     given = {"--address": address, "--other": other, "--witness": witness, "--fixed": fixed, "--output": out}
     missing = [option for option, value in given.items() if value is None]
@@ -115,7 +119,7 @@ def join(
         port=port,
         config=config,
         out=out,
-        again=again,
+        again=force,
     )
     join_first(options, as_json=as_json)
 

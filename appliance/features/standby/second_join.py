@@ -76,7 +76,7 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
         raise refused(
             [
                 f"{_VERB}: this appliance is already {earlier.name} of the pair {earlier.name} and {earlier.other};"
-                " leave that pair first (rosrv standby leave), or give --again"
+                " leave that pair first (rosrv standby leave), or give --force"
             ]
         )
     backup = None

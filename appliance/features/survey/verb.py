@@ -8,6 +8,7 @@ import msgspec
 import typer
 
 from appliance.base.input_files import names_of_hosts
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import Json, say_json, usage_error, write_new
 from appliance.features.survey.draft import DraftError, PolicyDraft, draft
 from appliance.features.survey.page import page, report
@@ -24,16 +25,14 @@ def survey(
     master: Annotated[
         str, typer.Option(metavar="URI", envvar="ROS_MASTER_URI", help="The robot's ROS master")
     ] = "http://localhost:11311",
-    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write one page; must not exist")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File for one HTML page; must not exist")
+    ] = None,
     policy: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write a draft policy, and its tests to FILE.tests.yaml; must not exist"
-        ),
+        typer.Option(help="File for a draft policy, and FILE.tests.yaml for its tests; both must not exist"),
     ] = None,
-    seconds: Annotated[
-        float, typer.Option(min=1, max=600, metavar="N", help="The longest time of the whole survey")
-    ] = 60.0,
+    within: Annotated[str, typer.Option(help="The longest time of the survey, 1s to 10m")] = "1m",
     as_json: Json = False,
 ) -> None:
     """List the hosts, nodes, topics and services of a robot, and what looks wrong. Nothing is registered or changed.
@@ -42,10 +41,11 @@ def survey(
     graph's hosts. It needs no appliance: run it on the robot, or on a computer of its network. Exit status 1 if the
     master does not answer.
 
-    Example: rosrv survey --master http://robot:11311 --html survey.html --policy draft.ini
+    Example: rosrv survey --master http://robot:11311 --output survey.html --policy draft.ini
     """
+    seconds = bounded_span("--within", within, "1s", "10m", _VERB, bare="s")
     tests = None if policy is None else policy.with_name(f"{policy.name}.tests.yaml")
-    for file in filter(None, (html, policy, tests)):
+    for file in filter(None, (output, policy, tests)):
         if file.exists():
             raise usage_error(f"{file} exists already: give the name of a new file", verb=_VERB)
     try:
@@ -53,9 +53,9 @@ def survey(
     except SurveyError as error:
         typer.echo(f"rosrv survey: {error}", err=True)
         raise typer.Exit(1) from None
-    drafted = _drafted(inventory, required=policy is not None) if html or policy else None
-    if html is not None:
-        write_new(html, page(inventory, drafted), verb=_VERB)
+    drafted = _drafted(inventory, required=policy is not None) if output or policy else None
+    if output is not None:
+        write_new(output, page(inventory, drafted), verb=_VERB)
     if policy is not None and tests is not None and drafted is not None:
         write_new(policy, drafted.text, verb=_VERB)
         write_new(tests, drafted.tests, verb=_VERB)
@@ -64,7 +64,7 @@ def survey(
         return
     for line in report(inventory):
         say(line)
-    for file in filter(None, (html, policy, tests)):
+    for file in filter(None, (output, policy, tests)):
         say(f"wrote {file}")
     for name in drafted.left_out if drafted else ():
         typer.echo(f"rosrv survey: no rule can be written for {name!r}", err=True)

@@ -32,9 +32,7 @@ def add(
         ),
     ] = "viewer",
     *,
-    lifetime: Annotated[
-        str, typer.Option("--for", metavar="TIME", help="Time until it expires: 12h, 90d, 52w")
-    ] = "90d",
+    lifetime: Annotated[str, typer.Option("--for", help="Time until it expires: 12h, 90d, 52w")] = "90d",
 ) -> None:
     """Create a token. It is printed once and stored nowhere.
 
@@ -53,14 +51,12 @@ def rotate(
         str | None,
         typer.Option(
             "--for",
-            metavar="TIME",
             help="Time until the new token expires: 12h, 90d, 52w (default: as for the earlier token)",
         ),
     ] = None,
     grace: Annotated[
         str | None,
         typer.Option(
-            metavar="TIME",
             help="Keep the earlier token valid for this time, such as 10m (default: it ends now)",
         ),
     ] = None,

@@ -11,13 +11,14 @@ from appliance.api.front.moments import in_full
 from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.query import Filter
 from appliance.base import clock
-from appliance.base.timestamps import in_local_zone, local_text, parse_timestamp
+from appliance.base.timestamps import in_local_zone, local_text
 from appliance.base.validation_messages import meant
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import bounded_span, time_given
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
 from appliance.features.topics.publishers import publishers_at
@@ -58,7 +59,7 @@ def echo(
     count: Annotated[
         int, typer.Option("-n", "--count", min=1, max=100_000, help="How many messages to wait for")
     ] = 1,
-    seconds: Annotated[float, typer.Option(min=0.1, max=10.0, help="Seconds to wait for each message")] = 5.0,
+    within: Annotated[str, typer.Option(help="The longest wait for each message, 0.1s to 10s")] = "5s",
     field: Annotated[
         str | None, typer.Option(metavar="NAME", help="Only this field, such as pose.position.x or ranges.3")
     ] = None,
@@ -70,6 +71,7 @@ def echo(
 
     Example: rosrv topic echo /odom -n 3 --field pose.pose.position
     """
+    seconds = bounded_span("--within", within, "0.1s", "10s", "rosrv topic", bare="s")
     shown = 0
     while shown < count:
         request = TopicLook(topic, min(count - shown, _AT_ONCE), seconds, latched=not shown)
@@ -106,7 +108,7 @@ def publishers(
     *,
     at: Annotated[
         str,
-        typer.Option(metavar="TIME", help="10:32, 'yesterday 10:32', 1h (ago), a date, RFC 3339, or now"),
+        typer.Option(help="At this time: 1h (ago), 14:03, 'yesterday 14:03', a date, RFC 3339, or now"),
     ] = "now",
 ) -> None:
     """Show the nodes that were registered as publishers of a topic now or in the past, from the audit log.
@@ -117,7 +119,7 @@ def publishers(
     """
     with Errors():
         now = clock.wall_ns()
-        then = now if at == "now" else parse_timestamp(at, now, None)
+        then = now if at == "now" else time_given("--at", at, "rosrv topic")
         if then > now:
             raise usage_error(f"--at {at} is in the future")
         log = appliance.audit()

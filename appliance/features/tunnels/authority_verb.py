@@ -1,16 +1,21 @@
 """The command `rosrv host authority rotate`."""
 
+import typer
+
 from appliance.backup.contents import BackupError
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.typed_confirmation import Confirm, confirm_state
+from appliance.cli.typed_confirmation import Confirm, Yes, confirm_state
 from appliance.features.tunnels.rotate_authority import rotate_authority
 from rosmop.tool.terminal import refused, say
 
 
 def rotate(
+    context: typer.Context,
     state: State = DEFAULT_STATE,
-    confirm: Confirm = None,
+    *,
+    yes: Yes = False,  # noqa: ARG001  `confirm_state` reads it
+    confirm: Confirm = None,  # noqa: ARG001  as above
     as_json: Json = False,
 ) -> None:
     """Erase the key of the hosts' authority; the next start makes a new one. Stop the appliance first.
@@ -21,7 +26,7 @@ def rotate(
     Example: rosrv host authority rotate --state /var/lib/rosrv
     """
     confirm_state(
-        state, confirm, "This erases the key of the hosts' authority; all hosts need new kits afterwards"
+        context, state, "This erases the key of the hosts' authority; all hosts need new kits afterwards"
     )
     try:
         rotate_authority(state)

@@ -26,6 +26,7 @@ from appliance.features.tunnels.requests import (
 )
 from rosmop.tool.terminal import printable, say
 
+_DAY = 86_400.0
 _Name = Annotated[
     str,
     typer.Argument(
@@ -46,19 +47,23 @@ _Csr = Annotated[
     Path | None,
     typer.Option(help="Signing request (PEM) for the host's own key; the kit then has no private key"),
 ]
-_Days = Annotated[float, typer.Option(help="Days until the certificate expires")]
+_Valid = Annotated[str, typer.Option("--for", help="How long the certificate is valid: 90d, 52w")]
 _Out = Annotated[
     Path | None,
     typer.Option(
         "--output",
+        "-o",
         help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh); - for"
         " standard output",
     ),
 ]
-_Open = Annotated[list[str] | None, typer.Option("--open", help="Services of the host to keep open: tcp/22")]
+_Open = Annotated[
+    list[str] | None,
+    typer.Option("--open", metavar="SERVICES", help="Services of the host to keep open: tcp/22 (repeatable)"),
+]
 _Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
 _Within = Annotated[
-    str, typer.Option(help="With --token, how long the token is valid, such as 30m, 1h or 7d")
+    str, typer.Option(help="With --token: the longest wait until the host enrols: 30m, 1h or 7d")
 ]
 
 
@@ -78,7 +83,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     ] = False,
     within: _Within = "1h",
     csr: _Csr = None,
-    days: _Days = 90,
+    valid: _Valid = "90d",
     out: _Out = None,
     opened: _Open = None,
     ports: _Ports = "32768-60999",
@@ -87,7 +92,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
 
     Example: rosrv host add ocu-1 --token
     """
-    wishes = wishes_of(appliance, ports, opened)
+    wishes, days = wishes_of(appliance, ports, opened), _days(valid)
     if token:
         if csr is not None:
             raise usage_error(
@@ -109,7 +114,7 @@ def kit(  # noqa: PLR0917  as above
     ] = False,
     within: _Within = "1h",
     csr: _Csr = None,
-    days: _Days = 90,
+    valid: _Valid = "90d",
     out: _Out = None,
     opened: _Open = None,
     ports: _Ports = "32768-60999",
@@ -118,7 +123,7 @@ def kit(  # noqa: PLR0917  as above
 
     Example: rosrv host kit ocu-1
     """
-    wishes = wishes_of(appliance, ports, opened)
+    wishes, days = wishes_of(appliance, ports, opened), _days(valid)
     if token:
         order = HostToken(name, token_seconds=_seconds(within), days=days)
         _write_script(running, order, wishes, out)
@@ -187,6 +192,10 @@ def revoke(running: Appliance, name: _Name) -> None:
             f"{body.name} ({body.address}) is revoked;"
             f" {counted(body.taken_back, 'registration or grant', 'registrations and grants')} removed"
         )
+
+
+def _days(valid: str) -> float:
+    return span_given("--for", valid, "60s, 30m, 12h, 90d or 52w", "rosrv host", bare="d") / _DAY
 
 
 def _seconds(within: str) -> float:

@@ -16,6 +16,7 @@ from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.durations import bounded_span
 from appliance.features.tunnels.requests import HostPorts
 from appliance.network import close_ports as protection
 from appliance.network import scan as scanner
@@ -30,7 +31,7 @@ _MOST_TOLD = 100
 _UNANNOUNCED_SECONDS = 5.0
 
 
-@speaks_with("One JSON object on standard output.")
+@speaks_with("One JSON object")
 def protect(
     running: Appliance,
     *,
@@ -38,55 +39,55 @@ def protect(
         list[str] | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Address of the appliance, as this machine sees it (default: the one at --state). Repeatable.",
+            help="Address of the appliance, as this machine sees it (default: the one at --state; repeatable)",
         ),
     ] = None,
     open_services: Annotated[
         list[str] | None,
-        typer.Option("--open", metavar="SERVICES", help="Keep open to all: tcp/22,udp/123. Repeatable."),
+        typer.Option("--open", metavar="SERVICES", help="Keep open to all: tcp/22,udp/123 (repeatable)"),
     ] = None,
     ports: Annotated[
         str | None,
         typer.Option(
             metavar="FIRST-LAST",
-            help="The ports to close or check (default: the local port range here, of this machine or container).",
+            help="The ports to close or check (default: the local port range here, of this machine or container)",
         ),
     ] = None,
     strict: Annotated[
         bool,
         typer.Option(
             "--strict",
-            help="Close the ports also to programs of this machine, except those of --user and --cgroup.",
+            help="Close the ports also to programs of this machine, except those of --user and --cgroup",
         ),
     ] = False,
     users: Annotated[
         list[str] | None,
-        typer.Option("--user", metavar="USER", help="Strict: a user that runs nodes. Repeatable."),
+        typer.Option("--user", metavar="USER", help="With --strict: a user that runs nodes (repeatable)"),
     ] = None,
     groups: Annotated[
         list[str] | None,
         typer.Option(
             "--cgroup",
             metavar="PATH",
-            help="Strict: a control group of nodes, such as system.slice/robot.service. Repeatable.",
+            help="With --strict: a control group of nodes, such as system.slice/robot.service (repeatable)",
         ),
     ] = None,
     apply: Annotated[
-        bool, typer.Option("--apply", help="Apply the rules now, replacing earlier ones.")
+        bool, typer.Option("--apply", help="Apply the rules now, replacing earlier ones")
     ] = False,
     check: Annotated[
-        str | None, typer.Option(metavar="HOST", help="Try the ports of another machine from here.")
+        str | None, typer.Option(metavar="HOST", help="Try the ports of another machine from here")
     ] = None,
     name: Annotated[
         str | None,
         typer.Option(
-            "--as", metavar="NAME", help="Check: report the result under this name of an enrolled host."
+            "--as", metavar="NAME", help="With --check: report the result under this name of an enrolled host"
         ),
     ] = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove the rules.")] = False,
-    seconds: Annotated[
-        float, typer.Option(min=0.05, max=60, help="Check: seconds to wait for each port.")
-    ] = 1.0,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the rules")] = False,
+    within: Annotated[
+        str, typer.Option(help="With --check: the longest wait for each port, 0.05s to 1m")
+    ] = "1s",
 ) -> None:
     """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
 
@@ -108,6 +109,7 @@ def protect(
 
     The check tries TCP. Run it on a machine other than the appliance, which is allowed in.
     """
+    seconds = bounded_span("--within", within, "0.05s", "1m", "rosrv protect", bare="s")
     if sum((apply, check is not None, remove)) > 1:
         _fail("--apply, --check and --remove exclude one another")
     try:

@@ -50,7 +50,7 @@ _UNKNOWN_NODES = ("/operator/bridge", "/camera/bridge")
 _DEMO = (
     "unshare", "--mount", "sh", "-ec",
     'mount -t tmpfs tmpfs /opt; mkdir /opt/rosrv; mount --bind "$1" /opt/rosrv; cd /opt/rosrv;'
-    " exec env PYTHONPATH=/opt/rosrv .venv/bin/rosrv demo --hold", "sh", str(REPOSITORY),
+    " exec env PYTHONPATH=/opt/rosrv .venv/bin/rosrv demo --keep", "sh", str(REPOSITORY),
 )  # fmt: skip
 _DEMO_SECONDS = 400.0
 _ATTACK = """

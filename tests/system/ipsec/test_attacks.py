@@ -320,7 +320,7 @@ def _up_from(remote: str) -> Callable[[Event], bool]:
 
 def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -> None:
     mark, seconds = site.mark, allowed(20)
-    expiring = site.kit("add", "visitor", "--days", str(seconds / 86400))
+    expiring = site.kit("add", "visitor", "--for", f"{seconds:g}s")
     with site.join(expiring, other) as visitor:
         site.recorded(mark, event="tunnel up", host=visitor.address)
         site.trail.wait_for(event="tunnel down", host=visitor.address, since=mark, timeout=seconds + LIMIT)

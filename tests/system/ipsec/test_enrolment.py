@@ -114,7 +114,7 @@ def closed(site: TunnelSite, laptop: ScriptHost) -> None:
     (site.home / "api.pem").write_text((site.appliance.state / "api/certificate.pem").read_text())
     told = site.attacker.popen(
         [
-            ROSRV, "protect", "--check", OCU, "--ports", "40000-40049", "--as", "laptop", "--seconds", "1",
+            ROSRV, "protect", "--check", OCU, "--ports", "40000-40049", "--as", "laptop", "--within", "1s",
             "--api", f"https://{MIDDLE}:{API}", "--api-ca", str(site.home / "api.pem"),
         ],
         env={"ROSRV_TOKEN": str(ready["token"]), "PATH": os.environ["PATH"]},
@@ -286,7 +286,7 @@ def test_a_short_lived_certificate_is_renewed_in_time(
 ) -> None:
     script = tmp_path / "join.sh"
     mark = site.mark
-    laptop.run("sh", str(script), awaited(site, "brief", script, "--days", str(90 / 86_400)))
+    laptop.run("sh", str(script), awaited(site, "brief", script, "--for", "90s"))
     first = site.is_up("brief")
     # The kit's script checks the certificate, which is backdated by an hour: its last third has already begun.
     assert "in force" in laptop.run("/etc/rosrv/renew.sh").stdout

@@ -245,7 +245,7 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
         command = ["/usr/bin/rostopic", "pub", "--rate", "10", topic, kind, value]
         return robot.ros.start(command, label=f"{topic} {value}")
 
-    ordered = ("adopt", "--when-standing", "--within", "8")
+    ordered = ("adopt", "--when-standing", "--within", "8s")
     assert "no topic commands a base" in rosrv(robot, appliance, *ordered, check=False)
     robot.ros.start(["/usr/bin/rostopic", "echo", "/cmd_vel"], label="base")
     moving = publish("/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.5}}")
@@ -255,12 +255,12 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
     publish("/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.0}}")
     publish("/odom", "nav_msgs/Odometry", "{twist: {twist: {linear: {x: 0.0}}}}")
     eventually(lambda: "/odom" in str(robot.graph()), robot.ros.story)
-    said = rosrv(robot, appliance, "adopt", "--when-standing", "--within", "30")
+    said = rosrv(robot, appliance, "adopt", "--when-standing", "--within", "30s")
     assert "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic" in said
     assert "noted" in said
     appliance.start()
     until_taken(robot, appliance)
-    said = rosrv(robot, appliance, "policy", "enforce", "--when-standing", "--within", "30")
+    said = rosrv(robot, appliance, "policy", "enforce", "--when-standing", "--within", "30s")
     assert (
         "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no" in said
     )

@@ -282,7 +282,7 @@ def test_the_printed_file_can_be_loaded(robot: Host, gateway: Host, tmp_path: Pa
 
 def test_a_silent_machine_is_not_reported_as_closed(lab: Lab, robot: Host, attacker: Host) -> None:
     lab.unplug(robot)
-    arguments = ("--check", robot.address, "--ports", "40000-40010", "--seconds", "0.2")
+    arguments = ("--check", robot.address, "--ports", "40000-40010", "--within", "0.2s")
     assert "may be open" in protect(attacker, *arguments, status=2)
     assert json.loads(protect(attacker, *arguments, "--json", status=2))["state"] == "unknown"
 

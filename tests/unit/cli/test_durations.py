@@ -1,6 +1,7 @@
 import pytest
+import typer
 
-from appliance.cli.durations import seconds_of
+from appliance.cli.durations import bounded_span, seconds_of
 
 
 @pytest.mark.parametrize(
@@ -20,3 +21,22 @@ def test_an_invalid_duration_is_none(text: str) -> None:
 
 def test_only_the_allowed_units_count() -> None:
     assert seconds_of("1w", "smh") is None
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("1s", 1), ("0.5m", 30), ("1h", 3600), ("7", 7)])
+def test_a_duration_within_its_bounds_is_in_seconds(text: str, seconds: float) -> None:
+    assert bounded_span("--within", text, "1s", "1h", "rosrv x", bare="s") == seconds
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("0s", "0s is out of bounds"),
+        ("61m", "61m is out of bounds"),
+        ("3 months", "'3 months' is not a duration"),
+    ],
+)
+def test_a_duration_out_of_bounds_names_them(text: str, why: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit):
+        bounded_span("--within", text, "1s", "1h", "rosrv x")
+    assert capsys.readouterr().err == f"rosrv x: --within {why}: write 1s to 1h\n"

@@ -59,7 +59,7 @@ class Terminal:
     def __init__(self, columns: int, lines: int, state: Path, seconds: str) -> None:
         self._ours, theirs = pty.openpty()
         self._size(columns, lines)
-        self.process = watch("--every", seconds, "--state", str(state), terminal=theirs)
+        self.process = watch("--every", f"{seconds}s", "--state", str(state), terminal=theirs)
         os.close(theirs)
         self.shown = ""
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -154,7 +154,7 @@ def test_a_pipe_gets_one_status_after_the_other(
     serving: Callable[..., FakeAppliance], tmp_path: Path
 ) -> None:
     serving()
-    with watch("--every", "1", "--state", str(tmp_path)) as process:
+    with watch("--every", "1s", "--state", str(tmp_path)) as process:
         assert process.stdout is not None
         lines: list[bytes] = []
         while sum(line.startswith(b"appliance") for line in lines) < 2:
@@ -169,7 +169,7 @@ def test_a_pipe_gets_one_status_after_the_other(
 
 
 def test_with_json_each_line_is_an_object(serving: Callable[..., FakeAppliance], tmp_path: Path) -> None:
-    with watch("--every", "1", "--json", "--state", str(tmp_path)) as process:
+    with watch("--every", "1s", "--json", "--state", str(tmp_path)) as process:
         assert process.stdout is not None
         away = json.loads(process.stdout.readline())
         again = json.loads(process.stdout.readline())
@@ -188,7 +188,7 @@ def test_a_rejected_token_ends_the_watch() -> None:
     """Each further request would be one more denial in the audit log."""
     with FakeAppliance() as fake:
         fake.problem(401, "not-recognised", "the token is wrong or revoked")
-        with watch("--every", "1", "--api", fake.url) as process:
+        with watch("--every", "1s", "--api", fake.url) as process:
             assert process.wait(_LIMIT_SECONDS) == 2
             assert process.stderr is not None
             assert b"is not accepted: the token is wrong or revoked" in process.stderr.read()
@@ -199,7 +199,7 @@ def test_a_restarted_api_may_reject_a_token_for_a_moment() -> None:
     good = msgspec.json.encode(example(Status, **_SERVED))
     with FakeAppliance() as fake:
         fake.body = good
-        with watch("--every", "1", "--json", "--api", fake.url) as process:
+        with watch("--every", "1s", "--json", "--api", fake.url) as process:
             assert process.stdout is not None
             for served in (True, False, True):
                 if served:

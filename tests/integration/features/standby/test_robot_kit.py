@@ -221,7 +221,7 @@ def test_a_new_kit_begins_a_new_lease_with_the_first_appliance_alone_in_sync(sit
     lease = site.state / "lease" / "epoch"
     lease.parent.mkdir()
     lease.write_text(f"{epoch}\n")
-    site.join("new", "--again")
+    site.join("new", "--force")
     site.script(robot, site.kit / "witness" / "install.sh")
     a, b = site.peer("a"), site.peer("b")
     assert a.granted(epoch) == epoch + 2

@@ -39,7 +39,7 @@ def test_a_survey_equals_the_state_of_the_master_and_changes_nothing(
 ) -> None:
     draft, page = tmp_path / "draft.ini", tmp_path / "survey.html"
     before = state(robot)
-    found = json.loads(rosrv(robot, "survey", "--json", "--policy", str(draft), "--html", str(page)))
+    found = json.loads(rosrv(robot, "survey", "--json", "--policy", str(draft), "--output", str(page)))
     assert state(robot) == before
     publishers, subscribers, services = (dict(part) for part in before)
     assert {

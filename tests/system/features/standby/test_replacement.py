@@ -17,7 +17,7 @@ def test_a_replaced_machine(site: StandbySite, robot: StandbyRobot) -> None:
     robot.lost_nothing()
     kit = site.home / "kit"
     remaining.rosrv(
-        "standby", "join", "--again", "--address", ADDRESSES["b"], "--other", ADDRESSES["a"], "--witness", ROBOT,
+        "standby", "join", "--force", "--address", ADDRESSES["b"], "--other", ADDRESSES["a"], "--witness", ROBOT,
         "--fixed", FIXED, "--output", str(kit),
     )  # fmt: skip
     shutil.rmtree(old.state)

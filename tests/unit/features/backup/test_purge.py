@@ -44,7 +44,7 @@ def test_all_of_it_is_removed_and_nothing_else(state: Path, tmp_path: Path) -> N
 def test_a_mount_point_stays_empty(state: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """The volume of a container, or an encrypted partition."""
     kept(state, monkeypatch, number)
-    done = CliRunner().invoke(app, ["purge", "--state", str(state), "--confirm", str(state)])
+    done = CliRunner().invoke(app, ["purge", "--state", str(state), "--yes"])
     assert (done.exit_code, "is erased: 5 files" in done.output) == (0, True)
     assert list(state.iterdir()) == []
 
@@ -88,6 +88,13 @@ def test_only_a_state_directory_is_removed(tmp_path: Path) -> None:
     with pytest.raises(BackupError, match="is not the state directory of an appliance"):
         purge(tmp_path / "home")
     assert (tmp_path / "home" / "letter").exists()
+
+
+def test_yes_needs_the_state_directory_beside_it(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROSRV_STATE", str(state))
+    done = CliRunner().invoke(app, ["purge", "--yes"])
+    assert (done.exit_code, f"--yes needs the directory: --state {state}" in done.output) == (2, True)
+    assert state.is_dir()
 
 
 def test_the_command_asks_for_the_path_again(state: Path) -> None:

@@ -72,7 +72,7 @@ def test_all_machines_have_keys_that_fit() -> None:
 
 def test_each_kit_has_a_lease_of_its_own() -> None:
     join_first("one")
-    join_first("two", "--again")
+    join_first("two", "--force")
     leases = {read_settings(f"{kit}/witness/witness.json").state for kit in ("one", "two")}
     assert len(leases) == 2
 

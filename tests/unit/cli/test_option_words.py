@@ -1,0 +1,114 @@
+"""One name and one metavar for a time, for output and for consent, in all verbs."""
+
+import re
+from collections import defaultdict
+from typing import Any, NamedTuple
+
+import pytest
+import typer
+from typer.core import TyperOption
+
+from appliance.cli.main import app
+from rosmop.tool.renamed_options import FORMER_OPTIONS
+from tests.support.command import commands, rosrv
+
+POINTS = {"--since": "TIME", "--until": "TIME", "--at": "TIME", "--between": "TIME TIME"}
+DURATIONS = {"--for", "--within", "--confirm-within", "--every", "--grace", "--before", "--after"}
+NO_TIME = {("audit checkpoints", "--after"), ("report interventions", "--after")}  # a number, and a report
+# Only these flags let a command do what it would refuse. `--hold` is beside `--force`, so that an operator who
+# accepts one consequence has not accepted the other.
+EVEN = re.compile(r"(Block|Join|Load|Release) even\b")
+CONSENT = {"--force", "--hold"}
+# These write a file beside the output of the verb.
+SECOND_OUTPUTS = {
+    ("survey", "--policy"), ("policy learn", "--tests"), ("monitor check", "--dot"), ("monitor check", "--svg"),
+    ("monitor run", "--report"), ("monitor learn", "--report"), ("monitor replay", "--report"),
+    ("monitor coverage", "--report"),
+}  # fmt: skip
+MEANINGS = {
+    "--api": {"HOST:PORT", "URL"},  # where `up` listens, and the appliance of all others
+    "--after": {"DURATION", "FILE", "N"},
+    "--check": {"", "HOST"},  # of `adopt` and of `protect`
+    "--other": {"ADDRESS", "DIR"},  # a copy of the other log, and the address of the other appliance
+    "--output": {"DIR", "FILE"},
+    "--topic": {"TOPIC", "PATTERN", "NAME=TOPIC"},  # one, several, and a topic for a role of a preset
+}
+
+
+class Option(NamedTuple):
+    verb: str
+    name: str
+    metavar: str
+    help: str
+    given: Any
+
+
+OPTIONS = [
+    Option(name, max(one.opts, key=len), one.metavar or "", one.help or "", one)
+    for name, command in commands()
+    for one in command.params
+    if isinstance(one, TyperOption) and not one.hidden
+]
+
+
+def test_a_point_in_time_is_time_and_a_length_is_duration() -> None:
+    for one in OPTIONS:
+        if (one.verb, one.name) in NO_TIME:
+            continue
+        if one.name in POINTS or one.metavar.startswith("TIME"):
+            assert one.metavar == POINTS.get(one.name), one
+        if one.name in DURATIONS or one.metavar == "DURATION":
+            assert (one.name in DURATIONS, one.metavar) == (True, "DURATION"), one
+
+
+def test_no_time_is_a_bare_number() -> None:
+    context = typer.Context(typer.main.get_command(app))
+    numbers = {one.name for one in OPTIONS if "float" in (one.given.display_type(context) or "")} - DURATIONS
+    assert numbers == {"--hold-out", "--fail-under"}  # shares
+
+
+def test_a_file_that_a_verb_writes_is_its_output() -> None:
+    for one in OPTIONS:
+        writes = one.help.startswith(("File for", "File to write", "File,", "File (", "Write", "Draw"))
+        if (one.verb, one.name) in SECOND_OUTPUTS:
+            assert one.metavar == "FILE", one
+        elif one.name == "--output" or (writes and one.metavar in ("FILE", "DIR")):
+            assert (one.name, "-o" in one.given.opts) == ("--output", True), one
+
+
+def test_an_option_that_consents_is_yes_or_force() -> None:
+    for one in OPTIONS:
+        assert (one.name == "--yes") is one.help.startswith("Do not ask"), one
+        assert (one.name in CONSENT) is bool(EVEN.match(one.help)), one
+
+
+def test_an_option_has_one_metavar_in_all_verbs() -> None:
+    found = defaultdict(set)
+    for one in OPTIONS:
+        found[one.name].add(one.metavar)
+    assert {name: kinds for name, kinds in found.items() if len(kinds) > 1} == MEANINGS
+
+
+def test_help_of_options_is_a_phrase_without_a_full_stop() -> None:
+    assert [one for one in OPTIONS if one.help.endswith(".")] == []
+
+
+@pytest.mark.parametrize(("former", "now"), sorted(FORMER_OPTIONS.items()))
+def test_a_former_name_is_replaced_somewhere(former: str, now: str) -> None:
+    known = defaultdict(set)
+    for one in OPTIONS:
+        known[one.verb].update(one.given.opts)
+    assert [verb for verb, names in known.items() if now in names and former not in names]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "note"),
+    [
+        (("status", "--watch", "--every", "0"), "--every 0 is now --every 0s"),
+        (("survey", "--seconds", "0.5"), "--within 0.5 is now --within 0.5s"),
+        (("host", "add", "a", "--days", "0"), "--for 0 is now --for 0d"),
+    ],
+)
+def test_a_number_without_a_unit_is_accepted_with_a_note(arguments: tuple[str, ...], note: str) -> None:
+    done = rosrv(*arguments)
+    assert (done.returncode, note in done.stderr) == (2, True)
