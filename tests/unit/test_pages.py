@@ -195,7 +195,7 @@ def test_options_that_the_product_names_exist() -> None:
 
 OTHERS = {
     "--device": "docker run", "--global": "pipx", "--pip-args": "pipx",
-    "--runtime-env-agent-port": "ray",
+    "--runtime-env-agent-port": "ray", "--wait": "roslaunch",
 }  # fmt: skip
 
 

@@ -314,11 +314,11 @@ WALL_CLOCK = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
-        "features/evidence/verbs.py", "features/logbook/report_verb.py", "features/logbook/who_drove_verb.py",
+        "features/evidence/verbs.py", "features/logbook/report_verb.py", "cli/durations.py",
         "features/monitor_tools/reset_verb.py", "features/policy_tools/policy_input.py",
         "features/tunnels/protect_verb.py",
         "base/timestamps.py",
-        "features/topics/verbs.py", "features/recorder/replay_input.py", "features/recorder/verbs.py",
+        "features/topics/verbs.py", "features/recorder/replay_input.py",
     ],
 }  # fmt: skip
 """Files that may read the wall clock, by purpose. Add a file only if it has one of these purposes."""

@@ -34,7 +34,7 @@ def demo(
     adopt: Annotated[
         bool,
         typer.Option(
-            "--adopt", help="Show `rosrv adopt` and `rosrv release` instead, on a robot that drives meanwhile"
+            "--adopt", help="Show `rosrv adopt` and `rosrv release` instead, on a robot that drives"
         ),
     ] = False,
 ) -> None:
