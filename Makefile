@@ -52,9 +52,9 @@ smoke: setup ## the container as a user starts it: built, a denied call, a polic
 	@scripts/setup --containers
 	$(PYTEST) tests/smoke --quiet
 
-nightly: setup ## every test, with all its examples: attacks, crashes, takeovers, containers, browser, machines; LANE=standby
+nightly: setup ## every test, with all its examples: attacks, crashes, takeovers, containers, browser, machines; LANE=standby, FROM=nodes
 	@scripts/setup --system
-	$(BIN)/python -m tests.nightly $(if $(LANE),--lane $(LANE))
+	$(BIN)/python -m tests.nightly $(if $(LANE),--lane $(LANE)) $(if $(FROM),--from $(FROM))
 
 steady: setup ## run one test N times beside busy loops: make steady TEST=tests/integration/test_nodes.py N=50
 	$(BIN)/python -m tests.steady $(TEST) $(N)

@@ -1,21 +1,27 @@
 """Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
 
-It never stops at a failure. `build/nightly/results.json` has passes, failures and seconds of each test, and the
-commit, start, end and load average of each run. Runs of the same commit add up. If a robot's start
-(`benchmarks/launch.py`) or the delay of a lone message (`benchmarks/cold.py`) differs by more than 20 % from the
-table in `benchmarks/RESULTS.md`, that is printed as a finding. The exit status is 1 if a test failed that
+It never stops at a failure, and ends with a table of the stages and the list of the failures. `--from STAGE`
+(`make nightly FROM=nodes`) resumes: the results of the same commit stand for the stages before it.
+`build/nightly/results.json` has passes, failures and seconds of each test, and the commit, start, end and load average
+of each run. Runs of the same commit add up. A stage that leaves network namespaces behind, and a robot's start
+(`benchmarks/launch.py`) or a delay of a lone message (`benchmarks/cold.py`) that differs by more than 20 % from the
+table in `benchmarks/RESULTS.md`, are printed as findings. The exit status is 1 if a test failed that
 `tests/unsteady.txt` does not list, or if one of these programs failed.
 """
 
 import argparse
+import contextlib
 import datetime
 import json
 import os
+import shutil
+import signal
 import stat
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +38,7 @@ MEASUREMENTS = {
 }
 UNSTEADY = ROOT / "tests" / "unsteady.txt"
 _STAGE_SECONDS = 90 * 60.0  # a stage that hangs ends, and counts as failed
+_END_SECONDS = 60.0  # for an interrupted stage to write its report
 
 LANES = {
     "console": ("tests/system/console/",),
@@ -81,6 +88,9 @@ STAGES = (
     Stage("namespaces", ("tests/system",), "auto"),
     Stage("packages", ("tests/package",)),
 )
+
+
+STEPS = (*(stage.name for stage in STAGES), *MEASUREMENTS)
 
 
 # Tests run programs of this checkout as other users. In a mount namespace of its own, an open folder with the same
@@ -150,36 +160,54 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     report.unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
     command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    environment = os.environ | {"TESTS_EXAMPLES": "all"}
-    with (FOLDER / f"{stage.name}.log").open("wb") as log:
-        try:
-            status = subprocess.run(
-                command,
-                cwd=ROOT,
-                env=environment,
-                stdout=log,
-                stderr=log,
-                timeout=_STAGE_SECONDS,
-                check=False,
-            ).returncode
-        except subprocess.TimeoutExpired:
-            return [], f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
+    status = run_limited(command, FOLDER / f"{stage.name}.log", _STAGE_SECONDS, {"TESTS_EXAMPLES": "all"})
     wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"
+    wrong = _late() if status is None else wrong
     return (list(outcomes_of(report)) if report.exists() else []), wrong
+
+
+def _late() -> str:
+    return f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
+
+
+def run_limited(
+    command: Sequence[str], output: Path, seconds: float, environment: Mapping[str, str] | None = None
+) -> int | None:
+    """Run a program and return its status, or None if it was interrupted after `seconds`.
+
+    An interrupted pytest reports the tests that have ended. A minute later all processes of the program are killed, so
+    that none disturbs the next stage.
+    """
+    with (
+        output.open("wb") as log,
+        subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env=os.environ | (environment or {}),
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        ) as program,
+    ):
+        try:
+            return program.wait(seconds)
+        except subprocess.TimeoutExpired:
+            program.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                program.wait(_END_SECONDS)
+            return None
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(program.pid, signal.SIGKILL)
 
 
 def measure(name: str) -> tuple[list[str], str]:
     """Run a program of `MEASUREMENTS`; return its findings, and why there are none."""
-    command, output = [sys.executable, "-m", *MEASUREMENTS[name]], _log_of(name)
-    with output.open("wb") as log:
-        try:
-            done = subprocess.run(
-                command, cwd=ROOT, stdout=log, stderr=log, timeout=_STAGE_SECONDS, check=False
-            )
-        except subprocess.TimeoutExpired:
-            return [], f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
-    wrong = f"{MEASUREMENTS[name][0]} ended with status {done.returncode}" if done.returncode else ""
-    return findings_of(output.read_text(encoding="utf-8")), wrong
+    status = run_limited([sys.executable, "-m", *MEASUREMENTS[name]], _log_of(name), _STAGE_SECONDS)
+    if status is None:
+        return [], _late()
+    wrong = f"{MEASUREMENTS[name][0]} ended with status {status}" if status else ""
+    return findings_of(_log_of(name).read_text(encoding="utf-8")), wrong
 
 
 def _log_of(name: str) -> Path:
@@ -192,49 +220,86 @@ def findings_of(output: str) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--lane", choices=["core", *LANES], help="run the tests of one lane only")
-    lane = parser.parse_args().lane
+    parser.add_argument(
+        "--lane", choices=["core", *LANES], default="all", help="run the tests of one lane only"
+    )
+    parser.add_argument(
+        "--from", choices=STEPS, default=STEPS[0], dest="first", help="resume with this stage"
+    )
+    arguments = parser.parse_args()
+    lane, first = arguments.lane, arguments.first
     open_folders_above(ROOT)
     FOLDER.mkdir(parents=True, exist_ok=True)
-    results = _earlier(_commit())
-    failed: list[str] = []
-    for stage in STAGES:
-        files = [file for file in files_of_stages()[stage.name] if lane in (None, lane_of(file))]
-        if not files:
-            continue
-        began, load = _moment(), os.getloadavg()[0]
-        outcomes, wrong = run_stage(stage, files)
-        failed += [name for name, outcome, _ in outcomes if outcome == "failed"]
-        failed += [f"{stage.name}: {wrong} (build/nightly/{stage.name}.log)"] if wrong else []
-        _add(results["tests"], outcomes)
-        results["runs"].append(
-            {
-                "stage": stage.name,
-                "lane": lane or "all",
-                "began": began,
-                "ended": _moment(),
-                "load": [load, *os.getloadavg()[:1]],
-            }
-        )
-        RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        count = {
-            kind: sum(1 for _, one, _ in outcomes if one == kind) for kind in ("passed", "failed", "skipped")
-        }
-        print(
-            f"{stage.name}: {count['passed']} passed, {count['failed']} failed, {count['skipped']} skipped",
-            flush=True,
-        )
-    for name in MEASUREMENTS if lane in (None, "core") else ():
-        found, wrong = measure(name)
-        results["findings"] += found
-        failed += [f"{name}: {wrong} (build/nightly/{_log_of(name).name})"] if wrong else []
-        RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        print("\n".join([*found, f"{name}: {len(found)} findings (build/nightly/{_log_of(name).name})"]))
-    return _report(failed)
+    results, steps = _earlier(_commit()), steps_of(lane)
+    for step in steps:
+        if STEPS.index(step) >= STEPS.index(first):
+            run_step(step, lane, results)
+    return _report(rows_of(results["runs"], lane, steps), results["findings"])
 
 
-def _report(failed: list[str]) -> int:
+def files_of(stage: str, lane: str) -> list[str]:
+    return [file for file in files_of_stages()[stage] if lane in ("all", lane_of(file))]
+
+
+def steps_of(lane: str) -> list[str]:
+    """Return the stages with tests of a lane, and the measurements of the core's."""
+    measured = MEASUREMENTS if lane in ("all", "core") else ()
+    return [*(stage.name for stage in STAGES if files_of(stage.name, lane)), *measured]
+
+
+def run_step(name: str, lane: str, results: dict[str, Any]) -> None:
+    began, clock, load, namespaces = _moment(), time.monotonic(), os.getloadavg()[0], _namespaces()
+    outcomes: list[tuple[str, str, float]] = []
+    if name in MEASUREMENTS:
+        findings, wrong = measure(name)
+    else:
+        [stage] = (stage for stage in STAGES if stage.name == name)
+        outcomes, wrong = run_stage(stage, files_of(name, lane))
+        left = sorted(_namespaces() - namespaces)
+        findings = [f"finding: {name} left the network namespaces {', '.join(left)}"] if left else []
+    _add(results["tests"], outcomes)
+    results["findings"] += findings
+    failed = [test for test, outcome, _seconds in outcomes if outcome == "failed"]
+    run = {
+        "stage": name,
+        "lane": lane,
+        "began": began,
+        "ended": _moment(),
+        "minutes": round((time.monotonic() - clock) / 60, 1),
+        "load": [load, *os.getloadavg()[:1]],
+        "free_gigabytes": shutil.disk_usage(ROOT).free >> 30,
+        "passed": sum(1 for _, outcome, _ in outcomes if outcome == "passed"),
+        "skipped": sum(1 for _, outcome, _ in outcomes if outcome == "skipped"),
+        "failed": failed + ([f"{name}: {wrong} ({_log_of(name).relative_to(ROOT)})"] if wrong else []),
+    }
+    results["runs"].append(run)
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    print("\n".join([*findings, row_of(run)]), flush=True)
+
+
+def _namespaces() -> set[str]:
+    folder = Path("/run/netns")
+    return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+
+
+def rows_of(runs: Sequence[dict[str, Any]], lane: str, steps: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the newest run of each step of a lane, or only its name."""
+    newest = {run["stage"]: run for run in runs if run["lane"] == lane}
+    return [newest.get(step, {"stage": step}) for step in steps]
+
+
+def row_of(run: dict[str, Any]) -> str:
+    if "minutes" not in run:
+        return f"{run['stage']:<20} not run"
+    counts = f"{run['passed']:>6} passed {len(run['failed']):>4} failed {run['skipped']:>4} skipped"
+    return f"{run['stage']:<20}{run['minutes']:>6.1f} min {counts}  {run['free_gigabytes']} GB free"
+
+
+def _report(runs: Sequence[dict[str, Any]], findings: Sequence[str]) -> int:
     known = unsteady()
+    failed = [name for run in runs for name in run.get("failed", ())]
+    total = sum(run.get("minutes", 0) for run in runs)
+    print("\n".join(["", *map(row_of, runs), f"{'all':<20}{total:>6.1f} min", *findings]))
     for name in failed:
         print(f"FAILED {name}" + (" (known to fail by chance)" if name in known else ""))
     print(f"results: {RESULTS.relative_to(ROOT)}")

@@ -12,16 +12,23 @@ from benchmarks.cold import LONE
 from benchmarks.launch import RESULTS, findings, table_ratios
 from tests.nightly import (
     LANES,
+    MEASUREMENTS,
     STAGES,
+    STEPS,
     UNSTEADY,
     files_of_stages,
     findings_of,
     lane_of,
     outcomes_of,
+    row_of,
+    rows_of,
+    run_limited,
+    steps_of,
     unsteady,
 )
 from tests.steady import largest_chance
 from tests.support.determinism import WATCH, ChanceError
+from tests.support.waiting import eventually
 
 REPORT = """<testsuites><testsuite>
 <testcase file="tests/a.py" name="test_one[x]" time="1.5"/>
@@ -53,6 +60,58 @@ def test_every_test_file_runs_at_night_in_one_stage() -> None:
     assert len(files) == len(set(files)) > 500
     assert all(stages[stage.name] for stage in STAGES)
     assert {lane_of(file) for file in files} == {"core", *LANES}
+
+
+def test_a_lane_has_the_stages_of_its_tests() -> None:
+    assert steps_of("all") == [*STEPS]
+    assert steps_of("console") == ["machine", "namespaces"]
+    assert MEASUREMENTS.keys().isdisjoint(steps_of("standby"))
+    assert MEASUREMENTS.keys() <= {*steps_of("core")}
+
+
+def test_a_resumed_night_has_the_newest_run_of_each_stage_of_its_lane() -> None:
+    runs = [
+        {"stage": "nodes", "lane": "all", "failed": ["a"]},
+        {"stage": "nodes", "lane": "fleet", "failed": ["b"]},
+        {"stage": "nodes", "lane": "all", "failed": []},
+    ]
+    assert rows_of(runs, "all", ["nodes", "machine"]) == [runs[2], {"stage": "machine"}]
+
+
+def test_the_table_of_a_night_names_what_did_not_run() -> None:
+    assert row_of({"stage": "machine"}) == "machine              not run"
+    run = {
+        "stage": "nodes",
+        "minutes": 41.26,
+        "passed": 400,
+        "failed": ["a"],
+        "skipped": 2,
+        "free_gigabytes": 60,
+    }
+    assert row_of(run) == "nodes                 41.3 min    400 passed    1 failed    2 skipped  60 GB free"
+
+
+@pytest.mark.nightly
+def test_a_stage_that_hangs_writes_its_report_and_leaves_no_process(tmp_path: Path) -> None:
+    script = "trap 'echo written; exit 2' INT; sleep 600 & echo $!; while true; do sleep 0.1; done"
+    assert run_limited(["bash", "-c", script], tmp_path / "log", 2.0) is None
+    child, word = (tmp_path / "log").read_text().split()
+    assert word == "written"
+    eventually(lambda: "State:" not in (status := _status(child)) or "(zombie)" in status, f"{child} runs")
+
+
+def _status(process: str) -> str:
+    try:
+        return Path(f"/proc/{process}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
+@pytest.mark.nightly
+def test_a_program_that_ends_in_time_has_its_status(tmp_path: Path) -> None:
+    command = ["sh", "-c", "echo $NIGHT; exit 5"]
+    assert run_limited(command, tmp_path / "log", 60.0, {"NIGHT": "all"}) == 5
+    assert (tmp_path / "log").read_text() == "all\n"
 
 
 def test_results_are_read_from_the_report(tmp_path: Path) -> None:
