@@ -22,7 +22,7 @@ help: ## list the targets
 setup: ## install what is missing to develop: Debian packages and .venv
 	@scripts/setup
 
-demo: ## the appliance at work: a simulated robot, its operator and an attacker, in a minute or two
+demo: ## the appliance at work: a simulated robot, its operator and an attacker, in three to five minutes
 	@scripts/setup --run
 	@$(BIN)/rosrv demo $(ARGS)
 

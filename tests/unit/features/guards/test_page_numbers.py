@@ -1,0 +1,34 @@
+from pathlib import Path
+
+import pytest
+
+from appliance.features.guards.message_types import VALUED
+from appliance.features.guards.presets import PRESETS
+from rosmop.types.roles import types_of_roles
+
+DOCS = Path(__file__).parents[4] / "docs"
+DEFAULTS = [
+    ("driving.md", "its `silent` time ({} s)", "deadman", "silent"),
+    ("guards.md", "(default {} m/s and", "mode", "vMax"),
+    ("guards.md", "m/s and {} rad/s)", "mode", "wMax"),
+    ("reference/guards.md", "within `together` ({} s)", "estop", "together"),
+    ("reference/guards.md", "the scanner sees all round (`sector={}`)", "separation", "sector"),
+    ("reference/guards.md", "can be driven with `person={}`", "separation", "person"),
+]
+COUNTS = [
+    ("guards.md", "by one of six sensors", 6, len(VALUED)),
+    ("reference/guards.md", "has conditions for six types", 6, len(VALUED)),
+    ("guards.md", "a topic of one of twelve types", 12, len(types_of_roles()["Private"])),
+]
+
+
+@pytest.mark.parametrize(("page", "words", "preset", "name"), DEFAULTS)
+def test_a_default_on_a_page_is_the_presets(page: str, words: str, preset: str, name: str) -> None:
+    [default] = [one.default for one in PRESETS[preset].parameters if one.name == name]
+    assert words.format(default) in (DOCS / page).read_text().replace("\n", " ")
+
+
+@pytest.mark.parametrize(("page", "words", "number", "counted"), COUNTS)
+def test_a_number_of_types_on_a_page_is_counted(page: str, words: str, number: int, counted: int) -> None:
+    assert words in (DOCS / page).read_text().replace("\n", " ")
+    assert number == counted
