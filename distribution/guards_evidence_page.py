@@ -261,9 +261,10 @@ level.
   simulated.
 - **Simulated** means random [worlds](../../dev/assurance.md#guards-in-simulated-worlds) with a robot, its sensors,
   persons and operators, within the assumptions that are listed for each preset. Timers are due on time there: the delay
-  of a relay is measured (below), not simulated. **Left out of the worlds** are events at which the preset may break a
-  law: the guard is disabled and enabled (*switch*), is held and resumed (*hold*), gets bytes that are not a message
-  (*cut*), or its process is replaced (*restart*).
+  of a relay is measured (below), not simulated. In a part of the worlds an **act** happens to the guard: it is disabled
+  and enabled in motion (*switch*), held and resumed (*hold*), gets bytes that are not a message (*cut*), or its process
+  is replaced, with its state (*restart*) or without (*lost*). A base that drove while its guard was disabled is judged
+  from its next standstill on, if no stop could have prevented the harm.
 - **Pairs** are worlds with two guards of different presets on one topic: {pairs}.
 - **Tested in the engine** names tests of the preset's text. With real nodes, the stops of the engine are tested by a
   guard that is written for the test, not by each preset: `test_a_restart_sends_stops_until_a_command_comes`,
@@ -356,6 +357,8 @@ def _presets() -> Iterator[str]:
         yield f"| simulated | {_simulated(name, results)} |"
         if left := _left_out(name):
             yield f"| left out of the worlds | {left} |"
+        if name in results and (acts := _acts(name, results[name])):
+            yield f"| worlds by act | {acts} |"
         yield f"| tested in the engine | {_named(row.unit)} |"
         yield f"| fails without a notice | {'; '.join(row.fails)} |\n"
 
@@ -381,7 +384,7 @@ def _results() -> Rows:
 def _left_out(name: str) -> str:
     """Return the events that no world has, because the preset breaks a law at them."""
     by_reason: dict[str, list[str]] = {}
-    for event, why in WORLDS[name].not_yet.items() if name in WORLDS else ():
+    for event, why in WORLDS[name].left_out().items() if name in WORLDS else ():
         by_reason.setdefault(why, []).append(f"*{event}*")
     return "; ".join(f"{', '.join(events)}: {why}" for why, events in by_reason.items())
 
@@ -395,6 +398,13 @@ def _simulated(name: str, results: Rows) -> str:
     if row.digest != present_digests()[name]:
         return f"not since its text changed ({row.date})"
     return run_line(row)
+
+
+def _acts(name: str, row: Row) -> str:
+    """Return in how many worlds each act happened, as far as it was counted."""
+    counted = sum(row.acts.values())
+    parts = ", ".join(f"*{act}* {row.acts.get(act, 0):,}" for act in WORLDS[name].acts())
+    return f"{parts} (of {counted:,} worlds in which it was counted)" if counted else ""
 
 
 def run_line(row: Row) -> str:

@@ -54,7 +54,7 @@ class JointsWorld(World):
     span = 8000
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"state": ("dead", "half dead")}
     not_yet: ClassVar[Mapping[str, str]] = {
-        "switch beside a third node": "of two nodes, the first keeps its place, and the next one gets the other",
+        "switch beside a third node": "the first reporter keeps its place, and the next node gets the other place",
         "cut beside a third node": "as with *switch*",
     }
 
@@ -68,7 +68,7 @@ class JointsWorld(World):
         self.way: tuple[int, list[float], tuple[Point, ...]] = (0, [0.0] * len(JOINTS), ())
         """When the trajectory in force began, the position then, and its points."""
         self.heard: dict[int, int] = {}
-        """When each node that reports positions did so last with numbers."""
+        """When each node that has named joints since the guard began did so last with numbers."""
         self.fault = ""
         self.sent = self.passing = 0
         limits = " ".join(f"{name}:{-self.most}..{self.most}" for name in JOINTS) if r.random() < 0.5 else ""
@@ -88,12 +88,25 @@ class JointsWorld(World):
         if not self.live:
             self.after(r.uniform(1000, 6000), self._fails)
             self.with_second()
-            self.interrupt("hold restart" if self.third else "hold restart switch", 0.3)
+            self.interrupt()
 
     @property
     def third(self) -> bool:
         """Whether a node may report beside two others."""
         return self.second is not None and len(self.reports) == 2
+
+    def source_of(self, topic: str) -> int:
+        return 3
+
+    def ready_acts(self) -> list[str]:
+        return [act for act in super().ready_acts() if not self.third or act not in {"switch", "cut"}]
+
+    def begins_again(self) -> None:
+        super().begins_again()
+        self.forgets()
+
+    def forgets(self) -> None:
+        self.heard.clear()
 
     def counts(self, topic: str) -> bool:
         return self.third  # two nodes may report, and both have to
@@ -124,6 +137,11 @@ class JointsWorld(World):
                 return
             case "NaN":
                 places = [math.nan] * len(places)
+            case "no names" if node not in self.heard:
+                self.say(
+                    "state", states(self.now, (), places), node
+                )  # a node that has named no joint owes none
+                return
             case "no names":
                 names = ()
             case "cut":
@@ -177,7 +195,8 @@ class JointsWorld(World):
         law = {"NaN": "L2", "infinite": "L2", "jump": "L3"}.get(bad, "L1")
         if bad:
             self.broken(law, f"a trajectory passes that is wrong: {bad}")
-        for node in self.reports:
+        may_answer = self.second is not None and not self.third
+        for node in self.heard if may_answer else self.reports:
             if self.now > self.heard.get(node, NEVER) + self.silent * 1000 and self.now > self.fresh_from:
                 self.broken(
                     "L4" if self.foreign else "L2",

@@ -67,7 +67,7 @@ class MeasuredWorld(World):
         if r.random() < 0.5:
             self.after(r.uniform(500, 6000), self._fails)
         self.with_second()
-        self.interrupt("hold restart switch", 0.3)
+        self.interrupt()
 
     def _command(self) -> None:
         r = self.random
@@ -154,8 +154,8 @@ class MeasuredWorld(World):
     def law(self) -> str:
         return "L4" if self.foreign else "L2"
 
-    def enable_guard(self) -> None:
-        super().enable_guard()
+    def begins_again(self) -> None:
+        super().begins_again()
         self.measure, self.bad_from = (NEVER, math.nan, math.nan), NEVER
         self.waits = True
 
@@ -264,8 +264,8 @@ class StandstillWorld(MeasuredWorld):
             self.waits = False
         self.count(wanted, got)
 
-    def enable_guard(self) -> None:
-        super().enable_guard()
+    def begins_again(self) -> None:
+        super().begins_again()
         self.moving_from = NEVER
         if self.stopped_at != NEVER:
             self.stopped_at = self.now

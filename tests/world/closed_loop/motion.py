@@ -1,5 +1,6 @@
 """Worlds with a base that moves: among obstacles and persons (`separation`), and inside a fence (`fence`)."""
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from tests.world.closed_loop.messages import (
     POSE,
     POSE_WITH_COVARIANCE,
     SCAN,
+    STILL,
     TWIST,
     TWIST_STAMPED,
     Legs,
@@ -26,7 +28,7 @@ from tests.world.closed_loop.messages import (
     scan,
     travels,
 )
-from tests.world.closed_loop.world import SLACK, World, void
+from tests.world.closed_loop.world import SLACK, BrokenLawError, Report, World, void
 
 PERSON_RADIUS = 0.2
 KINDS = {
@@ -45,6 +47,8 @@ class DrivenWorld(World):
     """When the last valid measurement arrived, or -1."""
     blind_from: int | None = None
     """When the first measurement without any evidence arrived that no valid one has followed."""
+    escaped = False
+    """Whether the base drove without the guard, so that no stop prevents the harm, and has not stood since."""
 
     def built(self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float) -> None:
         r = self.random
@@ -101,6 +105,47 @@ class DrivenWorld(World):
     def is_motion(self, legs: Legs) -> bool:
         return travels(legs)
 
+    def source_of(self, topic: str) -> int:
+        return 5
+
+    def begins_again(self) -> None:
+        super().begins_again()
+        self.heard, self.blind_from = -1, None
+
+    def switch(self) -> None:
+        super().switch()
+        self.escaped = True
+
+    def enable_guard(self) -> None:
+        super().enable_guard()
+        self.escaped = self._harmed_though_stopped()
+
+    def _caught(self) -> bool:
+        """Return whether the base stands, and executes no command from before the guard was enabled."""
+        executed = self.now > self.fresh_from + 100 + SLACK + self.base.lag
+        return not self.switched_off and executed and math.hypot(*self.base.velocity) <= 0.01
+
+    def harm(self) -> None:
+        """Check that the base collides with nothing, or stays inside."""
+        raise NotImplementedError
+
+    def _harmed_though_stopped(self) -> bool:
+        """Return whether a stop that comes now is too late."""
+        ghost = copy.deepcopy(
+            self, {id(one): one for one in (self.guard, self.random, self._queue, self._trace)}
+        )
+        ghost.report, ghost.escaped = Report(), False
+        ghost.base.order(self.now + SLACK, STILL)
+        try:
+            while ghost.now < self.now + 200 or math.hypot(*ghost.base.velocity) > 0:
+                ghost.move(ghost.now + 10)
+                ghost.now += 10
+                ghost.harm()
+        except BrokenLawError:
+            self.trace("the base drove without the guard, and now no stop prevents the harm")
+            return True
+        return False
+
     def measured(self, *, valid: "bool | None") -> None:
         """Note the arrival of a measurement: valid, valid in parts (None), or without any evidence."""
         if valid or valid is None:
@@ -110,7 +155,7 @@ class DrivenWorld(World):
 
     def evidence(self, silent: float) -> None:
         """Check that nothing moves without evidence."""
-        if not travels(self.force[1]) or self.switched_off:
+        if not travels(self.force[1]) or self.switched_off or self.now <= self.fresh_from + 100 + SLACK:
             return
         if self.heard < 0:
             self.broken(self.law(), "a motion is in force before the first measurement")
@@ -154,9 +199,6 @@ class SeparationWorld(DrivenWorld):
     """Whether a scanner that was silent may send again."""
     stood = True
     """Whether the base stood a step ago."""
-    not_yet: ClassVar[Mapping[str, str]] = {
-        "switch": "a base that drove without the guard may be so fast that no stop prevents a collision"
-    }
 
     def plan(self) -> None:
         r = self.random
@@ -192,7 +234,7 @@ class SeparationWorld(DrivenWorld):
         if r.random() < 0.5:
             self.after(r.uniform(300, 6000), self._fail)
         self.with_second()
-        self.interrupt("hold restart", 0.2)
+        self.interrupt()
 
     def good(self, topic: str) -> bytes:
         return scan(self.now, -math.pi, math.pi / 50, self.near, self.far, np.full(101, self.far * 0.9))
@@ -321,14 +363,15 @@ class SeparationWorld(DrivenWorld):
                 one.y += (self.base.y - one.y) / away * way
 
     def watch(self) -> None:
-        self._touch()
+        self.harm()
         self.evidence(self.silent)
         self.only_fresh()
 
-    def _touch(self) -> None:
+    def harm(self) -> None:
         for person in self.persons:
             self._follow(person)
         self.stood = math.hypot(*self.base.velocity) <= 0.01
+        self.escaped = self.escaped and not self._caught()
         places = [(*geometry.nearest_on(wall, self.base.x, self.base.y), 0.0) for wall in self.walls]
         places += [(one.x, one.y, PERSON_RADIUS) for one in self.persons if not one.stepped_in]
         vx, vy = self.base.velocity
@@ -339,6 +382,8 @@ class SeparationWorld(DrivenWorld):
             if towards <= 0.01:
                 continue
             left = away - self.radius - radius
+            if self.escaped:
+                continue
             self.report.clearance = min(self.report.clearance, left)
             if left <= 1e-9:
                 what = "a person" if radius else "a wall"
@@ -398,9 +443,6 @@ class FenceWorld(DrivenWorld):
     """A base inside a polygon, or at first outside: not a centimetre is left outside."""
 
     preset: ClassVar[str] = "fence"
-    not_yet: ClassVar[Mapping[str, str]] = {
-        "switch": "a base that drove without the guard may already be outside"
-    }
     tick = 50
 
     def plan(self) -> None:
@@ -437,7 +479,7 @@ class FenceWorld(DrivenWorld):
         if r.random() < 0.4:
             self.after(r.uniform(300, 6000), self._fail)
         self.with_second()
-        self.interrupt("hold restart", 0.2)
+        self.interrupt()
 
     def good(self, topic: str) -> bytes:
         return position(self.by, self.now, -1.0, 0.0, 0.0)
@@ -512,8 +554,18 @@ class FenceWorld(DrivenWorld):
         super().received(at, legs)
 
     def watch(self) -> None:
+        self.harm()
+        self.evidence(self.silent)
+        self.only_fresh()
+
+    def harm(self) -> None:
         left = self._depth()
         speed = math.hypot(*self.base.velocity)
+        if self.escaped:
+            self.escaped = not self._caught()
+            self.least = min(0.0, left)
+            self.outside = left < 0
+            return
         if not self.outside and speed > 0.01:
             self.report.clearance = min(self.report.clearance, left)
         if left > self.margin:
@@ -523,8 +575,6 @@ class FenceWorld(DrivenWorld):
                 f"{-left:.3f} m outside" if self.least == 0 else f"{self.least - left:.3f} m further outside"
             )
             self.broken(self.law("L3"), f"the base is {where}, at {speed:.2f} m/s")
-        self.evidence(self.silent)
-        self.only_fresh()
 
     def ended(self) -> None:
         if self.live and self.base.driven < 0.6 * self.honest:

@@ -71,17 +71,13 @@ class SwitchWorld(World):
         limit = self.silent * 1000 + slack
         return [node for node, one in self.switches.items() if self.silent and self.now > one.heard + limit]
 
-    def enable_guard(self) -> None:
-        super().enable_guard()
-        self._begin_again()
-
     def cut(self) -> None:
         self.trace("a switch sends bytes that are no message")
         self.say("by", b"", 3, whole=False)
-        self._begin_again()
+        self.begins_again()
 
-    def _begin_again(self) -> None:
-        self.fresh_from = self.now
+    def begins_again(self) -> None:
+        super().begins_again()
         self.switches.clear()
         self.ready.clear()
 
@@ -102,7 +98,7 @@ class EnableWorld(SwitchWorld):
         for node in (3,) if self.live or r.random() < 0.6 else (3, 4):
             self._device(node)
         if not self.live:
-            self.interrupt("hold restart switch cut", 0.4)
+            self.interrupt(0.4)
 
     def stands(self) -> bool:
         return self.live and self.now < 1500
@@ -216,7 +212,7 @@ class ModeWorld(SwitchWorld):
         for node in (3,) if self.live or r.random() < 0.5 else (3, 4):
             self._switch(node)
         if not self.live:
-            self.interrupt("hold restart switch cut", 0.35)
+            self.interrupt(0.35)
 
     def motion(self, speed: float, turning: float) -> Legs:
         if self.live or self.kind.startswith("ackermann"):

@@ -32,13 +32,20 @@ class Row:
     date: str
     commits: Mapping[str, int] = field(default_factory=dict)
     """The number of worlds that each commit of the rig ran."""
+    acts: Mapping[str, int] = field(default_factory=dict)
+    """The number of worlds by what happened to the guard (`ACTS`; empty: nothing). Older runs did not count it."""
 
     @property
     def next_seed(self) -> int:
         return self.first_seed + self.worlds
 
     def data(self) -> dict[str, Any]:
-        return {**vars(self), "violations": dict(self.violations), "commits": dict(self.commits)}
+        return {
+            **vars(self),
+            "violations": dict(self.violations),
+            "commits": dict(self.commits),
+            "acts": dict(self.acts),
+        }
 
 
 Rows = Mapping[str, Row]
@@ -69,6 +76,7 @@ def rows_of(summaries: Mapping[str, Summary], first_seed: int, commit: str, date
             dict(one.violations),
             date,
             {commit: one.worlds},
+            dict(one.acts),
         )
         for name, one in summaries.items()
     }
@@ -125,6 +133,7 @@ def _sum(name: str, one: Row, other: Row) -> Row:
         violations=_added(one.violations, other.violations),
         date=max(one.date, other.date),
         commits=_added(one.commits, other.commits),
+        acts=_added(one.acts, other.acts),
     )
 
 

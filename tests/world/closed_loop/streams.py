@@ -67,7 +67,7 @@ class DeadmanWorld(World):
         for driver in self.drivers.values():
             self._streams(driver)
         if not self.live:
-            self.interrupt("hold restart switch", 0.35)
+            self.interrupt(0.35)
 
     def _streams(self, driver: Driver) -> None:
         r = self.random
@@ -157,7 +157,7 @@ class SpeedWorld(World):
         )
         self.before: tuple[int, float, float] = (NEVER, 0.0, 0.0)
         self.live = r.random() < 0.2
-        self.interrupt("hold restart switch", 0 if self.live else 0.3)
+        self.interrupt(0 if self.live else 0.3)
         period = r.choice((10, 20, 50, 100, 300))
         legs = straight(0.9 * self.most, 0.0)
 
@@ -225,7 +225,7 @@ class SaneWorld(World):
         r = self.random
         self.kind = r.choice(VELOCITIES)
         self.guarded({})
-        self.interrupt("hold restart switch")
+        self.interrupt()
         self.whole = True
         self.every(lambda: r.choice((20, 100, 300)), self._send, first=50)
 
@@ -265,7 +265,7 @@ class RateWorld(World):
         self.kind = r.choice(VELOCITIES)
         self.interval, self.burst = round(r.uniform(0.02, 0.3), 3), r.choice((1, 2, 5))
         self.guarded({"interval": self.interval, "burst": self.burst})
-        self.interrupt("hold restart switch")
+        self.interrupt()
         self.motions: list[int] = []
         self.last: Legs = STILL
         self.every(lambda: r.choice((1, 5, 20, 100, 400, self.interval * 1100)), self._send, first=50)
@@ -329,7 +329,7 @@ class EvidenceWorld(World):
         self.drive(straight(self.steady) if self.random.random() > 0.03 else STILL)
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
-        if got is not None and self.moves(got) and not self._pardoned() and (why := self.fit()):
+        if got is not None and self.moves(got) and (why := self.fit()):
             self.broken(self.law(), f"a motion passes: {why}")
         if self.fit_since != NEVER and self.now > self.fit_since and self.moves(wanted):
             self.sent += 1
@@ -342,26 +342,12 @@ class EvidenceWorld(World):
         self.only_fresh()
         why = self.fit()
         self.unfit_from = (self.unfit_from if self.unfit_from != NEVER else self.now) if why else NEVER
-        if (
-            self.switched_off
-            or not why
-            or self._pardoned()
-            or self.now <= self.unfit_from + self.tick + SLACK
-        ):
+        if self.switched_off or not why or self.now <= self.unfit_from + self.tick + SLACK:
             return
         if self.fresh_from < self.force[0] < self.now and self.moves(self.force[1]):
             self.broken(self.law(), f"a motion stays in force: {why}")
 
     unfit_from = NEVER
-    enabled_at = NEVER
-
-    def enable_guard(self) -> None:
-        super().enable_guard()
-        self.enabled_at = self.now
-
-    def _pardoned(self) -> bool:
-        """Whether the guard, which saw nothing while it was disabled, may still believe an older measurement."""
-        return self.now <= self.enabled_at + 2000
 
     def ended(self) -> None:
         if self.got < 0.95 * self.sent:
@@ -390,9 +376,9 @@ class SensorWorld(EvidenceWorld):
         live = not self.alone and r.random() < 0.2
         self.fit_since = 1500 if live else NEVER
         if not live:
-            self.interrupt("hold restart switch")
             self.after(r.uniform(500, 4000), self._fail)
             self.with_second()
+            self.interrupt()
         period = r.uniform(15, min(200, self.silent * 800))
         self.every(
             lambda: -1 if self.fault == "dead" else period * r.uniform(0.7, 1),
@@ -406,8 +392,8 @@ class SensorWorld(EvidenceWorld):
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
 
-    def enable_guard(self) -> None:
-        super().enable_guard()
+    def begins_again(self) -> None:
+        super().begins_again()
         self.shown, self.repeated = [], 0  # the guard counts from its new beginning
 
     def forgets(self) -> None:
@@ -439,12 +425,11 @@ class SensorWorld(EvidenceWorld):
             self.say("by", values(self.by, self.now, numbers)[:14], whole=False)
             self.seeing, self.shown = False, []
             return
-        if self.second is not None and self.second.in_doubt:
-            self.shown = []  # the guard does not hear this sensor
         finite = sum(map(math.isfinite, numbers))
         same = repr(numbers) == repr(self.shown)
         self.repeated = self.repeated + 1 if same else 0
-        self.shown = numbers
+        hears = self.second is None or not self.second.in_doubt
+        self.shown = numbers if hears else []
         self.seeing, self.heard = finite > 0 and finite >= self.least * count, self.now
         self.say("by", values(self.by, self.now, numbers))
 
@@ -492,8 +477,8 @@ class ArmWorld(EvidenceWorld):
             self.every(lambda: period * r.uniform(0.5, 1), given, first=r.uniform(0, 400))
         self.every(lambda: r.uniform(100, 900), self._check, first=r.uniform(0, 500))
         if not live:
-            self.interrupt("hold restart switch")
             self.with_second()
+            self.interrupt()
             for _fault in range(2):
                 self.after(r.uniform(500, 6000), self._fail)
 
@@ -514,6 +499,10 @@ class ArmWorld(EvidenceWorld):
         )
         self.fault = self.random.choice(faults)
         self.trace(f"it fails: {self.fault}")
+
+    def begins_again(self) -> None:
+        super().begins_again()
+        self.battery = self.fix = self.check = (NEVER, False)
 
     def good(self, topic: str) -> bytes:
         if topic == "by":
@@ -584,9 +573,9 @@ class AgreeWorld(EvidenceWorld):
         live = not self.alone and r.random() < 0.2
         self.fit_since = 1500 if live else NEVER
         if not live:
-            self.interrupt("hold restart switch")
             self.after(r.uniform(1000, 4000), self._fail)
             self.with_second()
+            self.interrupt()
         for given, period in (("by", r.uniform(15, 80)), ("other", r.uniform(15, 80))):
             self._source(given, period)
 
@@ -595,6 +584,14 @@ class AgreeWorld(EvidenceWorld):
             ("x", "y", "turn", "opposite turn", "NaN", "dead", "dead by", "both NaN", "cut", "cut by")
         )
         self.trace(f"it fails: {self.fault}")
+        self.count = dict.fromkeys(self.count, 0)
+
+    def begins_again(self) -> None:
+        super().begins_again()
+        self.heard = dict.fromkeys(self.heard, NEVER)
+        self.forgets()
+
+    def forgets(self) -> None:
         self.count = dict.fromkeys(self.count, 0)
 
     def good(self, topic: str) -> bytes:
@@ -686,7 +683,7 @@ class EstopWorld(World):
             return
         for node in (5, 6) if self.hands or r.random() < 0.5 else (5,):
             self._resets(node)
-        self.interrupt("hold restart lost switch cut", 0.4)
+        self.interrupt(0.4)
 
     def _drives(self, node: int) -> None:
         r = self.random

@@ -6,7 +6,7 @@ from appliance.features.guards.presets import PRESETS
 from tests.support.examples import ALL
 from tests.support.rows import require_rows
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
-from tests.world.closed_loop.world import COMMAND
+from tests.world.closed_loop.world import ACTS, COMMAND
 from tests.world.closed_loop.worlds import (
     EACH_NODE,
     NOT_MODELLED,
@@ -46,6 +46,23 @@ def test_every_preset_has_a_world_or_a_reason() -> None:
     where = "WORLDS of tests/world/closed_loop/worlds.py, or to NOT_MODELLED there with the reason"
     require_rows(PRESETS, WORLDS.keys() | NOT_MODELLED.keys(), where)
     assert not WORLDS.keys() & NOT_MODELLED.keys()
+
+
+@pytest.mark.parametrize("preset", WORLDS)
+def test_each_act_happens_in_the_worlds_of_each_preset_or_has_a_reason(
+    preset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A world is only planned here, not run, so its guard is not compiled."""
+    kind = WORLDS[preset]
+    monkeypatch.setattr(kind, "guarded", lambda *_values: None)
+    planned: set[str] = set()
+    for seed in range(400):
+        world = kind(seed)
+        world.plan()
+        planned.add(world.planned_act)
+    observes = PRESETS[preset].given_topics.keys() - {COMMAND}
+    assert planned - {""} == set(ACTS) - kind.not_yet.keys() - (set() if observes else {"cut"})
+    assert all(kind.not_yet.values())
 
 
 ALONE = [

@@ -11,13 +11,15 @@ DIGESTS = {"rate": "r", "joints": "j"}
 
 
 def row(seed: int, commit: str = "c1", digest: str = "r", worlds: int = 300) -> Row:
-    return Row(digest, seed, worlds, 9, seed / 1000, {"L1": 1}, "2026-11-28", {commit: worlds})
+    broken, acts = {"L1": 1}, {"": worlds - 1, "hold": 1}
+    return Row(digest, seed, worlds, 9, seed / 1000, broken, "2026-11-28", {commit: worlds}, acts)
 
 
 def test_worlds_of_several_commits_are_added_and_counted_by_commit() -> None:
     runs = [{"rate": row(1600, "c2")}, {"rate": row(1000)}, {"rate": row(1300)}]
     rows, left_out = joined(runs, DIGESTS)
-    added = Row("r", 1000, 900, 27, 1.0, {"L1": 3}, "2026-11-28", {"c1": 600, "c2": 300})
+    commits, acts = {"c1": 600, "c2": 300}, {"": 897, "hold": 3}
+    added = Row("r", 1000, 900, 27, 1.0, {"L1": 3}, "2026-11-28", commits, acts)
     assert rows == {"rate": added} and not left_out
     assert parsed(as_data(rows)) == rows
     line = "900 worlds from seed 1000, 27 s, 3 broke a law, closest 100.0 cm"

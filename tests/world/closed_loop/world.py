@@ -33,6 +33,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
+from appliance.features.guards.presets import preset_named
 from tests.support.features.guards.running_guard import Change, Value, unchanged
 from tests.world.closed_loop.guard_run import Beside, RunningGuard, parameters_of
 from tests.world.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves, travels
@@ -41,6 +42,9 @@ NEVER = -(10**9)
 SECOND, COMMANDER = 7, 2
 """The node that publishes where another one is the source, and the one that takes over the commands."""
 COMMAND = "command"
+ACTS = ("hold", "restart", "lost", "switch", "cut")
+"""What operators and failures do to each guard: it is held and resumed; its process is replaced, and its state kept or
+lost; it is disabled and enabled; a source sends bytes that are not a message."""
 LAWS = ("L1", "L2", "L3", "L4", "L5", "L6", "live")
 SLACK = 30
 """Milliseconds that a guard has for an act: its timers run every 10 or 20 ms."""
@@ -62,6 +66,8 @@ class Report:
 
     seconds: float = 0.0
     clearance: float = float("inf")
+    act: str = ""
+    """The one of `ACTS` that happened, if any."""
     violations: list[Violation] = field(default_factory=list)
 
 
@@ -103,7 +109,7 @@ class World:
     foreign = False
     """Whether another node publishes good values on the sensor's topic."""
     not_yet: ClassVar[Mapping[str, str]] = {}
-    """Events that no world has yet, because the preset breaks a law at them, each with what is missing."""
+    """Acts that no world of the preset has, in all worlds or in some, each with the reason."""
 
     beside: "Companion | None" = None
     """A second guard of the same topic. It may stop what the first one lets pass."""
@@ -127,6 +133,8 @@ class World:
         self.second: Second | None = None
         self.commander = 1
         """The node that commands the base."""
+        self.planned_act = ""
+        """The one of `ACTS` that is to happen in this world, if any."""
         self._spoken: set[str] = set()
         """The topics on which the guard has heard the source since it began, so that it hears others."""
         self._known: set[str] = set()
@@ -287,6 +295,10 @@ class World:
         """Return a message on a topic of `one_source` that permits a motion."""
         raise NotImplementedError
 
+    def source_of(self, topic: str) -> int:
+        """Return the node that is the source of a topic of `one_source`."""
+        return 6
+
     def stops_for(self, topic: str) -> float:
         """Return the milliseconds for which a message of another node than the source stops the base."""
         return 1000
@@ -304,7 +316,7 @@ class World:
         return True
 
     def forgets(self) -> None:
-        """Note that the guard knows nothing any more, because of the bytes of another node than the source."""
+        """Note that the guard knows nothing any more, because of bytes that were not a message."""
 
     def with_second(self, part: float = 0.25) -> None:
         """Let, in a part of the worlds, another node publish beside a source, or take over the commands.
@@ -393,12 +405,31 @@ class World:
 
     # Acts of operators
 
-    def interrupt(self, kinds: str = "hold restart switch", part: float = 0.3) -> None:
-        """Plan, in a part of the worlds, one hold, restart or pause of the guard."""
-        ready = [kind for kind in kinds.split() if kind not in self.not_yet]
-        if self.random.random() < part and ready:
-            at = self.random.uniform(0.2, 0.7) * self.span
-            self.after(at, getattr(self, self.random.choice(ready)))
+    @classmethod
+    def acts(cls) -> tuple[str, ...]:
+        """Return what happens to the guard in worlds of this kind."""
+        observes = bool(preset_named(cls.preset).given_topics.keys() - {COMMAND})
+        return tuple(act for act in ACTS if act not in cls.not_yet and (observes or act != "cut"))
+
+    @classmethod
+    def left_out(cls) -> Mapping[str, str]:
+        """Return the acts that no world of this kind has, or only some, each with the reason."""
+        beside = {"lost beside a second node": "the next node is the source then"} if cls.one_source else {}
+        return {**beside, **cls.not_yet}
+
+    def ready_acts(self) -> list[str]:
+        """Return the acts that may happen in this world."""
+        return [act for act in self.acts() if act != "lost" or self.second is None]
+
+    def interrupt(self, part: float = 0.3) -> None:
+        """Plan, in a part of the worlds, one of `ACTS`."""
+        if self.random.random() < part:
+            self.planned_act = self.random.choice(self.ready_acts())
+            self.after(self.random.uniform(0.2, 0.7) * self.span, self._act)
+
+    def _act(self) -> None:
+        self.report.act = self.planned_act
+        getattr(self, self.planned_act)()
 
     def hold(self) -> None:
         self.trace("the guard holds")
@@ -427,6 +458,21 @@ class World:
         self.trace("the guard is enabled")
         self.switched_off = False
         self.guard.switch(self.now, enabled=True)
+        self.begins_again()
+
+    def lost(self) -> None:
+        self.trace("the process is replaced, and the state of the guard is lost")
+        self.guard.restart(self.now, lost=True)
+        self.begins_again()
+
+    def cut(self) -> None:
+        self.trace("the source sends bytes that are no message")
+        topic = self.random.choice([*self.one_source])
+        self.say(topic, b"", self.source_of(topic), whole=False)
+        self.forgets()
+
+    def begins_again(self) -> None:
+        """Note that the guard begins again, and knows nothing."""
         self.fresh_from = self.now
         self._forget_second()
 

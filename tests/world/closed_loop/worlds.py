@@ -90,6 +90,8 @@ class Summary:
     """The smallest distance, in metres, of a moving base to what it moves towards, or to its fence."""
     cost: float = 0.0
     """Seconds of the processor."""
+    acts: Counter[str] = field(default_factory=Counter)
+    """Worlds by what happened to the guard; an empty text: nothing."""
     violations: Counter[str] = field(default_factory=Counter)
     """Worlds that broke a law, by law."""
     broken: list[tuple[int, str]] = field(default_factory=list)
@@ -98,6 +100,7 @@ class Summary:
     def add(self, seed: int, report: Report) -> None:
         self.worlds += 1
         self.seconds += report.seconds
+        self.acts[report.act] += 1
         self.clearance = min(self.clearance, report.clearance)
         for one in report.violations:
             self.violations[one.law] += 1
@@ -108,6 +111,7 @@ class Summary:
         self.seconds += other.seconds
         self.cost += other.cost
         self.clearance = min(self.clearance, other.clearance)
+        self.acts += other.acts
         self.violations += other.violations
         self.broken += other.broken
 

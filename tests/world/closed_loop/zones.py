@@ -73,7 +73,7 @@ class ZoneWorld(SeparationWorld):
         if r.random() < 0.4:
             self.after(r.uniform(300, 6000), self._fail)
         self.with_second()
-        self.interrupt("hold restart switch", 0.25)
+        self.interrupt(0.25)
 
     def _square(self) -> str:
         far = round(self.half, 2)
@@ -110,6 +110,9 @@ class ZoneWorld(SeparationWorld):
 
     def good(self, topic: str) -> bytes:
         return boolean(self.random.random() < 0.8) if topic == "mute" else super().good(topic)
+
+    def source_of(self, topic: str) -> int:
+        return 6 if topic == "mute" else super().source_of(topic)
 
     def counts(self, topic: str) -> bool:
         return topic != "mute"
@@ -185,10 +188,9 @@ class ZoneWorld(SeparationWorld):
         if node not in self.ready and not self.slow:
             self.broken("L6", "a motion passes of a node that has not stood since the last stop")
 
-    def enable_guard(self) -> None:
-        super().enable_guard()
+    def begins_again(self) -> None:
+        super().begins_again()
         self.ready.clear()
-        self.heard, self.blind_from = -1, None
 
     def _follow(self, person: Person) -> None:
         """Every direction is in the zone, so no person steps into the way beside it."""
@@ -197,7 +199,7 @@ class ZoneWorld(SeparationWorld):
         self.only_fresh()
         if self.muted or self.switched_off or self.now <= self.fresh_from + 100 + SLACK:
             return
-        if not self.slow and self.muted_until == NEVER and self.fresh_from == 0:
-            self._touch()
+        if not self.slow and self.muted_until == NEVER:
+            self.harm()
         if self._fast(self.force[1]):
             self.evidence(self.silent)
