@@ -229,6 +229,8 @@ def main() -> int:
     arguments = parser.parse_args()
     lane, first = arguments.lane, arguments.first
     open_folders_above(ROOT)
+    for end in (signal.SIGINT, signal.SIGTERM):  # a script's background process ignores SIGINT
+        signal.signal(end, lambda number, _frame: sys.exit(128 + number))
     FOLDER.mkdir(parents=True, exist_ok=True)
     results, steps = _earlier(_commit()), steps_of(lane)
     for step in steps:
