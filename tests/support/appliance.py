@@ -8,7 +8,7 @@ import ssl
 import subprocess
 import tempfile
 import urllib.parse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -57,7 +57,6 @@ class Appliance:
         self.relays = relays
         self.host: Host = host or ThisMachine()
         self.isolation = isolation or ("none" if isinstance(self.host, ThisMachine) else "container")
-        self.options = options
         self.json = json
         # pytest's folder is closed to the users that the appliance's processes run as
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-test-"))
@@ -65,22 +64,25 @@ class Appliance:
         self.state = self.directory / "state"
         self.policy_file = self.directory / "policy.ini"
         self.policy_file.write_text(policy)
-        if settings:
-            file = self.directory / "appliance.yaml"
-            file.write_text(settings)
-            self.options = ("--config", str(file), *self.options)
-        if monitors is not None:
-            folder = self.directory / "monitors"
-            folder.mkdir()
-            for name, text in monitors.items():
-                (folder / f"{name}.rv").write_text(text)
-            self.options = ("--monitors", str(folder), *self.options)
+        self.options = (*self._options_of_files(settings, monitors), *options)
         self.process: Process | None = None
         self.ready: Event = {}
         self.token = ""  # the first token, printed at the first start
         self._looked_at = 0  # the last record that `audit` leaves out
         self._turn = contextlib.ExitStack()  # with isolation netns: until it is closed
         self._has_turn = False
+
+    def _options_of_files(self, settings: str, monitors: Mapping[str, str] | None) -> Iterator[str]:
+        if settings:
+            file = self.directory / "appliance.yaml"
+            file.write_text(settings)
+            yield from ("--config", str(file))
+        if monitors is not None:
+            folder = self.directory / "monitors"
+            folder.mkdir()
+            for name, text in monitors.items():
+                (folder / f"{name}.rv").write_text(text)
+            yield from ("--monitors", str(folder))
 
     @property
     def master_uri(self) -> str:

@@ -5,7 +5,6 @@ Models of everything else record their calls, and give the answers that a test s
 
 import asyncio
 import contextlib
-import functools
 import ipaddress
 import itertools
 from collections.abc import Callable, Iterable
@@ -41,8 +40,8 @@ from roswire.uris import node_uri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
 from tests.support.core import FakeTrail
 from tests.support.idle import idle
+from tests.support.master_api import MasterApi
 from tests.support.parameters import mirror, put
-from tests.support.serving import serving
 
 HOST = ipaddress.ip_address("10.0.0.5")
 POLICY = "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}default=*\n[Commands]\ndefault=*\n"
@@ -453,8 +452,7 @@ class ControlParts:
         )
 
     def _connect_calls(self, rights: ParameterRights) -> None:
-        self._serving = functools.partial(
-            serving,
+        self._api = MasterApi(
             policy=lambda: self.current,
             registry=self.registry,
             graph=self.graph,
@@ -464,7 +462,6 @@ class ControlParts:
             mirror=self.parameters,
             trail=self.records,
             rights=rights,
-            faces=self.faces,
             arrivals=self.arrivals(),
             relay=self.relay,
             addresses=self.addresses,
@@ -472,7 +469,7 @@ class ControlParts:
             nodes=self.nodes,
             redecide_for=self.enforcement.redecide_for,
         )
-        self._serve = self._serving()
+        self._serve = self._api.handler()
 
     def surround(self) -> None: ...
 
@@ -505,7 +502,7 @@ class ControlParts:
     ) -> Value:
         """Make a call: of RVMaster, of the node `target`, or by the appliance's own node (`own`)."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
-        serve = self._serving(own=own, target=target) if own or target is not None else self._serve
+        serve = self._api.handler(own=own, target=target) if own or target is not None else self._serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "4001") -> None:

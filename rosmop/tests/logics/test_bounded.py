@@ -26,6 +26,7 @@ PRINTER = Printer(
 OVER = 10**6
 
 Truth = bool | None
+At = Callable[[int, int], Truth]
 
 
 def least(values: list[Truth]) -> Truth:
@@ -40,37 +41,50 @@ def negated(value: Truth) -> Truth:
     return None if value is None else not value
 
 
-def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0911, PLR0912  # one per operator
+def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:
+    """Return the truth at the event `i`, or None if it depends on what comes later than `passed`."""
     operator, *rest = tree
-    low, high = 0, OVER
-    if operator in (*PAST, *FUTURE):
-        low, high = rest.pop()
-        high = OVER if high is None else high
+    bounds = rest.pop() if operator in (*PAST, *FUTURE) else (0, OVER)
 
     def at(operand: int, j: int) -> Truth:
         return worth(rest[operand], trace, j, passed)
 
-    def near(j: int) -> bool:
-        return low <= abs(trace[j][0] - trace[i][0]) <= high
+    if operator == "event":
+        return bool(trace[i][1] == rest[0])
+    if operator in PAST:
+        return of_the_past(operator, at, near(trace, i, bounds), i)
+    if operator in FUTURE:
+        high = OVER if bounds[1] is None else bounds[1]
+        open_still: Truth = None if trace[i][0] + high > passed else False
+        return of_the_future(operator, at, near(trace, i, bounds), range(i, len(trace)), open_still)
+    return of_now(operator, [at(operand, i) for operand in range(len(rest))])
 
-    open_still: Truth = None if trace[i][0] + high > passed else False
-    past, future = range(i + 1), range(i, len(trace))
-    match operator:
-        case "event":
-            return bool(trace[i][1] == rest[0])
-        case "true" | "false":
-            return bool(operator == "true")
-        case "not":
-            return negated(at(0, i))
-        case "and":
-            return least([at(0, i), at(1, i)])
-        case "or":
-            return most([at(0, i), at(1, i)])
-        case "implies":
-            return most([negated(at(0, i)), at(1, i)])
-        case "xor" | "iff":
-            left, right = at(0, i), at(1, i)
+
+def near(trace: Timed, i: int, bounds: tuple[int, int | None]) -> Callable[[int], bool]:
+    low, high = bounds
+    return lambda j: low <= abs(trace[j][0] - trace[i][0]) <= (OVER if high is None else high)
+
+
+def of_now(operator: str, values: list[Truth]) -> Truth:
+    match operator, values:
+        case (("true" | "false"), []):
+            return operator == "true"
+        case "not", [value]:
+            return negated(value)
+        case "and", _:
+            return least(values)
+        case "or", _:
+            return most(values)
+        case "implies", [left, right]:
+            return most([negated(left), right])
+        case (("xor" | "iff"), [left, right]):
             return None if left is None or right is None else (left != right) is (operator == "xor")
+    raise AssertionError(operator)
+
+
+def of_the_past(operator: str, at: At, near: Callable[[int], bool], i: int) -> Truth:
+    past = range(i + 1)
+    match operator:
         case "previously":
             return at(0, i - 1) if i > 0 and near(i - 1) else False
         case "once":
@@ -81,8 +95,16 @@ def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0
             return most(
                 [least([at(1, j), *(at(0, k) for k in range(j + 1, i + 1))]) for j in past if near(j)]
             )
+    raise AssertionError(operator)
+
+
+def of_the_future(
+    operator: str, at: At, near: Callable[[int], bool], future: range, open_still: Truth
+) -> Truth:
+    i = future.start
+    match operator:
         case "next":
-            return open_still if i + 1 == len(trace) else at(0, i + 1) if near(i + 1) else False
+            return open_still if i + 1 == future.stop else at(0, i + 1) if near(i + 1) else False
         case "eventually":
             return most([open_still, *(at(0, j) for j in future if near(j))])
         case "always":

@@ -38,6 +38,12 @@ STEPS = (
     "to lease", "to control", "restart", "settle", "settle", "away", "back", "back",
 )  # fmt: skip
 
+STORIES = {
+    "settle": ("time", "witness", "answer", "witness", "answer", "all to control", "report", "all to lease"),
+    "away": ("disconnect", "change", "settle", "settle", "settle"),
+    "back": ("connect", "ship", "acknowledge", "report", "to lease"),
+}
+
 
 class Feed:
     size = 0
@@ -97,7 +103,14 @@ class Pair:
         self.lease.control_linked()
         self.control.begin()
 
-    def step(self, name: str) -> None:  # noqa: PLR0912  a branch for each thing that can happen
+    def step(self, name: str) -> None:
+        """Do what has the name, if it can happen now, or all steps of a story."""
+        for each in STORIES.get(name, ()):
+            self.step(each)
+        self._change(name)
+        self._deliver(name)
+
+    def _change(self, name: str) -> None:
         sender: Any = self.control.sender
         match name:
             case "change":
@@ -114,6 +127,11 @@ class Pair:
                 self.acknowledgements.append(self.standby)
             case "acknowledge" if self.acknowledgements:
                 sender.take(Stored(2, self.database.history, self.acknowledgements.popleft()))
+            case "restart":
+                self.start_control(taken_over=False)
+
+    def _deliver(self, name: str) -> None:
+        match name:
             case "time":
                 self.machine.advance(0.31)
                 self.lease.tick()
@@ -127,28 +145,14 @@ class Pair:
                 self.answers.popleft()
             case "report":
                 self.control.report()
-            case "to lease" if self.to_lease:
+            case "to lease" | "all to lease" if self.to_lease:
                 self.lease.control_said(self.to_lease.popleft())
-            case "to control" if self.to_control:
+                self.step(name if name == "all to lease" else "")
+            case "to control" | "all to control" if self.to_control:
                 message = self.to_control.popleft()
                 if isinstance(message, lease_link.LeaseState):
                     self.client.heard(message)
-            case "restart":
-                self.start_control(taken_over=False)
-            case "settle":
-                for each in ("time", "witness", "answer", "witness", "answer"):
-                    self.step(each)
-                while self.to_control:
-                    self.step("to control")
-                self.step("report")
-                while self.to_lease:
-                    self.step("to lease")
-            case "away":
-                for each in ("disconnect", "change", "settle", "settle", "settle"):
-                    self.step(each)
-            case "back":
-                for each in ("connect", "ship", "acknowledge", "report", "to lease"):
-                    self.step(each)
+                self.step(name if name == "all to control" else "")
 
     async def _answer(self, number: int) -> None:
         await self.control.stored()

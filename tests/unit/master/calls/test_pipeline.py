@@ -23,8 +23,8 @@ from roswire.xmlrpc import Value, build_call, parse_response
 from tests.support.control_parts import Records
 from tests.support.examples import examples
 from tests.support.idle import idle
+from tests.support.master_api import MasterApi
 from tests.support.parameters import mirror, put
-from tests.support.serving import serving
 
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
@@ -76,7 +76,7 @@ class Site:
         self.go.set()
         self.faults: set[str] = set()  # keys that the ROS master answers with a fault
         self.dies_at = ""  # the key whose request kills the ROS master
-        self.serve = serving(
+        self.serve = MasterApi(
             policy=lambda: self.policy,
             registry=self.registry,
             graph=idle(RosGraph),
@@ -88,7 +88,7 @@ class Site:
             rights=ParameterRights(lambda: self.policy, cast(Any, self.trail)),
             addresses=self,
             offload=OFFLOAD,
-        )
+        ).handler()
 
     async def learn(self, _peer: Peer) -> None: ...
 
