@@ -2,7 +2,7 @@
 
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.blocks.orders import BlockOrders
+from appliance.features.blocks.orders import BlockOrders, is_own
 from appliance.features.blocks.requests import HostBlock, HostBlocks, HostUnblock
 
 
@@ -22,6 +22,7 @@ async def begin(core: Core) -> ControlPart:
         remotes=lambda: {name: seen.remote for name, seen in core.hosts.tunnels.seen.items()},
         uses=core.hosts.blocks.uses.of,
         carried_out=core.relay.carried_out,
+        is_own=is_own,
     )
     return ControlPart(
         (

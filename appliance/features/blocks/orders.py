@@ -62,8 +62,10 @@ class BlockOrders:
         remotes: Callable[[], Mapping[str, str]],  # outer addresses of hosts in tunnels, by name
         uses: Callable[[Address], list[str]],  # besides registrations, connections and tunnels
         carried_out: Callable[[], Awaitable[None]],
+        is_own: Callable[[Address], bool],  # whether this machine has the address
     ) -> None:
         self._uses = uses
+        self._is_own = is_own
         self._blocks = blocks
         self._policies = policies
         self._store = store
@@ -82,7 +84,7 @@ class BlockOrders:
         address = self._address(request.address)
         _require_sensible(request)
         if str(address) not in self._enrolled().values():
-            _require_possible(address)
+            self._require_possible(address)
         before = self._held_by(address)
         if not request.force:
             self._require_not_the_robot(address, before)
@@ -194,6 +196,14 @@ class BlockOrders:
             raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
         return plain_address(str(networks[0].network_address))
 
+    def _require_possible(self, address: Address) -> None:
+        if address.is_unspecified or address.is_multicast or str(address) == "255.255.255.255":
+            raise HostRefusedError(f"{address} cannot be the address of a host")
+        if address.is_loopback or self._is_own(address):
+            raise HostRefusedError(
+                f"{address} is the appliance's own address: its own calls come from there, so it cannot be blocked"
+            )
+
     def _require_not_the_robot(self, address: Address, held: requests.BlockEnded) -> None:
         own, whole = _registrations_of(held), self._registrations()
         if any(address in network for network in self._policies.current.robot):
@@ -247,15 +257,6 @@ class BlockOrders:
         )
 
 
-def _require_possible(address: Address) -> None:
-    if address.is_unspecified or address.is_multicast or str(address) == "255.255.255.255":
-        raise HostRefusedError(f"{address} cannot be the address of a host")
-    if address.is_loopback or _is_own(address):
-        raise HostRefusedError(
-            f"{address} is the appliance's own address: its own calls come from there, so it cannot be blocked"
-        )
-
-
 def _require_sensible(request: HostBlock) -> None:
     seconds = request.for_seconds
     if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
@@ -267,7 +268,8 @@ def _require_sensible(request: HostBlock) -> None:
         raise SenselessError(f"a note has at most {_LONGEST_NOTE} characters, all of them printable")
 
 
-def _is_own(address: Address) -> bool:
+def is_own(address: Address) -> bool:
+    """Return whether this machine has the address."""
     family = socket.AF_INET if address.version == 4 else socket.AF_INET6
     with socket.socket(family, socket.SOCK_DGRAM) as sock:
         try:

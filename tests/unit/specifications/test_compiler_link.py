@@ -1,5 +1,4 @@
 import asyncio
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,15 +8,15 @@ import pytest
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.specifications import compiler_link as module
 from appliance.specifications.compiled_store import CompiledStore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
+from tests.support.memory_channel import memory_link
 
 SOURCES = Sources({"a.rv": "text"})
 FOUND = messages.Contents({"a": "a.rv"})
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 class Scene:
@@ -32,15 +31,14 @@ class Scene:
         asyncio.get_running_loop().call_soon(self.come)
 
     def come(self) -> None:
-        ours, theirs = socket.socketpair()
-        channel = Channel(theirs, messages.CompilerLink)
+        ours, channel = memory_link(messages.CompilerLink)
         self._channels.append(channel)
         channel.attach(
             asyncio.get_running_loop(),
             lambda message, _descriptors: self._acts.pop(0)(channel, message),
             channel.close,
         )
-        self.compiler.attach(Channel(ours, messages.CompilerLink))
+        self.compiler.attach(ours)
 
     def close(self) -> None:
         for channel in self._channels:
@@ -59,7 +57,6 @@ def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:
     channel.close()
 
 
-@pytest.mark.nightly
 async def test_the_compiler_is_started_for_the_first_question() -> None:
     scene = Scene(finds, refuses, finds)
     assert (await scene.compiler.check(Sources(), ())).monitors == {}
@@ -72,7 +69,6 @@ async def test_the_compiler_is_started_for_the_first_question() -> None:
     scene.close()
 
 
-@pytest.mark.nightly
 async def test_a_compiler_that_just_ended_is_replaced() -> None:
     scene = Scene(dies, finds)
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
@@ -80,7 +76,6 @@ async def test_a_compiler_that_just_ended_is_replaced() -> None:
     scene.close()
 
 
-@pytest.mark.nightly
 async def test_only_texts_that_crash_it_are_refused() -> None:
     scene = Scene(dies, dies, finds)
     with pytest.raises(SpecificationsRefusedError, match="the compiler exited while it read them"):
@@ -89,12 +84,7 @@ async def test_only_texts_that_crash_it_are_refused() -> None:
     scene.close()
 
 
-@pytest.mark.nightly
-async def test_a_silent_or_missing_compiler_is_not_waited_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(module, "_WORK_SECONDS", 0.05)
-    monkeypatch.setattr(module, "_START_SECONDS", 0.05)
+async def test_a_silent_or_missing_compiler_is_not_waited_for() -> None:
     scene = Scene(lambda _channel, _wanted: None)
     with pytest.raises(SpecificationsRefusedError, match="the compiler does not answer"):
         await scene.compiler.check(SOURCES, ())
@@ -152,8 +142,7 @@ async def test_a_dry_run_begins_after_earlier_orders_and_dry_runs() -> None:
     scene.close()
 
 
-async def test_a_compilation_ends_when_its_order_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
+async def test_a_compilation_ends_when_its_order_is_withdrawn() -> None:
     heard: asyncio.Queue[Any] = asyncio.Queue()
     scene = Scene(lambda _channel, wanted: heard.put_nowait(wanted), finds)
     gone = False

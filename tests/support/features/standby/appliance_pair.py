@@ -1,5 +1,4 @@
 import asyncio
-import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractContextManager, asynccontextmanager
 from pathlib import Path
@@ -10,15 +9,15 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.base.clock import now, using
 from appliance.channel import messages
-from appliance.channel.channel import Channel
 from appliance.control.links.signer_requests import SignerRequests
 from appliance.features.standby.takeover_record import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import decision
+from tests.support.autojump import run
 from tests.support.engines import InlineDatabase, open_log
+from tests.support.memory_channel import memory_link
 from tests.support.virtual_clock import VirtualClock
-from tests.support.waiting import eventually
 
 SECOND = 1_000_000_000
 BEGAN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
@@ -54,10 +53,9 @@ class Member:
             checkpoint_every=1_000_000,
             checkpoint_seconds=1e6,
         )
-        ours, theirs = socket.socketpair()
-        self._signer = Channel(theirs, messages.SignerLink)
+        ours, self._signer = memory_link(messages.SignerLink)
         self._signer.attach(asyncio.get_running_loop(), self._sign, lambda: None, lambda _reason: None)
-        requests.attach(Channel(ours, messages.SignerLink))
+        requests.attach(ours)
         self._requests = requests
         self.store = StateStore(self.state / "control", failed=lambda _reason: None, kind=InlineDatabase)
         trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
@@ -106,9 +104,8 @@ class Member:
     async def sealed(self) -> None:
         assert await self.log.wait_signed() is None
         newest = newest_checkpoint(self.path)
-        await asyncio.to_thread(
-            eventually, lambda: self.replicated() == newest, "the checkpoint is replicated"
-        )
+        while self.replicated() != newest:
+            await asyncio.sleep(0.01)
 
     def replicated(self) -> SignedCheckpoint | None:
         text = self.store.settings().get(f"audit checkpoint of {self.name}")
@@ -140,7 +137,7 @@ def play(folder: Path, story: Story) -> tuple[Member, Member]:
             a.close()
             b.close()
 
-    asyncio.run(tell())
+    run(tell())
     return a, b
 
 

@@ -1,7 +1,6 @@
 import asyncio
 import contextlib
 import ipaddress
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -9,13 +8,13 @@ from typing import Any, cast
 import pytest
 
 from appliance.base.age_clock import AgeClock
-from appliance.base.clock import using
+from appliance.base.clock import using, wall
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.blocks.orders import BlockOrders
+from appliance.features.blocks.orders import BlockOrders, is_own
 from appliance.features.blocks.requests import (
     BlockEnded,
     HostBlock,
@@ -35,8 +34,8 @@ from tests.support.control_parts import OPEN, ControlParts
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
-NODE, ROBOT, OTHER = "10.0.0.5", "10.0.0.1", "10.0.0.7"
+pytestmark = pytest.mark.anyio
+NODE, ROBOT, OTHER, OURS = "10.0.0.5", "10.0.0.1", "10.0.0.7", "10.0.0.2"
 SECOND = 1_000_000_000
 
 
@@ -87,7 +86,7 @@ class Control(ControlParts):
         self.orders = BlockOrders(
             self.blocks, self.policies, self.state, cast(Any, self.records), self.ends, live=self.revocation.live,
             connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes,
-            uses=lambda _host: self.uses, carried_out=at_once,
+            uses=lambda _host: self.uses, carried_out=at_once, is_own=lambda address: str(address) == OURS,
         )  # fmt: skip
 
     def advance(self, seconds: float) -> None:
@@ -235,7 +234,7 @@ async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path
         [row] = (await made.orders.listed(HostBlocks())).blocks
         assert (row.address, row.note) == (NODE, "a")
         assert row.until is not None
-        assert abs(row.until - (time.time() + 3539)) < 30
+        assert abs(row.until - (wall() + 3539)) < 30
     async with control(tmp_path, clock) as made:
         assert await made.blocked() == [NODE]
 
@@ -286,7 +285,7 @@ async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> Non
     ("text", "reason"),
     [
         ("127.0.0.1", "own address"), ("127.1.2.3", "own address"), ("::1", "own address"),
-        ("::ffff:127.0.0.1", "own address"), ("0.0.0.0", "cannot be"), ("::", "cannot be"),
+        ("::ffff:127.0.0.1", "own address"), (OURS, "own address"), ("0.0.0.0", "cannot be"), ("::", "cannot be"),
         ("255.255.255.255", "cannot be"), ("224.0.0.1", "cannot be"), ("ff02::1", "cannot be"),
     ],
 )  # fmt: skip
@@ -294,6 +293,12 @@ async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str,
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(HostRefusedError, match=reason):
             await made.block(text, force=True)
+
+
+@pytest.mark.nightly
+def test_own_addresses_are_those_that_a_socket_can_have() -> None:
+    addresses = ("127.0.0.1", "192.0.2.1", "2001:db8::1")
+    assert [is_own(ipaddress.ip_address(one)) for one in addresses] == [True, False, False]
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, 0.5, 365 * 86_400 + 1, float("nan"), float("inf")])

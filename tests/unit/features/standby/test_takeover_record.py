@@ -11,9 +11,11 @@ from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from tests.support.features.standby.appliance_pair import Member, World, play
-from tests.support.waiting import eventually
 
-pytestmark = pytest.mark.nightly
+
+async def until(condition: Callable[[], object]) -> None:
+    while not condition():
+        await asyncio.sleep(0.01)
 
 
 def records(member: Member, event: str) -> list[dict[str, Any]]:
@@ -153,11 +155,7 @@ def test_the_takeover_is_sealed_and_replicated_at_once(tmp_path: Path) -> None:
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1, sealed=False):
             ((place),) = [one.sequence for one in search(a.path, Filter(event="took over")).entries]
-            await asyncio.to_thread(
-                eventually,
-                lambda: (kept := a.replicated()) and kept.sequence >= place,
-                "the takeover is sealed",
-            )
+            await until(lambda: (kept := a.replicated()) and kept.sequence >= place)
 
     after(tmp_path, story)
 
@@ -183,9 +181,7 @@ def test_an_earlier_checkpoint_is_replicated_at_the_start(tmp_path: Path) -> Non
         signed.append(first)
         a.silence()
         async with a.active(1, sealed=False):
-            await asyncio.to_thread(
-                eventually, lambda: a.replicated() == first, "the first one is replicated"
-            )
+            await until(lambda: a.replicated() == first)
 
     a, _b = after(tmp_path, story)
     assert newest_checkpoint(a.path) == signed[0]  # those after it have no signature
@@ -212,13 +208,9 @@ def test_a_log_that_cannot_be_read_does_not_end_the_replication(tmp_path: Path) 
             with structlog.testing.capture_logs() as printed:
                 a.path.rename(a.path.with_name("away"))
                 a.signed.set()
-                await asyncio.to_thread(
-                    eventually,
-                    lambda: [one for one in printed if "not replicated" in one["event"]],
-                    "an error",
-                )
+                await until(lambda: [one for one in printed if "not replicated" in one["event"]])
                 a.path.with_name("away").rename(a.path)
-            await asyncio.to_thread(eventually, lambda: a.log.failed is None, "the log is written")
+            await until(lambda: a.log.failed is None)
             await a.decide(2, 1)
             await a.sealed()
 

@@ -28,8 +28,6 @@ from tests.support.features.standby.appliance_pair import Member, Story, World, 
 from tests.support.features.standby.standby_site import memberships
 from tests.support.forgery import write_anew
 
-pytestmark = pytest.mark.nightly
-
 # ruff: noqa: S608  the attacker's statements are built from fixed words
 
 Kind = TakeoverFindingKind

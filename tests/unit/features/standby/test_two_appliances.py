@@ -20,7 +20,7 @@ from tests.support.engines import InlineDatabase
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 FIRST, SECOND = "10.0.0.2", "10.0.0.3"
 PIN = "sha256//" + 43 * "A" + "="
