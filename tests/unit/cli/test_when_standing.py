@@ -9,11 +9,12 @@ from appliance.channel.admin import AdminAnswer, AdminRequest, answer_to, verb_o
 from appliance.channel.operations import REQUESTS
 from appliance.channel.rest_operation import rows
 from appliance.cli.connection.admin_client import AdminSocket
-from appliance.features.guards.presets import PRESETS
 from tests.support.answers import example
 from tests.support.command import commands, rosrv
 from tests.support.rows import require_rows
+from tests.support.sources import ROOT
 
+DEADMAN = (ROOT / "monitors/guards/deadman.rv").read_text(encoding="utf-8")
 WAITS = {
     "policy load": ("policy enforce",),  # `policy grant --load` only adds a right
     "policy reload": ("policy reload",),
@@ -98,7 +99,7 @@ _CALLS = {
 _ANSWERS: dict[str, dict[str, Any]] = {
     "monitors": {
         "monitors": [{"name": "deadman", "file": "deadman.rv"}],
-        "files": {"deadman.rv": PRESETS["deadman"].text},
+        "files": {"deadman.rv": DEADMAN},
     },
     "status": {"bundles": {"for_order": "site-a/arms/2.tar"}},
 }
@@ -139,7 +140,7 @@ def test_no_order_is_given_while_the_robot_is_not_known_to_stand(
     verb: str, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("zone.rv").write_text(PRESETS["deadman"].text)
+    Path("zone.rv").write_text(DEADMAN)
     given = {order for order, verbs in WAITS.items() if verb in verbs}
     call = (*verb.split(), *_CALLS[verb], "--state", str(tmp_path))
     rosrv(*call)

@@ -33,7 +33,10 @@ class Row:
     commits: Mapping[str, int] = field(default_factory=dict)
     """The number of worlds that each commit of the rig ran."""
     acts: Mapping[str, int] = field(default_factory=dict)
-    """The number of worlds by what happened to the guard (`ACTS`; empty: nothing). Older runs did not count it."""
+    """The number of worlds by what happened to the guard (`ACTS`, or an empty text for nothing).
+
+    Older runs did not count it.
+    """
 
     @property
     def next_seed(self) -> int:

@@ -43,8 +43,8 @@ SECOND, COMMANDER = 7, 2
 """The node that publishes where another one is the source, and the one that takes over the commands."""
 COMMAND = "command"
 ACTS = ("hold", "restart", "lost", "switch", "cut")
-"""What operators and failures do to each guard: it is held and resumed; its process is replaced, and its state kept or
-lost; it is disabled and enabled; a source sends bytes that are not a message."""
+"""The acts of operators and failures on each guard: it is held and resumed; its process is replaced, and its state kept
+or lost; it is disabled and enabled; a source sends bytes that are not a message."""
 LAWS = ("L1", "L2", "L3", "L4", "L5", "L6", "live")
 SLACK = 30
 """Milliseconds that a guard has for an act: its timers run every 10 or 20 ms."""
