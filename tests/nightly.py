@@ -59,20 +59,28 @@ LANES = {
 
 @dataclass(frozen=True)
 class Stage:
-    """Tests that run side by side on `workers` of pytest-xdist, or one after the other."""
+    """Tests that run side by side on `workers` of pytest-xdist, or one after the other.
+
+    The tests of a file share a worker, and what the file makes for all of them, unless `spread`.
+    """
 
     name: str
     folders: tuple[str, ...]
     workers: str = ""
+    spread: bool = False
 
     def options(self) -> list[str]:
-        return ["-n", self.workers, "--dist", "loadfile", "--no-loadscope-reorder"] if self.workers else []
+        distribution = ("load",) if self.spread else ("loadfile", "--no-loadscope-reorder")
+        return ["-n", self.workers, "--dist", *distribution] if self.workers else []
 
 
 # A worker has no network but a loopback of its own, so tests that fetch packages run without workers, as do those that
 # start many processes themselves.
 STAGES = (
-    Stage("computing", ("tests/unit", "tests/world", "rosmop/tests", "tests/proofs"), "logical"),
+    Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical"),
+    Stage(
+        "worlds", ("tests/world",), "logical", spread=True
+    ),  # a file of them computes for more than an hour
     Stage("nodes", ("tests/integration",), "auto"),
     Stage(
         "machine",

@@ -62,6 +62,12 @@ def test_every_test_file_runs_at_night_in_one_stage() -> None:
     assert {lane_of(file) for file in files} == {"core", *LANES}
 
 
+def test_the_worlds_of_a_file_are_spread_over_the_workers() -> None:
+    """On one worker, those of tests/world/closed_loop would take longer than a stage may."""
+    [worlds] = (stage for stage in STAGES if "tests/world" in stage.folders)
+    assert worlds.options() == ["-n", "logical", "--dist", "load"]
+
+
 def test_a_lane_has_the_stages_of_its_tests() -> None:
     assert steps_of("all") == [*STEPS]
     assert steps_of("console") == ["machine", "namespaces"]
