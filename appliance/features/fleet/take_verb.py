@@ -19,7 +19,7 @@ def take(appliance: Appliance, *, when_standing: WhenStanding = False, within: W
 
     With --when-standing, the bundle comes into force only if the robot stands. `rosrv status` shows the result.
 
-    Example: sudo rosrv fleet take --when-standing --within 600
+    Example: sudo rosrv fleet take --when-standing --within 10m
     """
     state: BundlesState | None = asdict(appliance.ask_or_exit(StatusWanted())).get("bundles")
     if state is None or not state.for_order:
