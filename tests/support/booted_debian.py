@@ -52,6 +52,16 @@ except ConnectionRefusedError:
 except TimeoutError:
     print("held")
 """
+_MASTER = f"""
+import http.client, xmlrpc.client
+link = http.client.HTTPConnection("{ROBOT}", 11311, timeout=1)
+try:
+    link.request("POST", "/RPC2", xmlrpc.client.dumps(("/visitor",), "getPid"), {{"Content-Type": "text/xml"}})
+    server = link.getresponse().headers.get("Server", "")
+    print("rosmaster" if "BaseHTTP" in server else "RVMaster")
+except (OSError, http.client.HTTPException):
+    print("")
+"""
 
 
 class BootedDebian:
@@ -128,6 +138,10 @@ class BootedDebian:
         """Return how another machine finds port 11311: `open`, `refused` or `held`."""
         return self.run("ip", "netns", "exec", "visitor", "python3", "-c", _REACHES)
 
+    def master_of_visitor(self) -> str:
+        """Return which program answers another machine as ROS master: `RVMaster`, `rosmaster`, or "" for none."""
+        return self.run("ip", "netns", "exec", "visitor", "python3", "-c", _MASTER)
+
     def story(self) -> str:
         console = self.root.parent / "console.log"
         tail = "\n".join(console.read_text(errors="replace").splitlines()[-20:]) if console.exists() else ""
@@ -147,19 +161,22 @@ _BOOTED = ("running", "degraded", "starting")
 
 
 @contextlib.contextmanager
-def booted_debian(folder: Path, suite: str, package: Path) -> Iterator[BootedDebian]:
-    """Yield a Debian with the package installed, which has not booted."""
+def booted_debian(
+    folder: Path, suite: str, package: Path, *, installed: bool = True
+) -> Iterator[BootedDebian]:
+    """Yield a Debian with the package installed, or only in /root, which has not booted."""
     need_root()
     need_program("systemd-nspawn", "systemd-container")
     root = make_base(folder / "root", _PACKAGES, suite=suite)
-    shutil.copyfile(package, root / "root/rosrv.deb")
+    shutil.copyfile(package, root / "root" / ("rosrv.deb" if installed else package.name))
     (root / "etc/hostname").write_text("robot\n")
     (root / "etc/hosts").write_text("127.0.0.1 localhost\n127.0.1.1 robot\n")
     subprocess.run(["systemd-machine-id-setup", f"--root={root}"], check=True, capture_output=True)
-    install = ["unshare", "--mount", "--propagation", "private", "sh", "-c", _INSTALL, "sh", str(root)]
-    subprocess.run(
-        install, env={"PATH": "/usr/sbin:/usr/bin", "DEBIAN_FRONTEND": "noninteractive"}, check=True
-    )
+    if installed:
+        install = ["unshare", "--mount", "--propagation", "private", "sh", "-c", _INSTALL, "sh", str(root)]
+        subprocess.run(
+            install, env={"PATH": "/usr/sbin:/usr/bin", "DEBIAN_FRONTEND": "noninteractive"}, check=True
+        )
     debian = BootedDebian(root)
     try:
         yield debian
