@@ -38,9 +38,10 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.sessions import Sessions
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RelayControl
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Request
-from appliance.policy.policy import Approval, Policy
+from appliance.policy.policy import Policy
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
@@ -124,24 +125,16 @@ class PolicyFacts:
     def revision(self) -> int:
         return self.revisions.revision
 
-    def provide(
-        self,
-        *,
-        hosts: Callable[[], Mapping[str, Address]] | None = None,
-        holders: Callable[[], Mapping[str, Address]] | None = None,
-        approvals: Callable[[], frozenset[Approval]] | None = None,
-    ) -> None:
-        """Add hosts by their names in the policy, holders of groups (`Policy.holders`) and approvals
-        (`Policy.approved`). After a change of hosts, call `hosts_changed`, and `decide_again` after others.
-        """
-        services = self._services
-        services.hosts += [] if hosts is None else [hosts]
-        services.holders += [] if holders is None else [holders]
-        services.approvals += [] if approvals is None else [approvals]
+    def provide(self, facts: Callable[[PolicyContext], PolicyContext]) -> None:
+        """Add facts to those that policies decide with, such as `known.with_hosts(…)`.
 
-    def hosts(self) -> dict[str, Address]:
+        After a change of hosts, call `hosts_changed`, and `decide_again` after others.
+        """
+        self._services.facts.append(facts)
+
+    def hosts(self) -> Mapping[str, Address]:
         """Return the hosts that features provide."""
-        return self._services.all_hosts()
+        return self._services.added_to(PolicyContext()).hosts
 
     def on_change(self, listener: Callable[[], None]) -> None:
         """End everything that the new policy does not allow, even if the next policy allows it again.

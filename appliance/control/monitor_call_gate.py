@@ -5,7 +5,7 @@ Relays connect to themselves, so this is the address that they listen on, which 
 
 import ipaddress
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from appliance.base import clock
 from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
@@ -53,9 +53,7 @@ class MonitorCallGate:
 
     async def _refused(self, service: str) -> str:
         request = request_of(_CALL, ipaddress.ip_address(self.host), self.name, service)
-        # A guard stops the robot even if another host holds the group (`[Authority]`).
-        policy = replace(self.policy(), authority={}) if self.policy().authority else self.policy()
-        decision = decide(policy, rights_of_call(request, _CALL))
+        decision = decide(self.policy().without_groups(), rights_of_call(request, _CALL))
         asker = Asker(self.host, self.name, clock.now_ns(), None)
         record = self.trail.decided(asker, _CALL, request.category.value, service, decision)
         if not decision.allowed:

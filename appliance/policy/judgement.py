@@ -2,7 +2,7 @@
 
 import ipaddress
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Self
 
 from appliance.policy.cases import CaseResult, run_cases
@@ -24,7 +24,7 @@ class PolicyContext:
 
     `own` are the other addresses of the robot's machine, which belong to `robot` unless the policy names them.
     If the test cases could not be read, `cases_error` says why, and rejects the policy. `blocks`, `holders` and
-    `approved` do not affect checks and test cases.
+    `approved` do not affect checks and test cases; None: they are not known.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -41,6 +41,20 @@ class PolicyContext:
     def compiled(self, text: str, file: str) -> Policy:
         """Compile a text for these addresses. Raises `PolicyError`."""
         return compile_policy(text, file=file, hosts=self.hosts, robot=self.robot, own=self.own)
+
+    def complete(self, policy: Policy) -> Policy:
+        """Return the policy with the present blocks, holders of groups and approvals."""
+        holders = None if self.holders is None else dict(self.holders)
+        return replace(policy, blocks=dict(self.blocks), holders=holders, approved=self.approved)
+
+    def with_hosts(self, hosts: Mapping[str, Address]) -> Self:
+        return replace(self, hosts={**self.hosts, **hosts})
+
+    def with_holders(self, holders: Mapping[str, Address]) -> Self:
+        return replace(self, holders={**(self.holders or {}), **holders})
+
+    def with_approvals(self, approved: frozenset[Approval]) -> Self:
+        return replace(self, approved=(self.approved or frozenset()) | approved)
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
@@ -67,6 +81,10 @@ class PolicyContext:
             "holders": {group: str(host) for group, host in (self.holders or {}).items()},
             "approved": [[str(host), category.value, name] for host, category, name in self.approved or ()],
         }
+
+
+IN_CONTROL = PolicyContext(holders={}, approved=frozenset())
+"""Where all holders and approvals are known: there are none yet."""
 
 
 class PolicyJudgement(NamedTuple):

@@ -126,6 +126,10 @@ class Policy:
         self._any_audit_only = any(table.audit_only for table in self.tables.values())
         self._commanded = {name: group for group in self.authority.values() for name in group.names}
 
+    def without_groups(self) -> "Policy":
+        """Return the policy for monitors: a guard stops the robot even if another host holds the group."""
+        return replace(self, authority={}) if self.authority else self
+
     def decide(self, request: Request) -> Decision:
         """Decide by the rules of the request's own category; `policy/rights` decides on additional rights."""
         host = request.host

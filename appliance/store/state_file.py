@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from appliance.signing.request_signing import TokenKeys
-from appliance.store import door_tables, host_tables
+from appliance.store import host_tables
 from appliance.store.access_tokens import TokenRow
 from appliance.store.writer_thread import Database
 
@@ -61,7 +61,15 @@ CREATE TABLE IF NOT EXISTS monitor_state (
     relay INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, content BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-{host_tables.SCHEMA}{door_tables.SCHEMA}"""
+CREATE TABLE IF NOT EXISTS door (
+    name TEXT PRIMARY KEY, address TEXT NOT NULL UNIQUE, added REAL NOT NULL, removed REAL, slot INTEGER,
+    port INTEGER, source TEXT NOT NULL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS door_ticket (
+    id TEXT PRIMARY KEY, door TEXT NOT NULL, hash BLOB NOT NULL, created REAL NOT NULL, expires REAL NOT NULL,
+    who TEXT NOT NULL
+) WITHOUT ROWID;
+{host_tables.SCHEMA}"""
 
 
 REVISION_TABLES = frozenset({"policy_revision", "policy_signature", "monitor_revision"})
@@ -151,7 +159,6 @@ class StateStore:
     ) -> None:
         self.database = kind(directory / "state.db", SCHEMA, failed=failed)
         self.hosts = host_tables.HostTables(self.database)
-        self.doors = door_tables.DoorTables(self.database)
         self._parameter_changes = 0  # the number of the last change
         self._largest_change: float = LARGEST_CHANGE
         self._only_in_tree = False  # whether a change waits for the next tree

@@ -3,7 +3,7 @@
 import asyncio
 import socket
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import structlog
@@ -17,7 +17,7 @@ from appliance.control.assembly.host_blocks import BlockTable
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.listener_limits import HostQuotaClass, ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
-from appliance.control.assembly.policies import Policies, surroundings
+from appliance.control.assembly.policies import Policies
 from appliance.control.assembly.robot import robot_addresses
 from appliance.control.assembly.services import CallHolder, OwnServiceTable, PolicyServices
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
@@ -25,6 +25,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import Enforcement
+from appliance.policy.judgement import IN_CONTROL
 from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
@@ -122,14 +123,15 @@ async def make_foundation(
         ends,
         trail,
         policy,
-        known=lambda: surroundings(
-            {**tunnels().addresses, **services.all_hosts()},
-            robot,
-            own=lifeline.surroundings.machine,
-            site_keys=settings.site_keys,
-            blocks=blocks.reasons,
-            holders=services.all_holders(),
-            approved=services.all_approvals(),
+        known=lambda: services.added_to(
+            replace(
+                IN_CONTROL,
+                hosts=dict(tunnels().addresses),
+                robot=robot,
+                own=frozenset(lifeline.surroundings.machine),
+                site_keys=settings.site_keys,
+                blocks=blocks.reasons,
+            )
         ),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=changed,

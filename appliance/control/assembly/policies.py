@@ -6,7 +6,7 @@ is on disk and the relays have carried it out: revoked traffic no longer passes.
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -33,8 +33,7 @@ from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, deprived, may_keep
-from appliance.policy.model import Address
-from appliance.policy.policy import Approval, CurrentPolicy, Policy
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
 from appliance.store.ends import EndKind, EndTable
@@ -88,9 +87,9 @@ class Policies(Revisions[RevisionRow]):
     ) -> None:
         """`start` brings a policy into force, and sets it in `policy`.
 
-        `known()` returns the `surroundings` of now. The owners of its `hosts` and `own` call `hosts_changed`; those of
-        `blocks`, `holders` and `approved` call `decide_again`. `changed(before, policy)` decides all live rights again,
-        and returns the number of revocations.
+        `known()` returns the present facts. The owners of its `hosts` and `own` call `hosts_changed`; those of other
+        facts call `decide_again`. `changed(before, policy)` decides all live rights again, and returns the number of
+        revocations.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
         super().__init__(store, ends, store.revisions, store.save_revision, nothing)
@@ -333,7 +332,7 @@ class Policies(Revisions[RevisionRow]):
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
         known = self.known
-        lost = _losses(completed(policy, known), self.policy(), self._live()) if self.policy else []
+        lost = _losses(known.complete(policy), self.policy(), self._live()) if self.policy else []
         earlier = {"policy": self.policy().text} if self.policy else {}
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
@@ -353,7 +352,7 @@ class Policies(Revisions[RevisionRow]):
 
     def _enforce(self, policy: Policy) -> int:
         before = self.policy() if self.policy else None
-        self.policy.set(completed(policy, self.known))
+        self.policy.set(self.known.complete(policy))
         self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, self.policy())
 
@@ -363,38 +362,6 @@ class Policies(Revisions[RevisionRow]):
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who=UNCONFIRMED)
-
-
-def surroundings(
-    hosts: Mapping[str, Address],
-    robot: Collection[Address | Network],
-    *,
-    own: Collection[Address] = (),
-    site_keys: Sequence[str] = (),
-    blocks: Mapping[Address, str],
-    holders: Mapping[str, Address],
-    approved: frozenset[Approval],
-) -> PolicyContext:
-    """Return a snapshot of the facts, beside its source, that a policy decides with."""
-    return PolicyContext(
-        dict(hosts),
-        robot,
-        own=frozenset(own),
-        site_keys=site_keys,
-        blocks=dict(blocks),
-        holders=dict(holders),
-        approved=approved,
-    )
-
-
-def completed(policy: Policy, known: PolicyContext) -> Policy:
-    """Return the policy with the present blocks, holders of groups, and approvals."""
-    return replace(
-        policy,
-        blocks=known.blocks,
-        holders=known.holders or {},
-        approved=known.approved or frozenset(),
-    )
 
 
 def _losses(policy: Policy, before: Policy, live: Iterable[LiveRight]) -> list[str]:

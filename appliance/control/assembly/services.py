@@ -1,12 +1,13 @@
 """Keep the services that features provide (`control/core.py`), for the parts of control that use them."""
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import reduce
 
 from appliance.channel import messages
 from appliance.control.assembly.current import Provided
-from appliance.policy.model import Address, Request
-from appliance.policy.policy import Approval
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.model import Request
 
 OwnServiceAnswer = Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
 
@@ -15,20 +16,12 @@ class PolicyServices:
     """The facts that features add to each policy in force."""
 
     def __init__(self) -> None:
-        self.hosts: list[Callable[[], Mapping[str, Address]]] = []
-        self.holders: list[Callable[[], Mapping[str, Address]]] = []
-        self.approvals: list[Callable[[], frozenset[Approval]]] = []
+        self.facts: list[Callable[[PolicyContext], PolicyContext]] = []
         self.listeners: list[Callable[[], None]] = []
         self.first: list[Callable[[], None]] = []
 
-    def all_hosts(self) -> dict[str, Address]:
-        return {name: host for hosts in self.hosts for name, host in hosts().items()}
-
-    def all_holders(self) -> dict[str, Address]:
-        return {group: host for holders in self.holders for group, host in holders().items()}
-
-    def all_approvals(self) -> frozenset[Approval]:
-        return frozenset(approval for approvals in self.approvals for approval in approvals())
+    def added_to(self, known: PolicyContext) -> PolicyContext:
+        return reduce(lambda known, facts: facts(known), self.facts, known)
 
     def changed(self) -> None:
         for listener in self.listeners:
@@ -51,7 +44,7 @@ class HeldCalls:
     request: Callable[[messages.RequestHeld], Awaitable[messages.HeldRequestDecided]]
 
 
-_NO_APPROVALS = "no operator can approve calls on this appliance"
+_NOT_HELD = "no operator can approve calls on this appliance"
 
 
 class CallHolder:
@@ -62,12 +55,12 @@ class CallHolder:
 
     def call(self, request: Request) -> str:
         held = self.held()
-        return _NO_APPROVALS if held is None else held.call(request)
+        return _NOT_HELD if held is None else held.call(request)
 
     async def request(self, wanted: messages.RequestHeld) -> messages.HeldRequestDecided:
         held = self.held()
         if held is None:
-            return messages.HeldRequestDecided(wanted.number, _NO_APPROVALS)
+            return messages.HeldRequestDecided(wanted.number, _NOT_HELD)
         return await held.request(wanted)
 
 

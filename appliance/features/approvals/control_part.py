@@ -43,7 +43,7 @@ async def begin(core: Core) -> ControlPart:
         lambda host, topic: _asks(policy.current(), host, topic),
     )
     core.limits.provide(orders.limits)
-    policy.provide(approvals=orders.approved)
+    policy.provide(lambda known: known.with_approvals(orders.approved()))
     policy.on_change(orders.policy_changed)
     core.relay.hold(orders.hold_call, orders.approve_call)
     return ControlPart(

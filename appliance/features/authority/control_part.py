@@ -36,7 +36,7 @@ async def begin(core: Core) -> ControlPart:
         lambda: bool(policy.current().authority),
         lambda _host, topic: policy.current().commanded(topic) is not None,
     )
-    policy.provide(holders=orders.holders)
+    policy.provide(lambda known: known.with_holders(orders.holders()))
     policy.on_change(orders.policy_changed)
     policy.on_first(ranked.policy_changed)
     core.own_services.provide(TAKE, orders.take_called)

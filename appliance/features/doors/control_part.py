@@ -32,7 +32,7 @@ async def begin(core: Core) -> ControlPart:
         left=visits.left,
     )
     orders = DoorOrders(core, table, tickets=tickets, visits=visits, processes=processes)
-    core.policy.provide(hosts=table.addresses)
+    core.policy.provide(lambda known: known.with_hosts(table.addresses()))
     blocks.on_change(processes.blocks_changed)
     blocks.uses.add(processes.uses_of)
     core.rest.websocket(orders.enter)

@@ -25,12 +25,12 @@ from appliance.channel.link import Link
 from appliance.configuration.settings import Settings
 from appliance.control.core import Core
 from appliance.features.doors import door_link
+from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.doors.view import LATELY_SECONDS, DoorHealth
 from appliance.policy.model import Address
 from appliance.rpc.server import listen
-from appliance.store.door_tables import DoorRow
 
 ROLE = "door"
 _CONNECT_SECONDS = 5.0

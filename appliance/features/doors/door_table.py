@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from appliance.base import clock
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.doors.door_link import node_name
+from appliance.features.doors.door_rows import DoorRow, DoorTables
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.policy.model import DOOR, Address, address_of
-from appliance.store.door_tables import DoorRow
 from appliance.store.state_file import StateStore
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,30}", re.ASCII)
@@ -26,10 +26,10 @@ class DoorTable:
     """All doors that were ever added."""
 
     def __init__(self, store: StateStore, settings: Doors) -> None:
-        self._store = store
+        self._tables = DoorTables(store.database)
         self._network = ipaddress.IPv4Network(settings.network)
         self._gateway = settings.gateway
-        self._rows = {row.name: row for row in store.doors.doors()}
+        self._rows = {row.name: row for row in self._tables.doors()}
         # Why the firewall does not reserve the addresses, or empty.
         self.closed = "the firewall does not reserve doors.network yet"
 
@@ -118,7 +118,7 @@ class DoorTable:
     def save(self, row: DoorRow) -> None:
         self._rows.pop(row.name, None)
         self._rows[row.name] = row
-        self._store.doors.save(row)
+        self._tables.save(row)
 
     def remove(self, name: str) -> DoorRow:
         row = self.of(name)

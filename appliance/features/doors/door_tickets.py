@@ -5,8 +5,8 @@ from collections.abc import Collection
 from appliance.base import clock
 from appliance.base.actors import OPERATOR
 from appliance.control.errors import SenselessError
+from appliance.features.doors.door_rows import DoorTables, TicketRow
 from appliance.signing.bearer_secrets import SecretForm, hash_of
-from appliance.store.door_tables import TicketRow
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 
@@ -20,9 +20,9 @@ class DoorTickets:
     """All tickets that have not ended."""
 
     def __init__(self, store: StateStore, ends: EndTable) -> None:
-        self._store = store
+        self._tables = DoorTables(store.database)
         self._ends = ends
-        self._rows = {row.id: row for row in store.doors.tickets()}
+        self._rows = {row.id: row for row in self._tables.tickets()}
         ends.when_due(TICKETS, self._due)
 
     def valid(self, door: str | None = None) -> list[TicketRow]:
@@ -42,9 +42,9 @@ class DoorTickets:
             raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some end")
         row, text = new_ticket(door, seconds, who)
         self._rows[row.id] = row
-        with self._store.database.together():
+        with self._tables.together():
             self._ends.set(TICKETS, row.id, seconds)
-            self._store.doors.save_ticket(row)
+            self._tables.save_ticket(row)
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
@@ -60,7 +60,7 @@ class DoorTickets:
     def _due(self, ended: list[str]) -> None:
         for ticket in ended:
             if self._rows.pop(ticket, None) is not None:
-                self._store.doors.forget_ticket(ticket)
+                self._tables.forget_ticket(ticket)
         self._ends.forget(TICKETS, *ended)
 
 

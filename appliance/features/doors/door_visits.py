@@ -7,8 +7,8 @@ had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit end
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from appliance.features.doors.door_rows import TicketRow
 from appliance.features.doors.door_tickets import TICKET_FORM, new_ticket
-from appliance.store.door_tables import TicketRow
 from appliance.store.ends import EndKind, EndTable
 
 _OPEN_SECONDS = 60.0

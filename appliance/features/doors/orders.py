@@ -14,6 +14,7 @@ from appliance.control.errors import SenselessError, UnavailableError, UnknownTh
 from appliance.features.doors import requests as door_requests
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import DoorProcesses
+from appliance.features.doors.door_rows import DoorRow, TicketRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker
 from appliance.features.doors.door_visits import DoorVisits
@@ -22,7 +23,6 @@ from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.doors.view import DoorsState
 from appliance.features.doors.viewer_topics import ViewerTopics
 from appliance.policy.model import address_of
-from appliance.store.door_tables import DoorRow, TicketRow
 
 _LOOK_SECONDS = 1.0
 _RETRY_SECONDS = 10

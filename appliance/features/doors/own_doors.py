@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from appliance.control.operators.sessions import Sessions
+from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.door_table import DoorTable, is_door_name
-from appliance.store.door_tables import DoorRow
 
 
 class CallerDoor(NamedTuple):

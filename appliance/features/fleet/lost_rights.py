@@ -1,9 +1,9 @@
 """Find the rights that a new policy takes from a host, by deciding sample names for each rule."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 from appliance.policy.commands import COMMANDS
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.keys import Key
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
@@ -17,9 +17,7 @@ class LostRights:
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
         self._names = {category: tuple(dict.fromkeys(_names(old, new, category))) for category in Category}
-        self._before, self._after = (
-            replace(one, blocks={}, holders=None, approved=None) for one in (old, new)
-        )
+        self._before, self._after = map(PolicyContext().complete, (old, new))
         self._lost: dict[tuple[str, str], bool] = {}  # by the networks that both policies name
 
     def took_from(self, host: Address) -> bool:

@@ -97,8 +97,7 @@ def explanation(
 ) -> DecisionExplanation:
     fields = msgspec.structs.asdict(current)
     known = PolicyContext.of(fields)
-    policy = judge_text(text, current, cases=False).policy
-    policy = replace(policy, blocks=known.blocks, holders=known.holders, approved=known.approved)
+    policy = known.complete(judge_text(text, current, cases=False).policy)
     try:
         request = Request(find_host(host, policy), node, category, check_resource(category, resource))
     except BadWordError as error:

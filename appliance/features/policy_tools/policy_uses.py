@@ -27,12 +27,7 @@ def policy_uses(
 ) -> PolicyUses:
     """Return the uses since a time (nanoseconds since the epoch). Raises `LogUnreadableError`."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
-    policy = replace(
-        known.compiled(current.text, current.file),
-        blocks=known.blocks,
-        holders=known.holders,
-        approved=known.approved,
-    )
+    policy = known.complete(known.compiled(current.text, current.file))
     records = _NewestRecords(path, most)
     period: RecordedPeriod = replace(period_since(partial(export, path), since, since), read=records)
     uses = RuleUses(policy)

@@ -139,7 +139,7 @@ def compiled_with(text: str, name: str, known: PolicyContext) -> Policy:
         policy = known.compiled(text, name)
     except PolicyError as error:  # the appliance has another version
         raise refused(error.findings) from error
-    return replace(policy, blocks=known.blocks, holders=known.holders, approved=known.approved)
+    return known.complete(policy)
 
 
 @speaks

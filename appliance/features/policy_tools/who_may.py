@@ -4,9 +4,10 @@ import functools
 import ipaddress
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from appliance.policy.host_sets import Network
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Address, Category, Decision, Request, word_of
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, decide_right, rights_of
@@ -41,7 +42,7 @@ def who_may(policy: Policy, category: Category, resource: str, node: str = "") -
     the holders of groups are ignored.
 
     """
-    policy = replace(policy, blocks={}, holders=None, approved=None)
+    policy = PolicyContext().complete(policy)
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
     inside = [
         (network, _only_in(policy, network, networks[place:]))

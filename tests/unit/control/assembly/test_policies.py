@@ -18,9 +18,10 @@ from appliance.channel.admin import (
     PolicyRollback,
     PolicyWanted,
 )
-from appliance.control.assembly.policies import Policies, RevisionChangedError, completed, surroundings
+from appliance.control.assembly.policies import Policies, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Approval, CurrentPolicy, Policy
@@ -69,8 +70,8 @@ class Appliance:
         policies = Policies(
             self.file, store, self.ends, cast(Any, self.records), CurrentPolicy(), live=live, changed=changed,
             carried_out=at_once,
-            known=lambda: surroundings(
-                hosts(), (), blocks=blocks(), holders=holders(), approved=approved(), site_keys=site_keys
+            known=lambda: PolicyContext(
+                hosts(), blocks=blocks(), holders=holders(), approved=approved(), site_keys=site_keys
             ),
         )  # fmt: skip
         policies.start(restarted=restarted)
@@ -479,8 +480,8 @@ def test_a_policy_keeps_what_was_known_when_it_came_into_force() -> None:
         {address_of("10.0.0.7"): "odd"},
         {"base": address_of("10.0.0.8")},
     )
-    known = surroundings({}, (), blocks=blocks, holders=holders, approved=frozenset())
-    policy = completed(compile_policy(OPEN, file="site.ini"), known)
+    known = PolicyContext(blocks=blocks, holders=holders)
+    policy = known.complete(compile_policy(OPEN, file="site.ini"))
     blocks[host], holders["arm"] = "odd", host
     assert (len(policy.blocks), list(policy.holders or ())) == (1, ["base"])
     assert not policy.decide(Request(address_of("10.0.0.7"), "/n", Category.PUBLISH, "/x")).allowed

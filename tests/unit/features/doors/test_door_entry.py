@@ -3,9 +3,9 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.orders import DoorOrders
 from appliance.policy.model import Address
-from appliance.store.door_tables import DoorRow
 from tests.support.core import FakeTrail
 
 ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")

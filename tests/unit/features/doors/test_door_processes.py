@@ -11,10 +11,10 @@ from appliance.control.core import Core, Links
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.doors import door_link, door_processes
 from appliance.features.doors.door_processes import DoorProcesses
+from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import Doors
 from appliance.features.doors.view import DOORS_VIEW, DoorsState
-from appliance.store.door_tables import DoorRow
 from tests.support.core import FakeTrail
 from tests.support.virtual_clock import VirtualClock
 

@@ -4,10 +4,10 @@ import pytest
 
 from appliance.base import clock
 from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.doors.door_rows import DoorTables, TicketRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker, new_ticket
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.store.door_tables import TicketRow
 from appliance.store.state_file import StateStore
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
@@ -100,7 +100,7 @@ def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
         machine.advance(3601.0)
         assert tickets.find("alice", text) is None
         assert tickets.valid() == []
-        assert store.doors.tickets() == [] and store.ends() == []
+        assert DoorTables(store.database).tickets() == [] and store.ends() == []
 
 
 def test_a_ticket_of_an_earlier_version_opens_its_door(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_ticket_of_an_earlier_version_opens_its_door(tmp_path: Path) -> None:
             "0f007385b6f9d4b7eeb2748605afe1a984a0a3bfa3f014d09e2a784ce9e5cd1a"  # of 43 times A, by sha256sum
         )
         row = TicketRow("5c0f3d2b9a11", "alice", bytes.fromhex(digest), WALL, WALL + 60.0, "ann")
-        store.doors.save_ticket(row)
+        DoorTables(store.database).save_ticket(row)
         assert DoorTickets(store, ends_of(store, tmp_path)).find("alice", f"5c0f3d2b9a11.{'A' * 43}") == row
 
 

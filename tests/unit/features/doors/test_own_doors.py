@@ -5,10 +5,10 @@ from typing import Any, cast
 import pytest
 
 from appliance.base import clock
+from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.own_doors import OwnDoors
-from appliance.store.door_tables import DoorRow
 from tests.support.ends import ends_in
 from tests.support.virtual_clock import VirtualClock
 

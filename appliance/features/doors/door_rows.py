@@ -1,19 +1,8 @@
-"""The tables of doors: identities with their addresses, and the tickets of people."""
+"""Store doors, identities with their addresses, and the tickets of people; `store/state_file.py` has their tables."""
 
 from typing import NamedTuple
 
 from appliance.store.writer_thread import Database
-
-SCHEMA = """
-CREATE TABLE IF NOT EXISTS door (
-    name TEXT PRIMARY KEY, address TEXT NOT NULL UNIQUE, added REAL NOT NULL, removed REAL, slot INTEGER,
-    port INTEGER, source TEXT NOT NULL
-) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS door_ticket (
-    id TEXT PRIMARY KEY, door TEXT NOT NULL, hash BLOB NOT NULL, created REAL NOT NULL, expires REAL NOT NULL,
-    who TEXT NOT NULL
-) WITHOUT ROWID;
-"""
 
 
 class DoorRow(NamedTuple):
@@ -48,6 +37,7 @@ class DoorTables:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self.together = database.together
 
     def save(self, row: DoorRow) -> None:
         self._database.put("door", *row)
