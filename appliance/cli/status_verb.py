@@ -31,7 +31,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
-from appliance.features.views import pair_view, states_of
+from appliance.features.views import pair_view, passive_status, states_of
 from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
 
@@ -87,8 +87,7 @@ def _look(appliance: Appliance) -> StatusView:
 def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
-        pair = pair_view()
-        return _shown(appliance.ask(pair.request()), pair.status)
+        return _shown(appliance.ask(pair_view().request()), passive_status())
     return _shown(answer, partial(_view, appliance=appliance))
 
 

@@ -18,6 +18,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.quotas.table import DRY_RUNS
+from appliance.specifications import checking
 from appliance.specifications.specification_files import SpecificationsRefusedError
 
 _MEMORY = 1 << 30  # bytes of address space, of which the compiler's own libraries take 50 MiB
@@ -86,8 +87,6 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
     ends = int(_used()) + _budget(wanted) + _SPARE_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
-        from appliance.specifications import checking  # noqa: PLC0415  after the limits are set
-
         if isinstance(wanted, messages.PartsWanted):
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         if wanted.at_start:

@@ -53,7 +53,7 @@ _NO_PAIRS = UserError("this appliance is one of two, which this rosrv cannot sho
 
 
 class PairView:
-    """The views of a product without pairs."""
+    """The passive of two appliances, in a product without pairs."""
 
     def request(self) -> Any:
         raise _NO_PAIRS
@@ -62,26 +62,28 @@ class PairView:
         del state
         return {}
 
-    def status(self, state: Any) -> Any:
-        del state
-        raise _NO_PAIRS
 
-    def verify(
-        self,
-        own: Path,
-        verified: Any,
-        other: Path,
-        state: Path,
-        verify: Callable[[], Any],
-    ) -> tuple[Any, Callable[[Any], None]]:
-        del verified, state, verify
-        raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
+def no_passive_status(state: Any) -> Any:
+    del state
+    raise _NO_PAIRS
+
+
+def no_verification(
+    own: Path, verified: Any, other: Path, state: Path, verify: Callable[[], Any]
+) -> tuple[Any, Callable[[Any], None]]:
+    """Verify the takeovers between two logs; return the result, and the function that prints it."""
+    del verified, state, verify
+    raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
 
 
 @dataclass(frozen=True)
 class FeatureView:
-    """A feature's views; `pair` is a class of `PairView` (`module:name`), for the feature that makes pairs."""
+    """A feature's views. The feature that makes pairs also names (`module:name`) its `PairView`, and its functions in
+    place of `no_passive_status` and `no_verification`; a command imports only the one that it needs.
+    """
 
     name: str
     states: tuple[StateView[Any], ...] = ()
-    pair: str | None = None
+    pair: str = ""
+    passive_status: str = ""
+    verification: str = ""

@@ -3,7 +3,7 @@
 import functools
 import pkgutil
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -16,12 +16,13 @@ from appliance.features.guards.view import GUARDS_VIEW
 from appliance.features.recorder.view import RECORDER_VIEW
 from appliance.features.standby.view import STANDBY_VIEW
 from appliance.features.syslog.view import SYSLOG_VIEW
-from appliance.features.view import FeatureView, PairView, StateView
+from appliance.features.view import FeatureView, PairView, StateView, no_passive_status, no_verification
 
 VIEWS: tuple[FeatureView, ...] = (
     SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW, APPROVALS_VIEW, GUARDS_VIEW,
     ADOPT_VIEW,
 )  # fmt: skip
+T = TypeVar("T")
 STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)
 
 
@@ -54,4 +55,20 @@ def states_of(status: Any) -> Iterator[tuple[StateView[Any], Any]]:
 
 @functools.cache
 def pair_view() -> PairView:
-    return next((pkgutil.resolve_name(view.pair)() for view in VIEWS if view.pair), PairView())
+    return _named((view.pair for view in VIEWS), PairView)()
+
+
+def passive_status() -> Any:
+    return _named((view.passive_status for view in VIEWS), no_passive_status)
+
+
+def pair_verification() -> Any:
+    return _named((view.verification for view in VIEWS), no_verification)
+
+
+def _named(names: Iterator[str], otherwise: T) -> T:
+    name = next(filter(None, names), None)
+    if name is None:
+        return otherwise
+    member: T = pkgutil.resolve_name(name)
+    return member

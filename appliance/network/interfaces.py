@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from appliance.network import netlink
 from appliance.network.namespaces import Namespace, NetworkError
 
 IFNAMSIZ = 15  # characters
@@ -232,15 +233,15 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    from pyroute2 import IPRoute, NetlinkError  # noqa: PLC0415  a hundred modules, only to change a network
+    pyroute2 = netlink.library()
 
     def inside() -> T:
-        with IPRoute() as route:
+        with pyroute2.IPRoute() as route:
             return work(route)
 
     try:
         return namespace.run(inside)
-    except NetlinkError as error:
+    except pyroute2.NetlinkError as error:
         hint = ": needs root (CAP_NET_ADMIN); run it with sudo" if error.code in (1, 13) else ""
         raise NetworkError(f"{what} in {namespace.name}: {os.strerror(error.code)}{hint}") from error
 

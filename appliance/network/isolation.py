@@ -24,7 +24,7 @@ from typing import Literal
 
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.status import FirewallRule
-from appliance.network import interfaces, vendor_masters
+from appliance.network import conntrack, interfaces, vendor_masters
 from appliance.network.cut import close_port, open_port, refuse_no_port
 from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import statuses
@@ -295,8 +295,6 @@ class Isolation:
         self._forget_tunnels()
 
     def _forget_tunnels(self) -> None:
-        from appliance.network import conntrack  # noqa: PLC0415  pyroute2: see `links`
-
         conntrack.forget(self._host, [port.first for port in _TUNNELS])
 
     def _build(self) -> None:

@@ -13,6 +13,7 @@ from appliance.base import clock
 from appliance.channel.messages import LookEnded, LookWanted, Message, MessageSeen
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.transport.frames import Batch
+from roswire.message_view import PublisherReader
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20
@@ -70,13 +71,10 @@ class _Reader:
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
         self._header: Mapping[str, str] | None = None
-        from roswire.message_view import PublisherReader  # noqa: PLC0415  only for a topic that is looked into
-
-        self._made_for = PublisherReader
         self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
         header = self._topic.header or {}
         if header is not self._header:
-            self._header, self._reader = header, self._made_for(header)
+            self._header, self._reader = header, PublisherReader(header)
         return self._reader.type, *self._reader.read(data)

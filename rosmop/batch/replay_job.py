@@ -14,7 +14,8 @@ from rosmop.fast.build import fast_path_of
 from rosmop.recordings.recording import Reader, RecordingError, definitions_of, open_recording
 from rosmop.recordings.replay import ReplayStep, refusals, replay
 from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import Outcome, Verdict, bound, lines_of_why, why_of
+from rosmop.run.outcomes import Outcome, Verdict, bound, why_of
+from rosmop.run.why_lines import lines_of_why
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 

@@ -97,12 +97,6 @@ class RunningProperty:
     history: Exits | Steps
     remedy: "Remedy | None" = None
 
-    @property
-    def drawable(self) -> bool:
-        from rosmop.logics.picture import dot_of  # noqa: PLC0415  only tools draw
-
-        return dot_of([self.code.property]) is not None
-
     def begin(self, time_ns: int) -> None:
         self.run = self.code.property.start(time_ns)
         self.history.begin(time_ns)
@@ -198,11 +192,6 @@ class MonitorInstance:
     @property
     def failing(self) -> bool:
         return self.broken or self.faults >= FAILING_AFTER
-
-    def picture(self) -> str | None:
-        from rosmop.logics.picture import svg_of  # noqa: PLC0415  only tools draw
-
-        return svg_of([code.property for code in self.code.properties])
 
     def hold(self, why: str = "") -> None:
         self.held, self.why_held = True, why

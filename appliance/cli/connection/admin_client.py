@@ -2,14 +2,11 @@
 
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, StatusWanted, decode
-
-if TYPE_CHECKING:
-    from appliance.cli.connection.audit_file import FileLog
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
@@ -51,11 +48,6 @@ class AdminSocket:
         self.state = state
         self._seconds = seconds
         self._grace = grace
-
-    def audit(self) -> "FileLog":
-        from appliance.cli.connection.audit_file import FileLog  # noqa: PLC0415  only for the verbs that read it
-
-        return FileLog(self.state, self.robot_name)
 
     def robot_name(self) -> str:
         try:

@@ -4,7 +4,7 @@ import json
 import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -17,7 +17,9 @@ from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import RecordInContext, SearchPage
 from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
 from appliance.cli.connection.audit_file import Progress
-from appliance.cli.connection.rest_session import RestClient
+
+if TYPE_CHECKING:
+    from appliance.cli.connection.rest_session import RestClient
 
 _PATH = "/v1/audit"
 _PAGE = 1000
@@ -31,7 +33,7 @@ _MOST_FAILURES = 5
 class RestLog:
     """The methods of `FileLog` over REST; they raise `NotRunningError`."""
 
-    def __init__(self, client: RestClient) -> None:
+    def __init__(self, client: "RestClient") -> None:
         self._client = client
 
     def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:

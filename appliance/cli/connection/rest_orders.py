@@ -1,7 +1,7 @@
 """Send admin requests as REST calls, and convert the answers to the admin socket's answers."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 
@@ -11,9 +11,6 @@ from appliance.channel.answers.graph_answers import Graph, Registration, Registr
 from appliance.channel.rest_meaning import call_of
 from appliance.cli.connection.admin_client import NotRunningError, RestProblemError, encoded
 from appliance.cli.connection.rest_session import RestClient
-
-if TYPE_CHECKING:
-    from appliance.cli.connection.audit_over_rest import RestLog
 
 
 class RestWay:
@@ -32,11 +29,6 @@ class RestWay:
             if problem.kind == "standby":
                 trouble = "standby"
             return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:], trouble=trouble)
-
-    def audit(self) -> "RestLog":
-        from appliance.cli.connection.audit_over_rest import RestLog  # noqa: PLC0415  only for the verbs that read it
-
-        return RestLog(self.client)
 
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:

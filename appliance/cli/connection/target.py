@@ -30,8 +30,6 @@ from appliance.policy.host_names import HostInWords, in_words
 from rosmop.tool.terminal import printable
 
 if TYPE_CHECKING:
-    from appliance.cli.connection.audit_file import FileLog
-    from appliance.cli.connection.audit_over_rest import RestLog
     from appliance.cli.connection.rest_orders import RestWay
     from appliance.cli.connection.rest_session import RestClient
     from appliance.policy.host_names import HostInWords
@@ -116,9 +114,6 @@ class Appliance(typer.Context):
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         return self.way.ask(request)
-
-    def audit(self) -> "FileLog | RestLog":
-        return self.way.audit()
 
     @cached_property
     def host_in_words(self) -> "HostInWords":

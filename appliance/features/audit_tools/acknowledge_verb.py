@@ -8,6 +8,7 @@ import typer
 from appliance.cli.audit.audit_errors import CANNOT_READ, Errors, fail
 from appliance.cli.audit.verification_text import signed_log_text, write
 from appliance.cli.connection.audit_file import FileLog
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 
 
@@ -29,7 +30,7 @@ def acknowledge_log(
     Example: rosrv audit acknowledge 3f2a
     """
     with Errors():
-        source = appliance.audit()
+        source = audit_of(appliance.way)
         if not isinstance(source, FileLog):
             fail("only root on the machine can do this: run it there with --state", CANNOT_READ)
         present, logs = source.present(), source.signed_logs()

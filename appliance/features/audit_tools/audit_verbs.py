@@ -30,12 +30,12 @@ from appliance.cli.audit.verification_text import print_verification, write
 from appliance.cli.audit.verified import keep_verification
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.audit_file import FileLog
-from appliance.cli.connection.audit_over_rest import RestLog
+from appliance.cli.connection.audit_source import AuditSource, audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.record_table import line, print_entries, print_shown
 from appliance.features.audit_tools.unrecorded import unrecorded
-from appliance.features.views import pair_view
+from appliance.features.views import pair_verification
 from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = (
@@ -68,7 +68,7 @@ def search(
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
     wanted = _filter_of(appliance)
-    page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
+    page = audit_of(appliance.way).search(wanted, cursor, limit, newest_first=not oldest_first)
     if appliance.as_json:
         _print_lines(page.entries, appliance)
     else:
@@ -99,7 +99,7 @@ def tail(
 
     Example: rosrv audit tail --deny
     """
-    for entries in appliance.audit().follow(_filter_of(appliance), lines, on=follow):
+    for entries in audit_of(appliance.way).follow(_filter_of(appliance), lines, on=follow):
         _print_lines(entries, appliance)
 
 
@@ -116,7 +116,7 @@ def show(
     Example: rosrv audit show 18e9aa02efc40abb0e51
     """
     with Errors():
-        shown = appliance.audit().show(record, neighbours)
+        shown = audit_of(appliance.way).show(record, neighbours)
         if shown is None:
             fail(f"no record in the log has the id {record!a}; list them: rosrv audit search", 1)
         if appliance.as_json:
@@ -168,20 +168,20 @@ def verify(
     if other is None and (other_key is not None or other_checkpoints is not None):
         fail("--other-key and --other-checkpoints need --other, the other appliance's state directory", 2)
     with Errors():
-        source = appliance.audit()
+        source = audit_of(appliance.way)
         partner = None if other is None else _files(source, other)
         result = _verified(source, key, checkpoints)
         if partner is None or other is None:
             _print_result(result, print_verification, as_json_lines=appliance.as_json)
             return
         own, of_other = partner
-        found, printed = pair_view().verify(
+        found, printed = pair_verification()(
             own.path, result, of_other.path, other, lambda: _verified(of_other, other_key, other_checkpoints)
         )
         _print_result(found, printed, as_json_lines=appliance.as_json)
 
 
-def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
+def _files(source: AuditSource, other: Path) -> tuple[FileLog, FileLog]:
     if not isinstance(source, FileLog):
         fail("--other needs the logs' files: run this with --state, on any machine with copies of both", 2)
     if not other.is_dir():
@@ -189,7 +189,7 @@ def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
     return source, FileLog(other)
 
 
-def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | None) -> Verification:
+def _verified(source: AuditSource, key: Path | None, checkpoints: Path | None) -> Verification:
     copies = None if checkpoints is None else read_copies(checkpoints)
     public_key = None if key is None else read_public_key(key)
     began = clock.now()
@@ -225,13 +225,13 @@ def checkpoints(
     Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
     """
     with Errors(unread=1 if follow else 0):
-        for found in _checkpoints(appliance.audit(), after, follow=follow):
+        for found in _checkpoints(audit_of(appliance.way), after, follow=follow):
             for checkpoint in found:
                 write(checkpoint.as_json())
             sys.stdout.flush()
 
 
-def _checkpoints(source: FileLog | RestLog, after: int, *, follow: bool) -> Iterator[list[SignedCheckpoint]]:
+def _checkpoints(source: AuditSource, after: int, *, follow: bool) -> Iterator[list[SignedCheckpoint]]:
     pause, away = threading.Event(), False
     last: SignedCheckpoint | None = None
     yield (found := source.checkpoints(after))
@@ -252,7 +252,7 @@ def _checkpoints(source: FileLog | RestLog, after: int, *, follow: bool) -> Iter
         yield found
 
 
-def _later(source: FileLog | RestLog, last: SignedCheckpoint) -> list[SignedCheckpoint]:
+def _later(source: AuditSource, last: SignedCheckpoint) -> list[SignedCheckpoint]:
     """Return the checkpoints after the last one, or all those of a log that has replaced its log."""
     found = source.checkpoints(last.number - 1)
     if found and (found[0].log, found[0].number) == (last.log, last.number):
@@ -281,7 +281,7 @@ def export(
     Example: rosrv audit export --since 7d --output week.ndjson
     """
     wanted = _filter_of(appliance)
-    source = appliance.audit()
+    source = audit_of(appliance.way)
     entries = _csv(source.export(wanted)) if as_csv else source.evidence(wanted)
     with progress("exporting", source.last, shares_screen=output is None) as report:
         if output is None:

@@ -12,6 +12,7 @@ from appliance.audit.search.query import Filter
 from appliance.base.counted import counted
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.verification_text import write
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.policy.host_names import HostInWords
@@ -39,7 +40,7 @@ def summarise(
     """
     with Errors():
         begin, end = times_given(since, until)
-        found = appliance.audit().denials(Filter(since=begin, until=end), limit)
+        found = audit_of(appliance.way).denials(Filter(since=begin, until=end), limit)
         if appliance.as_json:
             say_json(found)
             return

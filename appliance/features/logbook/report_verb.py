@@ -19,6 +19,7 @@ from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.verified import last_verification
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import FileLog
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error, write_new
 from appliance.features.logbook import live_facts
@@ -92,7 +93,7 @@ def report_interventions(
 
 
 def _report(appliance: Appliance, since: int | None, end: int, other: Path | None) -> MachineReport:
-    logs = logs_of(appliance.audit(), other, _VERB)
+    logs = logs_of(audit_of(appliance.way), other, _VERB)
     sources = [_reported(name, log) for name, log in logs.items()]
     begins = min((one.begins_utc for one in sources if one.begins_utc), default="")
     if since is None:

@@ -8,6 +8,7 @@ import typer
 from appliance.audit.log.record_format import rfc3339
 from appliance.base.timestamps import in_local_zone
 from appliance.cli.audit.audit_errors import Errors
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.durations import time_given
 from appliance.cli.output import say_json, usage_error
@@ -47,7 +48,7 @@ def who_drove(
         begin, end = (time_given(option, text, _VERB) for text in (first, last))
         if begin > end:
             raise usage_error(f"--between: {first} is after {last}", verb=_VERB)
-        logs = logs_of(appliance.audit(), other, _VERB)
+        logs = logs_of(audit_of(appliance.way), other, _VERB)
         with OpenedLogs(logs) as opened:
             read = read_records(opened.of_events(_EVENTS), Period(begin, end + 1))
         # A span that ends at that very moment does not include it.

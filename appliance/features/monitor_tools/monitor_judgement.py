@@ -1,27 +1,14 @@
-"""Compile the specifications in force from their texts. The compiler is imported when it is first needed."""
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+"""Compile the specifications in force from their texts, to describe and draw them."""
 
 from appliance.api.front.problems import Finding
 from appliance.api.routes.specification_findings import findings_of
 from appliance.channel.answers.monitor_answers import Monitors
-from appliance.features.monitor_tools.monitor_models import EventShown, PropertyShown
+from appliance.features.monitor_tools.monitor_models import Described, EventShown, PropertyShown
+from rosmop.check.sources import compiled_from
+from rosmop.logics.picture import dot_of, svg_of
+from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
-
-if TYPE_CHECKING:
-    from rosmop.run.engine import MonitorSet
-
-
-class Described(NamedTuple):
-    """The contents of a specification; `uses` are the monitors whose variables it uses; `hold` is its modifier."""
-
-    events: list[EventShown]
-    properties: list[PropertyShown]
-    uses: list[str]
-    hold: bool
 
 
 class Compiler:
@@ -55,7 +42,7 @@ class Compiler:
                 formula=running.code.property.formula.strip(),
                 categories=list(running.code.property.categories),
                 handled=list(running.code.order),
-                drawn=running.drawable,
+                drawn=dot_of([running.code.property]) is not None,
             )
             for running in monitor.properties
         ]
@@ -63,7 +50,8 @@ class Compiler:
 
     def picture(self, loaded: Monitors, name: str) -> str | None:
         """Return a monitor's picture, or None if no automaton is finite. Raises `KeyError`."""
-        return self._set(loaded).monitor(name).picture()
+        monitor = self._set(loaded).monitor(name)
+        return svg_of([code.property for code in monitor.code.properties])
 
     def warnings(self, file: str) -> list[Finding]:
         assert self._last is not None  # noqa: S101  callers compile by `described` first
@@ -73,8 +61,5 @@ class Compiler:
 
 
 def _compiled(loaded: Monitors) -> MonitorSet:
-    from rosmop.check.sources import compiled_from  # noqa: PLC0415  the compiler: see the head
-    from rosmop.run.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
-
     known = standard_definitions().extended(Definitions.from_files(loaded.definitions or {}))
     return MonitorSet.of(compiled_from(loaded.files or {}, known, topics=loaded.topics or {}))

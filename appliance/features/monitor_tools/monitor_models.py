@@ -1,6 +1,6 @@
 """Structs of `/v1/monitors` besides control's answers."""
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 
@@ -28,6 +28,15 @@ class PropertyShown(msgspec.Struct, frozen=True, kw_only=True):
     categories: list[str]
     handled: list[str]
     drawn: bool
+
+
+class Described(NamedTuple):
+    """The contents of a specification; `uses` are the monitors whose variables it uses; `hold` is its modifier."""
+
+    events: list[EventShown]
+    properties: list[PropertyShown]
+    uses: list[str]
+    hold: bool
 
 
 class Happened(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,8 +1,9 @@
 """Routes of `/v1/monitors`: monitors, their specifications and history, and changes with answers of their own."""
 
 import asyncio
+from functools import cached_property
 from pathlib import Path as FilePath
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import Path, Query, Response
 from msgspec.structs import asdict
@@ -23,8 +24,10 @@ from appliance.channel.answers.monitor_answers import (
     Monitors,
     MonitorState,
 )
-from appliance.features.monitor_tools.monitor_judgement import Compiler, Described
-from appliance.features.monitor_tools.monitor_models import Happened, History, Monitor, Replaced
+from appliance.features.monitor_tools.monitor_models import Described, Happened, History, Monitor, Replaced
+
+if TYPE_CHECKING:
+    from appliance.features.monitor_tools.monitor_judgement import Compiler
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
 _PICTURE = file("image/svg+xml", "OK")
@@ -38,8 +41,13 @@ class _Looking:
 
     def __init__(self, services: Services) -> None:
         self._services = services
-        self.compiler = Compiler()
         self.desk = LogReader(services)
+
+    @cached_property
+    def compiler(self) -> "Compiler":
+        from appliance.features.monitor_tools.monitor_judgement import Compiler  # noqa: PLC0415  150 modules
+
+        return Compiler()
 
     async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
         """Return the specifications, and the state of a monitor. Raises `ProblemError` (404)."""

@@ -17,7 +17,9 @@ from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
-from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
+from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
+from appliance.cli.connection.audit_file import FileLog
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.features.policy_tools.denials import asks_policy
@@ -61,10 +63,9 @@ def _explained(appliance: Appliance, record: str) -> Why:
                 err=True,
             )
             known = None
-        assert isinstance(appliance.way, AdminSocket)  # noqa: S101  it has no place
-        return explained(
-            found, known, recorded_in_full(appliance.way.audit().path, entry), appliance.host_in_words
-        )
+        source = audit_of(appliance.way)
+        assert isinstance(source, FileLog)  # noqa: S101  it has no place
+        return explained(found, known, recorded_in_full(source.path, entry), appliance.host_in_words)
 
 
 @speaks
@@ -154,7 +155,7 @@ def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
 
 
 def _entry(appliance: Appliance, record: str) -> LogEntry:
-    shown = appliance.audit().show(record, 0)
+    shown = audit_of(appliance.way).show(record, 0)
     if shown is None:
         _unknown(record)
     return shown.entry

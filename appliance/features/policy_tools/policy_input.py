@@ -22,6 +22,7 @@ from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli import output
 from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.features.policy_tools.recorded_requests import RecordedPeriod, period_since, request_of
 from appliance.policy.actions import BadWordError, find_host
@@ -156,7 +157,7 @@ def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
 
     def read(wanted: Filter) -> Iterator[LogEntry]:
         try:
-            yield from appliance.audit().export(wanted)
+            yield from audit_of(appliance.way).export(wanted)
         except (LogUnreadableError, NotRunningError, FilterError) as error:
             raise usage_error(str(error)) from error
 
@@ -172,7 +173,7 @@ def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
     """Yield the decided requests, except those of folded records, which do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
-        for entry in appliance.audit().export(decided):
+        for entry in audit_of(appliance.way).export(decided):
             record = entry.record
             if record.host is None or record.category not in set(Category) or record.resource is None:
                 continue

@@ -8,6 +8,7 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, rfc3339, rule_text
 from appliance.base.actors import actor
 from appliance.base.counted import counted
+from rosmop.run.why_lines import lines_of_why
 
 _TALLIES = ("reasons", "hosts", "callers", "resources", "calls")
 """The counts by name in a summary of repetitions (`repetition.py`)."""
@@ -82,8 +83,6 @@ def _own_lines(record: AuditRecord, host_in_words: Callable[[str], str]) -> Iter
         yield "this role may not read contents of messages"
         return
     if "why" in detail:
-        from rosmop.run.outcomes import lines_of_why  # noqa: PLC0415  slow to import, and few records need it
-
         yield from lines_of_why(_mapping(detail["why"]))
     is_verdict = record.event == "monitor verdict" or detail.get("would") == "verdict" or "handler" in detail
     if is_verdict and "why" not in detail and "count" not in detail:

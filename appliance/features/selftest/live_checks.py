@@ -12,6 +12,7 @@ from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.cli.status_verb import troubles_of
 from appliance.features.selftest.probe_nodes import TOPIC, ProbeError, call, message_through_the_relay
@@ -71,7 +72,7 @@ def _processes(rows: list[ProcessInfo]) -> Iterator[SelftestFinding]:
 
 
 def _audit(appliance: Appliance) -> Iterator[SelftestFinding]:
-    source = appliance.audit()
+    source = audit_of(appliance.way)
     try:
         last = source.last()
         if last > _MANY_RECORDS:
@@ -135,7 +136,7 @@ def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
 
 def _last(appliance: Appliance) -> int | None:
     try:
-        return appliance.audit().last()
+        return audit_of(appliance.way).last()
     except (LogUnreadableError, NotRunningError):
         return None
 
@@ -145,7 +146,7 @@ def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> b
 
     Raise `LogUnreadableError` or `NotRunningError` if the last query failed.
     """
-    source, deadline, pause = appliance.audit(), clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
+    source, deadline, pause = audit_of(appliance.way), clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:
         is_last = clock.now() > deadline
         try:

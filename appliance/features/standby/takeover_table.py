@@ -17,11 +17,12 @@ from appliance.features.standby.takeover_verification import (
 )
 
 
-def verified_pair(
+def verification(
     own: Path, verified: Verification, other: Path, state: Path, verify: Callable[[], Verification]
-) -> PairVerification:
+) -> tuple[PairVerification, Callable[[PairVerification], None]]:
     first, missing = VerifiedLog(own, verified), _absent(other, state)
-    return verify_alone(first, missing) if missing else verify_takeovers(first, VerifiedLog(other, verify()))
+    pair = verify_alone(first, missing) if missing else verify_takeovers(first, VerifiedLog(other, verify()))
+    return pair, print_pair
 
 
 def _absent(log: Path, state: Path) -> str:

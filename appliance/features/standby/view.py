@@ -62,4 +62,6 @@ STANDBY_VIEW = FeatureView(
         ),
     ),
     pair="appliance.features.standby.pair_view:StandbyPairView",
+    passive_status="appliance.features.standby.standby_view:standby_view",
+    verification="appliance.features.standby.takeover_table:verification",
 )

@@ -17,6 +17,7 @@ from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors
+from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span, time_given
 from appliance.cli.message_lines import lines_of
@@ -122,7 +123,7 @@ def publishers(
         then = now if at == "now" else time_given("--at", at, "rosrv topic")
         if then > now:
             raise usage_error(f"--at {at} is in the future")
-        log = appliance.audit()
+        log = audit_of(appliance.way)
         first = next(iter(log.search(Filter(), None, 1, newest_first=False).entries), None)
         found = publishers_at(log.export, first, topic, then)
     rows = [
