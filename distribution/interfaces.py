@@ -128,6 +128,28 @@ def modules_that_features_import() -> list[str]:
     return sorted(module for module in imported if not module.startswith("appliance.features."))
 
 
+_MACHINERY = (
+    "api", "audit.log.housekeeping", "audit.log.log", "audit.log.log_writer", "backup", "channel.channel",
+    "channel.child_process", "channel.link", "cli.connection", "compiler", "control", "forwarding", "hosts", "master",
+    "relay", "rpc", "specifications", "store", "supervisor", "telemetry",
+)  # fmt: skip
+"""The folders and modules with state, processes or connections of the core."""
+
+
+def _is_machinery(module: str) -> bool:
+    below = module.removeprefix("appliance.")
+    return any(below == folder or below.startswith(f"{folder}.") for folder in _MACHINERY)
+
+
+def machinery_that_features_import() -> list[str]:
+    return [module for module in modules_that_features_import() if _is_machinery(module)]
+
+
+def libraries_that_features_import() -> list[str]:
+    """Return formats, texts, codecs and other code without state of the core, which any program may import."""
+    return [module for module in modules_that_features_import() if not _is_machinery(module)]
+
+
 def names_of_a_feature() -> list[str]:
     """Return the fields of a feature and of its part, and the names that the core looks for in its files."""
     names = [
@@ -249,7 +271,8 @@ def uses_of_any() -> list[str]:
 
 
 COUNTS = (
-    Count("imported", "core modules that features import", 238, 15, modules_that_features_import),
+    Count("machinery", "core modules with state or connections that features import", 96, 74, machinery_that_features_import),
+    Count("libraries", "core modules without state that features import", 137, 137, libraries_that_features_import),
     Count("names", "names of a feature, of its files and of its part", 19, 10, names_of_a_feature),
     Count("phases", "phases of a feature in control", 1, 1, phases_of_a_feature),
     Count("late", "late imports in product code", 15, 10, late_imports),

@@ -19,9 +19,8 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.hosts.appliances import CERTIFICATE_DAYS, Appliances
-from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
 from appliance.hosts.host_table import HostRefusedError, HostTable
-from appliance.hosts.stored_authority import StoredAuthority
 from appliance.policy.model import Address, address_of
 from appliance.telemetry.audit_trail import AuditTrail
 

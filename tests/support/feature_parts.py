@@ -32,7 +32,7 @@ from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
 from appliance.features.table import TOOLS
 from appliance.hosts.appliances import Appliances
-from appliance.hosts.stored_authority import StoredAuthority
+from appliance.hosts.certificate_requests import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.host_signs import HostSigns

@@ -1,6 +1,7 @@
 """Errors as clients get them: problem details (RFC 9457)."""
 
 import http
+import re
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from appliance.channel.answers.field_docs import doc
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope for the reason of its answer
 _MOST_FINDINGS = 200
+_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -102,3 +104,22 @@ def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
 def defect(error: Exception) -> ProblemError:
     """Return the answer to a defect, which reveals only the type of the error."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")
+
+
+def findings_of(texts: list[str]) -> list[Finding]:
+    """Return the findings in control's texts about specifications, each with its place."""
+    return [
+        Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
+        for file, line, column, severity, text in (
+            found.groups() for found in map(_PLACE.fullmatch, texts) if found is not None
+        )
+    ]
+
+
+def refusal(error: str, findings: list[str]) -> ProblemError:
+    return ProblemError(
+        422,
+        "specifications-refused",
+        "\n".join([error, *findings[:_MOST_FINDINGS]]),
+        findings=findings_of(findings) or None,
+    )

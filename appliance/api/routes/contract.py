@@ -10,7 +10,7 @@ from fastapi.openapi.utils import get_openapi
 from appliance.api.front import moments
 from appliance.api.front.problems import MEDIA_TYPE, Problem
 from appliance.api.front.routing import CONTRACT
-from appliance.api.routes.shown_records import RECORD
+from appliance.api.routes.log_reader import RECORD
 
 # Answers that the request gate may give to any call.
 _ALWAYS = {

@@ -1,24 +1,28 @@
 """Read the audit log for routes, in a limited number of threads. The api cannot write the log."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, TypeVar
 
 from fastapi import Path
 
 from appliance.api.front.access import Bearer
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.route_roles import ask
+from appliance.api.front.route_roles import ask, reads_contents
 from appliance.api.front.routing import Responses
 from appliance.api.front.services import Services
 from appliance.api.routes.named_hosts import has_name, with_networks
 from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record_format import LogEntry, as_json, without_contents
+from appliance.audit.log.schema import json_schema
 from appliance.audit.log.signatures import KeyUnreadableError
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import RecordInContext, show
 from appliance.channel.admin import PolicyWanted
 
 _T = TypeVar("_T")
+RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
+RECORD_REFERENCE = {"$ref": "#/components/schemas/AuditRecord"}
 UNKNOWN: Responses = {404: {"description": "There is no such record."}}
 OneRecord = Annotated[
     str,
@@ -63,3 +67,17 @@ class LogReader:
             raise ProblemError(422, "bad-input", str(error)) from error
         except (LogUnreadableError, KeyUnreadableError) as error:
             raise ProblemError(503, "log-unreadable", str(error)) from error
+
+
+def readable(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[LogEntry]:
+    """Return the records as the client may read them, without those that match `text` only in hidden parts."""
+    found = []
+    for entry in entries:
+        shown = readable_by(entry, bearer)
+        if shown is entry or text is None or text.casefold() in as_json(shown).casefold():
+            found.append(shown)
+    return found
+
+
+def readable_by(entry: LogEntry, bearer: Bearer) -> LogEntry:
+    return entry if reads_contents(bearer) else without_contents(entry)

@@ -11,13 +11,12 @@ from pydantic import StringConstraints, create_model
 
 from appliance.api.front.access import Bearer
 from appliance.api.front.etags import etag
-from appliance.api.front.problems import ProblemError
+from appliance.api.front.problems import ProblemError, refusal
 from appliance.api.front.recording_id import CONVERTORS
 from appliance.api.front.request_gate import asked_of
 from appliance.api.front.route_roles import answered, problem_of, requires
 from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
 from appliance.api.front.services import Services
-from appliance.api.routes.specification_findings import refusal
 from appliance.channel.admin import MONITORS, A, AdminAnswer, AdminRequest, answer_to
 from appliance.channel.answers.token_answers import may
 from appliance.channel.messages.api import ClientRequest

@@ -6,10 +6,9 @@ from typing import NamedTuple
 from appliance.channel.link import Link
 from appliance.configuration.settings import Settings
 from appliance.hosts.appliances import Appliances
-from appliance.hosts.certificate_requests import Authority
+from appliance.hosts.certificate_requests import Authority, StoredAuthority
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
-from appliance.hosts.stored_authority import StoredAuthority
 from appliance.signing.fingerprints import fingerprint
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail

@@ -4,7 +4,7 @@ import pathlib
 from typing import Any
 
 from appliance.api.front.access import Bearer
-from appliance.api.routes.shown_records import RECORD_REFERENCE, readable
+from appliance.api.routes.log_reader import RECORD_REFERENCE, readable
 from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.search.equality import equality_of
 from appliance.audit.search.query import Filter

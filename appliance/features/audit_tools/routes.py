@@ -20,8 +20,14 @@ from appliance.api.front.route_roles import Operator, Viewer, reads_contents
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Streams, Work, in_thread, peer_of
-from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord
-from appliance.api.routes.shown_records import RECORD_REFERENCE, readable, readable_by
+from appliance.api.routes.log_reader import (
+    RECORD_REFERENCE,
+    UNKNOWN,
+    LogReader,
+    OneRecord,
+    readable,
+    readable_by,
+)
 from appliance.audit.log.record import Severity
 from appliance.audit.log.record_format import as_object
 from appliance.audit.proof.chain_findings import Verification

@@ -1,7 +1,6 @@
 """Compile the specifications in force from their texts, to describe and draw them."""
 
-from appliance.api.front.problems import Finding
-from appliance.api.routes.specification_findings import findings_of
+from appliance.api.front.problems import Finding, findings_of
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.features.monitor_tools.monitor_models import Described, EventShown, PropertyShown
 from rosmop.check.sources import compiled_from

@@ -9,13 +9,12 @@ from fastapi import Path, Query, Response
 from msgspec.structs import asdict
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.problems import ProblemError
+from appliance.api.front.problems import ProblemError, findings_of
 from appliance.api.front.route_roles import Viewer, ask, reads_contents
 from appliance.api.front.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import LogReader
 from appliance.api.routes.operation_routes import Answer, AnsweringRoutes, OperationCall
-from appliance.api.routes.specification_findings import findings_of
 from appliance.audit.log.record_format import LogEntry, rfc3339, without_contents
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search

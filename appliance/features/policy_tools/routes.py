@@ -13,10 +13,9 @@ from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask, ask_optional
 from appliance.api.front.routing import Responses, Routes, body
 from appliance.api.front.services import Services
-from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord
+from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord, readable_by
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.api.routes.operation_routes import AnsweringRoutes
-from appliance.api.routes.shown_records import readable_by
 from appliance.audit.search.search import recorded_in_full
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import Granted, Why

@@ -13,9 +13,8 @@ from appliance.base import clock
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.features.standby.replication_frames import Introduction
 from appliance.hosts.appliances import CERTIFICATE_DAYS, Appliances
-from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.hosts.stored_authority import StoredAuthority
 from appliance.store.host_tables import ApplianceRow, HostTables
 
 _RENEWED_DAYS = 60.0  # at least these days are left when the standby takes over

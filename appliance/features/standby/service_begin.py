@@ -13,13 +13,13 @@ from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.core import ControlPart
 from appliance.control.operators.request_method import RequestMethod
+from appliance.control.start_rehearsal import lacking_room
 from appliance.features.standby import lease_link
 from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.features.standby.orders import ActiveAppliance, SingleAppliance, StandbyOrders
 from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
-from appliance.features.standby.takeover_check import lacking_room
 from appliance.features.standby.takeover_record import TakeoverRecorder
 
 _REPAIR_SECONDS = 8.0

@@ -7,8 +7,7 @@ A revoked host is shut out anyway, because charon loads no connection for it.
 import datetime
 
 from appliance.base import clock
-from appliance.hosts.certificate_requests import Authority, AuthorityError
-from appliance.hosts.stored_authority import StoredAuthority
+from appliance.hosts.certificate_requests import Authority, AuthorityError, StoredAuthority
 from appliance.store.host_tables import AuthorityRow, HostTables
 
 LIST_DAYS = 30.0  # strongSwan accepts a list for so long (`certificate_authority.REVOCATIONS_DAYS`)

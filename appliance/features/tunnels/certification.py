@@ -18,9 +18,8 @@ from appliance.features.tunnels.host_answers import AuthorityCertificate, KitPar
 from appliance.features.tunnels.host_view import soon
 from appliance.features.tunnels.rest_address import RestAddress
 from appliance.hosts.appliances import Appliances
-from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
-from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore

@@ -11,9 +11,8 @@ from appliance.features.standby.appliance_table import ApplianceTable
 from appliance.features.standby.replication_frames import Introduction
 from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.appliances import Appliances
-from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.hosts.stored_authority import StoredAuthority
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase

@@ -53,6 +53,7 @@ from appliance.features.tunnels.requests import (
 )
 from appliance.features.tunnels.rest_address import RestAddress
 from appliance.hosts.appliances import Appliances
+from appliance.hosts.certificate_requests import StoredAuthority
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,
@@ -61,7 +62,6 @@ from appliance.hosts.host_table import (
 )
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.policy.model import Address

@@ -1,4 +1,4 @@
-from appliance.api.routes.specification_findings import findings_of, refusal
+from appliance.api.front.problems import findings_of, refusal
 
 
 def test_findings_without_a_position_stay_in_the_detail() -> None:
