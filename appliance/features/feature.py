@@ -1,15 +1,7 @@
 """Define everything that a feature can add to the core.
 
-A feature is a folder with these files, of which only `feature.py` must exist. Each process imports the files that it
-needs, so only `feature.py` must be fast to import.
-
-| file | content | imported by |
-|---|---|---|
-| `feature.py` | `FEATURE`, with the names of `Feature` or `Tool` | every process |
-| `requests.py` | `REQUESTS`, and `PUBLIC`: paths that need no token | control, api, verbs |
-| `routes.py` | `routes(services)`, which may be `AnsweringRoutes` | api |
-| `control_part.py` | `begin(core)`: `appliance/control/core.py` has all that it may use | control |
-| `view.py` | the fields of `rosrv status`, their alarms and metrics (`views.py` lists them) | status, metrics |
+`docs/dev/architecture.md` lists the files of a feature. Each process loads `feature.py`, so it must be fast to import; of
+the others it loads those that it needs.
 
 The core knows only this module and `table.py`. No feature imports another one. `feature.py` does not import
 `configuration.settings`, because the settings import the table.
