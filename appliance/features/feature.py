@@ -1,7 +1,7 @@
 """Define everything that a feature can add to the core.
 
-`docs/dev/architecture.md` lists the files of a feature. Each process loads `feature.py`, so it must be fast to import.
-Of the others, a process loads those that it needs.
+`docs/dev/architecture.md` lists the files of a feature. Each process loads `feature.py`, so it must be fast to import,
+and those of the other files that it needs.
 
 The core knows only this module and `table.py`. No feature imports another one. `feature.py` does not import
 `configuration.settings`, because the settings import the table.

@@ -1,9 +1,10 @@
 """Load the library for netlink when a network is first changed: it has 200 modules, and most verbs change none."""
 
-from typing import Any
+from types import ModuleType
 
 
-def library() -> Any:
+def library() -> ModuleType:
     import pyroute2  # noqa: PLC0415  see the head
 
-    return pyroute2
+    module: ModuleType = pyroute2
+    return module

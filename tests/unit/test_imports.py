@@ -26,7 +26,9 @@ PUBLIC = {
     "form.findings": "errors of a text, and their positions",
     "run.engine": "`MonitorSet`",
     "run.fast_path": "lanes of the fast path",
+    "logics.picture": "drawing the automata of properties",
     "run.outcomes": "what came of a message, and why",
+    "run.why_lines": "why, as text",
     "types.given_lists": "values of lists that operators give",
     "types.roles": "the message types of a topic's role",
 }
