@@ -6,7 +6,7 @@ The relay decides with the product's own grant table. Its connections are rows, 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from appliance.channel import messages
 from appliance.configuration.settings import Audit, LivenessSection, Settings
@@ -208,7 +208,7 @@ class Appliance:
         mine, its = LinkEnd.pair(self.supervisor, self.lease)
         self._lease_lifeline = mine
         mine.process.run(mine.attach, None, self._heard_lease, lambda: None)
-        made = self.lease.run(LeaseProcess, self.membership, cast(Any, its), self.state / EPOCH)
+        made = self.lease.run(LeaseProcess, self.membership, its, self.state / EPOCH)
         self.lease.start(made.run()).add_done_callback(self.world.done)
 
     def _heard_lease(self, message: Any, _descriptors: tuple[Any, ...]) -> None:

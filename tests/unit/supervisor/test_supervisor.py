@@ -4,7 +4,7 @@ import signal
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import msgspec
 import pytest
@@ -226,7 +226,7 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     supervisor.control_said(control, CompilerWanted(), ())
     assert filled == [0]
     slot.process, slot.starts = handle(StandIn()), 1
-    cast(Any, slot.process).started = 0.0
+    slot.process.started = 0.0
     if wanted:
         supervisor.control_said(control, CompilerWanted(), ())
     supervisor.died(slot.process, 0)
@@ -234,7 +234,7 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     assert slot.is_free
     assert slot.starts == 0
     slot.process, slot.starts = handle(StandIn()), 1
-    cast(Any, slot.process).started = 0.0
+    slot.process.started = 0.0
     supervisor.died(slot.process, -9)
     assert slot.due is not None  # each death is followed by a new start
     slot.due.cancel()

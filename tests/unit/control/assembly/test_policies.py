@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -68,7 +68,7 @@ class Appliance:
         self.records = Records()
         self.ends = ends_of(store, self.state)
         policies = Policies(
-            self.file, store, self.ends, cast(Any, self.records), CurrentPolicy(), live=live, changed=changed,
+            self.file, store, self.ends, self.records, CurrentPolicy(), live=live, changed=changed,
             carried_out=at_once,
             known=lambda: PolicyContext(
                 hosts(), blocks=blocks(), holders=holders(), approved=approved(), site_keys=site_keys

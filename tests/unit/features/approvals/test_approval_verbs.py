@@ -24,7 +24,7 @@ def test_an_operator_sees_that_arguments_are_cut(
     data = (5000).to_bytes(4, "little") + b"x" * 4092
     row = Approval(48213, "waits", *REST, data.hex(), size, 60.0, "")  # type: ignore[arg-type]  # of a tuple
     fake = SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=lambda _request: Approvals([row]))
-    cast(Any, verbs.approve).function(cast(Appliance, fake), None)
+    verbs.approve.function(fake, None)
     assert shown in capsys.readouterr().out
 
 
@@ -50,7 +50,7 @@ def test_an_operator_sees_every_byte_of_the_arguments(
     call = ("10.0.0.7", "/agent", "call", "/set", service, "4bf5")
     row = Approval(48213, "waits", *call, data.hex(), len(data), 60.0, "")  # type: ignore[arg-type]  # of a tuple
     fake = SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=lambda _request: Approvals([row]))
-    cast(Any, verbs.approve).function(cast(Appliance, fake), None)
+    verbs.approve.function(fake, None)
     assert shown in capsys.readouterr().out
 
 
@@ -83,7 +83,7 @@ def test_the_watch_goes_on_while_the_appliance_restarts(
     fake = SimpleNamespace(
         as_json=False, host_in_words=lambda host: f"agent ({host})", ask=ask, body_or_exit=lambda one: one
     )
-    cast(Any, verbs.approve).function(cast(Appliance, fake), None, watch=True)
+    verbs.approve.function(fake, None, watch=True)
     out, err = capsys.readouterr()
     assert "7: agent (10.0.0.7) call /log" in out
     assert "rosrv approve 7 --for 30s" in out
@@ -100,7 +100,7 @@ def test_a_call_is_refused_by_both_names_of_the_verb(capsys: pytest.CaptureFixtu
         return refused
 
     fake = cast(Appliance, SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=answer_or_exit))
-    cast(Any, verbs.refuse).function(fake, 7)
-    cast(Any, verbs.approve).function(fake, 7, refused=True)
+    verbs.refuse.function(fake, 7)
+    verbs.approve.function(fake, 7, refused=True)
     assert asked == [RefuseCall(7), RefuseCall(7)]
     assert "rosrv approve --refuse is now rosrv approval refuse 7" in capsys.readouterr().err

@@ -77,14 +77,14 @@ class Control(ControlParts):
         self.remotes: dict[str, str] = {}
         self.uses: list[str] = []
         self.policies = Policies(
-            state / "policy.ini", self.state, self.ends, cast(Any, self.records), CurrentPolicy(),
+            state / "policy.ini", self.state, self.ends, self.records, CurrentPolicy(),
             known=lambda: PolicyContext(robot=[ipaddress.ip_network(ROBOT)], blocks=self.blocks.reasons),
             live=list, changed=self.changed, carried_out=at_once,
         )  # fmt: skip
         self.policies.start(restarted=False)
         self.current = self.policies.current
         self.orders = BlockOrders(
-            self.blocks, self.policies, self.state, cast(Any, self.records), self.ends, live=self.revocation.live,
+            self.blocks, self.policies, self.state, self.records, self.ends, live=self.revocation.live,
             connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes,
             uses=lambda _host: self.uses, carried_out=at_once, is_own=lambda address: str(address) == OURS,
         )  # fmt: skip

@@ -1,5 +1,5 @@
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 from appliance.base import clock
 from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
@@ -14,7 +14,7 @@ def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
     with clock.using(machine):
         for number in range(MOST_SHOWN + 10):
             machine.advance(1.0)
-            clients.append(CountedClient(cast(Any, session), f"10.0.0.{number}", "", []))
+            clients.append(CountedClient(session, f"10.0.0.{number}", "", []))
     session.received, session.refusals = 600, 2
     for _sample in range(60 // SAMPLE_SECONDS):
         session.received += 5

@@ -1,5 +1,4 @@
 from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
@@ -43,7 +42,7 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
         "_processes": SimpleNamespace(pass_on=lambda *_given: True),
         "_used": {},
     }
-    assert cast(Any, orders).enter("alice", ticket, peer, 3)[0] == status
+    assert orders.enter("alice", ticket, peer, 3)[0] == status
     assert [(one["host"], one["decision"]) for one in trail.rows] == (
         [] if decision is None else [(peer, decision)]
     )

@@ -5,7 +5,7 @@ import random
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -85,7 +85,7 @@ class Site:
             rosmaster=self,
             mirror=self.parameters,
             trail=self.trail,
-            rights=ParameterRights(lambda: self.policy, cast(Any, self.trail)),
+            rights=ParameterRights(lambda: self.policy, self.trail),
             addresses=self,
             offload=OFFLOAD,
         ).handler()
