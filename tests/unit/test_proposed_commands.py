@@ -14,7 +14,9 @@ import typer
 from rosrv_fleet.cli import app as fleet_app
 
 from appliance.cli import main
-from distribution.counts import no_collector, nodes
+from distribution import counts
+from distribution.counts import nodes
+from distribution.fact_cache import facts_of_files
 from rosmop.tool.command import app as rosmop_app
 from tests.support.sources import LANGUAGE_TESTS, ROOT
 
@@ -55,14 +57,20 @@ def proposals() -> dict[str, str]:
     """Return the proposed commands, each with the name of a file that proposes it."""
     found: dict[str, str] = {}
     files = [file for folder in ("appliance", "fleet", "rosmop") for file in (ROOT / folder).rglob("*.py")]
-    for file in [*files, *ROOT.glob("appliance/**/console/**/*.js")]:
-        if LANGUAGE_TESTS in file.parents:
-            continue
-        for text in texts(file):
-            for program, call in _PROPOSED.findall(text):
-                whole = re.split(r"[.:] ", f"{call} ")[0].strip().rstrip(".:…")
-                found.setdefault(f"{program} {whole}", file.name)
+    files += ROOT.glob("appliance/**/console/**/*.js")
+    product = [file for file in files if LANGUAGE_TESTS not in file.parents]
+    code = (__file__, counts.__file__)
+    for name, proposed in facts_of_files(tuple[str, ...], proposed_by, product, code=code).items():
+        for call in proposed:
+            found.setdefault(call, Path(name).name)
     return found
+
+
+def proposed_by(file: Path) -> tuple[str, ...]:
+    calls = [each for text in texts(file) for each in _PROPOSED.findall(text)]
+    return tuple(
+        f"{program} {re.split('[.:] ', f'{call} ')[0].strip().rstrip('.:…')}" for program, call in calls
+    )
 
 
 @functools.cache
@@ -129,8 +137,7 @@ def test_each_proposed_command_is_accepted(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setenv("ROSRV_FLEET_COLLECTOR", "https://10.0.0.9:8450")  # as its pages ask for
     monkeypatch.setenv("ROSRV_FLEET_CA", "ca.pem")
     monkeypatch.setenv("ROSRV_FLEET_TOKEN_FILE", "token")
-    with no_collector():
-        found = proposals()
+    found = proposals()
     wrong = [
         f"{file} proposes: {proposal}: {why}" for proposal, file in found.items() if (why := _wrong(proposal))
     ]
