@@ -20,3 +20,9 @@ def test_a_page_that_moves_to_the_reference_is_cut_from_the_guides_only() -> Non
     moved = Path("docs/guards.md")
     assert 0 < len(moved.read_text().split()) < words()["guides"] < words()["pages"]
     assert words()["pages"] == sum(len(page.read_text().split()) for page in Path("docs").rglob("*.md"))
+
+
+def test_the_guides_stay_short_and_the_index_begins_with_twelve_pages() -> None:
+    """What does not fit is a row of the reference, or replaces words of a guide."""
+    first = Path("docs/README.md").read_text().split("\n## ")[1]
+    assert (words()["guides"] <= 40_000, first.count("\n| [")) == (True, 12)
