@@ -3,7 +3,7 @@
 It never stops at a failure, and ends with a table of the stages and the list of the failures. `--from STAGE`
 (`make nightly FROM=nodes`) resumes: the results of the same commit stand for the stages before it.
 `build/nightly/results.json` has passes, failures and seconds of each test, and the commit, start, end and load average
-of each run. Runs of the same commit add up. A stage that leaves network namespaces behind, and a robot's start
+of each run. Runs of the same commit add up. Network namespaces that are left after a stage, and a robot's start
 (`benchmarks/launch.py`) or a delay of a lone message (`benchmarks/cold.py`) that differs by more than 20 % from the
 table in `benchmarks/RESULTS.md`, are printed as findings. The exit status is 1 if a test failed that
 `tests/unsteady.txt` does not list, or if one of these programs failed.
@@ -266,7 +266,7 @@ def run_step(name: str, lane: str, results: dict[str, Any]) -> None:
         [stage] = (stage for stage in STAGES if stage.name == name)
         outcomes, wrong = run_stage(stage, files_of(name, lane))
         left = sorted(_namespaces() - namespaces)
-        findings = [f"finding: {name} left the network namespaces {', '.join(left)}"] if left else []
+        findings = [f"finding: new network namespaces after {name}: {', '.join(left)}"] if left else []
     _add(results["tests"], outcomes)
     results["findings"] += findings
     failed = [test for test, outcome, _seconds in outcomes if outcome == "failed"]

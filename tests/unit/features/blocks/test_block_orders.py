@@ -3,12 +3,11 @@ import contextlib
 import ipaddress
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
-from appliance.base.age_clock import AgeClock
-from appliance.base.clock import using, wall
+from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
@@ -27,16 +26,15 @@ from appliance.master.graph.registry import Kind
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import CurrentPolicy, Policy
-from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
-from tests.support.virtual_clock import VirtualClock
+from tests.support.virtual_clock import let_time_pass, set_wall
 
 pytestmark = pytest.mark.anyio
 NODE, ROBOT, OTHER, OURS = "10.0.0.5", "10.0.0.1", "10.0.0.7", "10.0.0.2"
-SECOND = 1_000_000_000
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -48,31 +46,13 @@ async def until(condition: Callable[[], object]) -> None:
 async def at_once() -> None: ...
 
 
-class Clock:
-    def __init__(self) -> None:
-        self.now = 1_700_000_000 * SECOND
-
-    def __call__(self) -> int:
-        return self.now
-
-    def dated(self, date: int) -> int:
-        return date
-
-    def uncounted(self, _date: int) -> int:
-        return 0
-
-    def advance(self, seconds: float) -> None:
-        self.now += int(seconds * SECOND)
-
-
 class Control(ControlParts):
-    def __init__(self, state: Path, clock: Clock, connected: list[set[str]], text: str = OPEN) -> None:
+    def __init__(self, state: Path, connected: list[set[str]], text: str = OPEN) -> None:
         super().__init__()
         state.mkdir(exist_ok=True)
         (state / "policy.ini").write_text(text)
         self.state = StateStore(state, failed=print, kind=InlineDatabase)
-        self.clock = clock
-        self.ends = EndTable(self.state, cast(AgeClock, clock))
+        self.ends = ends_of(self.state, state)
         self.blocks = host_blocks.BlockTable(self.state, self.ends)
         self.remotes: dict[str, str] = {}
         self.uses: list[str] = []
@@ -90,7 +70,7 @@ class Control(ControlParts):
         )  # fmt: skip
 
     def advance(self, seconds: float) -> None:
-        self.clock.advance(seconds)
+        let_time_pass(seconds)
         self.ends.read_clock()
         self.ends.look()
 
@@ -120,9 +100,9 @@ class Control(ControlParts):
 
 @contextlib.asynccontextmanager
 async def control(
-    tmp_path: Path, clock: Clock, connected: list[set[str]] | None = None, text: str = OPEN
+    tmp_path: Path, connected: list[set[str]] | None = None, text: str = OPEN
 ) -> AsyncIterator[Control]:
-    made = Control(tmp_path / "state", clock, connected or [], text)
+    made = Control(tmp_path / "state", connected or [], text)
     timer = asyncio.create_task(made.ends.run())
     made.keep(timer)
     await made.round()
@@ -136,7 +116,7 @@ async def control(
 
 
 async def test_a_block_ends_everything_and_what_is_lifted_returns(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock(), [{NODE, ROBOT}, {ROBOT, OTHER}]) as made:
+    async with control(tmp_path, [{NODE, ROBOT}, {ROBOT, OTHER}]) as made:
         node = made.node("/talker")
         await made.register(node, Kind.PUBLICATION, "/scan")
         await made.register(node, Kind.PUBLICATION, "/odom")
@@ -157,7 +137,7 @@ async def test_a_block_ends_everything_and_what_is_lifted_returns(tmp_path: Path
 
 
 async def test_the_reason_names_who_until_note_and_remedy(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         await made.block(NODE, 3600, note="strange traffic")
         reason = made.denial(NODE)
         assert reason is not None
@@ -171,14 +151,14 @@ async def test_the_reason_names_who_until_note_and_remedy(tmp_path: Path) -> Non
 
 async def test_audit_only_sections_deny_a_blocked_host(tmp_path: Path) -> None:
     text = "[Options]\naudit-only=all\n" + OPEN.replace("default=*", "default=10.0.0.9")
-    async with control(tmp_path, Clock(), text=text) as made:
+    async with control(tmp_path, text=text) as made:
         assert made.denial(NODE) is None
         await made.block(NODE)
         assert made.denial(NODE) is not None
 
 
 async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         made.faces.go.clear()
         call = asyncio.create_task(
             made.ask("registerPublisher", "/talker", "/scan", "t/T", f"http://{NODE}:4001/")
@@ -193,7 +173,7 @@ async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: 
 
 
 async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         await made.block(OTHER)
         with awaited(lambda: True):
             with pytest.raises(WithdrawnError):
@@ -204,43 +184,41 @@ async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> 
 
 
 async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(tmp_path: Path) -> None:
-    clock, machine = Clock(), VirtualClock()
-    with using(machine):
-        async with control(tmp_path, clock) as made:
-            node = made.node("/talker")
-            await made.register(node, Kind.PUBLICATION, "/scan")
-            await made.block(NODE, 3600)
-            await made.block(OTHER)
-            machine.set_wall(4e9)
-            made.advance(3599.9)
-            assert await made.blocked() == [NODE, OTHER]
-            made.advance(0.1)
-            await until(lambda: made.denial(NODE) is None)
-            await made.settle()
-            assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
-            assert await made.blocked() == [OTHER]
-            assert ("host block ended", None) in made.records.pairs
+    async with control(tmp_path) as made:
+        node = made.node("/talker")
+        await made.register(node, Kind.PUBLICATION, "/scan")
+        began = clock.now()
+        await made.block(NODE, 3600)
+        await made.block(OTHER)
+        set_wall(4e9)
+        made.advance(3599.9)
+        assert await made.blocked() == [NODE, OTHER]
+        await until(lambda: made.denial(NODE) is None)
+        assert clock.now() - began == pytest.approx(3600, abs=0.05)
+        await made.settle()
+        assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
+        assert await made.blocked() == [OTHER]
+        assert ("host block ended", None) in made.records.pairs
 
 
 async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path: Path) -> None:
-    clock = Clock()
-    async with control(tmp_path, clock) as made:
+    async with control(tmp_path) as made:
         await made.block(NODE, 3600, note="a")
         await made.block(OTHER, 60)
-    clock.advance(61)
-    async with control(tmp_path, clock) as made:
+    let_time_pass(61)
+    async with control(tmp_path) as made:
         await until(lambda: made.denial(OTHER) is None)
         assert (made.denial(NODE) or "").startswith(f"{NODE} is blocked by ann until")
         [row] = (await made.orders.listed(HostBlocks())).blocks
         assert (row.address, row.note) == (NODE, "a")
         assert row.until is not None
-        assert abs(row.until - (wall() + 3539)) < 30
-    async with control(tmp_path, clock) as made:
+        assert abs(row.until - (clock.wall() + 3539)) < 30
+    async with control(tmp_path) as made:
         assert await made.blocked() == [NODE]
 
 
 async def test_a_second_block_replaces_the_first(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         await made.block(NODE, 60, note="first")
         answer = await made.block(f"::ffff:{NODE}", note="second")
         assert answer.replaced is not None
@@ -250,7 +228,7 @@ async def test_a_second_block_replaces_the_first(tmp_path: Path) -> None:
 
 
 async def test_spellings_and_names_of_a_host_are_one_block(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         for text in (f"::ffff:{NODE}", "::FFFF:a00:5", "fd00::0:1", "fe80::1%eth0", "ocu-1", "host:ocu-1"):
             await made.block(text)
         assert await made.blocked() == [NODE, "fd00::1", "fe80::1", "10.99.0.2"]
@@ -263,7 +241,7 @@ async def test_spellings_and_names_of_a_host_are_one_block(tmp_path: Path) -> No
 
 
 async def test_the_answer_names_other_addresses_of_the_machine(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         made.remotes = {"ocu-1": "192.0.2.20"}
         assert (await made.block("192.0.2.20")).other_addresses == ["10.99.0.2"]
         assert (await made.block("ocu-1")).other_addresses == []
@@ -275,7 +253,7 @@ async def test_the_answer_names_other_addresses_of_the_machine(tmp_path: Path) -
     "text", ["10.0.0.300", "10.0.0.0/24", "", "ocu-2", "10.0.0.5%eth0", "010.0.0.5", "x" * 500, "10.0.0.5\n"]
 )
 async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         with pytest.raises(SenselessError, match=r"is not (an address|one host)"):
             await made.block(text)
         assert await made.blocked() == []
@@ -290,7 +268,7 @@ async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> Non
     ],
 )  # fmt: skip
 async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str, reason: str) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         with pytest.raises(HostRefusedError, match=reason):
             await made.block(text, force=True)
 
@@ -303,20 +281,20 @@ def test_own_addresses_are_those_that_a_socket_can_have() -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, 0.5, 365 * 86_400 + 1, float("nan"), float("inf")])
 async def test_a_duration_out_of_bounds_is_rejected(tmp_path: Path, seconds: float) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         with pytest.raises(SenselessError, match="1 second to 365 days"):
             await made.block(NODE, seconds)
 
 
 @pytest.mark.parametrize("note", ["n" * 201, "a\nb", "\x1b[31m"])
 async def test_a_note_is_short_and_printable(tmp_path: Path, note: str) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         with pytest.raises(SenselessError, match="at most 200 characters"):
             await made.block(NODE, note=note)
 
 
 async def test_the_robot_is_blocked_only_by_force(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock(), [{ROBOT, OTHER}, {OTHER}]) as made:
+    async with control(tmp_path, [{ROBOT, OTHER}, {OTHER}]) as made:
         with pytest.raises(HostRefusedError, match=r"robot's own host: .* 0 registrations and 1 connection"):
             await made.block(ROBOT)
         assert made.denial(ROBOT) is None
@@ -326,7 +304,7 @@ async def test_the_robot_is_blocked_only_by_force(tmp_path: Path) -> None:
 
 async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path: Path) -> None:
     """One wrong digit must not stop the robot, whose nodes may be on any host."""
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         for host, name in ((NODE, "/driver"), (OTHER, "/console")):
             node = made.node(name, host=address_of(host))
             for number in range(11):
@@ -342,7 +320,7 @@ async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path:
 
 async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("appliance.features.blocks.orders.MOST", 2)
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         await made.block(NODE)
         await made.block(OTHER)
         with pytest.raises(HostRefusedError, match="2 hosts are blocked, the limit"):
@@ -353,16 +331,15 @@ async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pyte
 
 
 async def test_only_a_blocked_host_can_be_unblocked(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         with pytest.raises(UnknownThingError, match=f"{NODE} is not blocked: `rosrv host blocks`"):
             await made.unblock(NODE)
 
 
 async def test_an_order_at_the_moment_of_the_end_finds_one_state(tmp_path: Path) -> None:
-    clock = Clock()
-    async with control(tmp_path, clock) as made:
+    async with control(tmp_path) as made:
         await made.block(NODE, 60)
-        clock.advance(60)
+        let_time_pass(60)
         made.ends.read_clock()
         orders = asyncio.gather(
             made.unblock(NODE), made.unblock(NODE), made.block(OTHER), return_exceptions=True
@@ -385,7 +362,7 @@ async def test_a_block_that_is_not_stored_is_in_force_and_says_so(
     async def full() -> None:
         raise StoreError("state.db: no space left")
 
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         monkeypatch.setattr(made.state, "settled", full)
         with pytest.raises(StoreError, match="is blocked now, but a stop of the appliance ends it"):
             await made.block(NODE)
@@ -393,7 +370,7 @@ async def test_a_block_that_is_not_stored_is_in_force_and_says_so(
 
 
 async def test_a_policy_that_is_loaded_keeps_the_blocks(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         await made.block(NODE)
         made.policies.file.write_text(OPEN + "# changed\n")
         await made.policies.reload(PolicyReload(), "operator")
@@ -405,7 +382,7 @@ async def test_a_policy_that_is_loaded_keeps_the_blocks(tmp_path: Path) -> None:
 
 
 async def test_a_dry_run_names_everything_and_blocks_nothing(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock(), [{NODE, ROBOT}]) as made:
+    async with control(tmp_path, [{NODE, ROBOT}]) as made:
         await made.register(made.node("/talker"), Kind.PUBLICATION, "/scan")
         made.uses = ["session of ann (REST, last call 3 s ago)", "1 connection to the door alice"]
         answer = await made.block(NODE, 60, dry_run=True)
@@ -417,7 +394,7 @@ async def test_a_dry_run_names_everything_and_blocks_nothing(tmp_path: Path) -> 
 
 
 async def test_a_tunnel_is_named_that_the_block_ends(tmp_path: Path) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         made.remotes = {"ocu-1": "192.0.2.20"}
         for either in ("ocu-1", "192.0.2.20"):
             assert (await made.block(either, dry_run=True)).ended.uses == [
@@ -428,7 +405,7 @@ async def test_a_tunnel_is_named_that_the_block_ends(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("address", [NODE, "ocu-1"])
 async def test_the_callers_own_way_in_is_blocked_only_by_force(tmp_path: Path, address: str) -> None:
-    async with control(tmp_path, Clock()) as made:
+    async with control(tmp_path) as made:
         made.remotes = {"ocu-1": NODE}
         for dry_run in (True, False):
             with (
