@@ -32,7 +32,7 @@ def pytest_configure() -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    return True if config.getoption("--quick") and is_left_out(collection_path) else None
+    return True if config.getoption("--quick", default=False) and is_left_out(collection_path) else None
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
@@ -44,7 +44,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.nodeid.startswith(_NIGHTLY) and not item.get_closest_marker("real"):
             item.add_marker(pytest.mark.nightly)
-    if config.getoption("--quick"):
+    if config.getoption("--quick", default=False):
         quick = [one for one in items if one.get_closest_marker("complete") or not waits(_file(one))]
         config.hook.pytest_deselected(items=[one for one in items if one not in set(quick)])
         items[:] = quick
