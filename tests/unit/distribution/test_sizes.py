@@ -23,6 +23,6 @@ def test_a_page_that_moves_to_the_reference_is_cut_from_the_guides_only() -> Non
 
 
 def test_the_guides_stay_short_and_the_index_begins_with_twelve_pages() -> None:
-    """What does not fit is a row of the reference, or replaces words of a guide."""
+    """Further text is a row of the reference, or replaces words of a guide."""
     first = Path("docs/README.md").read_text().split("\n## ")[1]
     assert (words()["guides"] <= 40_000, first.count("\n| [")) == (True, 12)
