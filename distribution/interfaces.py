@@ -58,7 +58,7 @@ class _File(NamedTuple):
 def _product() -> tuple[_File, ...]:
     paths = python_files(("appliance", "roswire", "rosmop", "fleet/rosrv_fleet"), without="rosmop/tests")
     code = (__file__, counts.__file__)
-    return tuple(facts_of_files(_File, _facts, paths, code=code, context=_modules()).values())
+    return tuple(facts_of_files(_File, _facts, paths, code=code, context=sorted(_modules())).values())
 
 
 def _facts(path: Path) -> _File:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from distribution.fact_cache import facts_of_files
 from tests.support.sources import LANGUAGE_TESTS, ROOT
 
 FOLDERS = ("appliance", "roswire", "rosmop", "fleet/rosrv_fleet")
@@ -272,13 +273,17 @@ def _places(node: ast.AST, *, filled: bool) -> Iterator[tuple[str, str]]:
 
 
 def test_each_dictionary_that_is_asked_and_filled_has_its_rule() -> None:
-    found = {
-        f"{name}::{attribute}": text
+    files = [
+        file
         for folder in FOLDERS
         for file in (ROOT / folder).rglob("*.py")
-        if LANGUAGE_TESTS not in file.parents and not OF_OPERATORS.match(name := str(file.relative_to(ROOT)))
-        for text in [file.read_text(encoding="utf-8")]
-        for attribute in kept_by_hand(file)
+        if LANGUAGE_TESTS not in file.parents and not OF_OPERATORS.match(str(file.relative_to(ROOT)))
+    ]
+    kept = facts_of_files(set[str], kept_by_hand, files, code=(__file__,))
+    found = {
+        f"{name}::{attribute}": (ROOT / name).read_text(encoding="utf-8")
+        for name, attributes in kept.items()
+        for attribute in attributes
     }
     assert found.keys() == BY_HAND.keys()
     lacking = [
