@@ -8,8 +8,9 @@ A publisher has a rank; 0 is the highest. A message *moves* unless it is a zero.
 1. Only the driver is heard, and its messages always are.
 2. A higher rank becomes the driver with its first message that moves. Its zeros before that do not pass: they are those
    of a gamepad at rest.
-3. A lower rank becomes the driver only while the topic is FREE, with a message that came `SETTLE` seconds after that.
-   Messages from before the hand-back, which waited in a connection, have been read and dropped by then.
+3. A lower rank becomes the driver only while the topic is FREE, with a message that was sent after the driver let go.
+   Earlier ones, which waited in a connection, are read and dropped first: while the driver's `free` time runs, so that
+   this takes no further time, or for `SETTLE` seconds after a pause of the process or the order of an operator.
 4. Silence after a motion is not letting go: the topic is LOST until the driver returns, its own or a higher rank moves,
    or an operator hands it back (`free`). A driver whose type has no velocity never lets go.
 5. A relay that does not know who moves begins as if rank 0 had been LOST. One that knows listens first: it drops a
@@ -27,7 +28,7 @@ LOST_SECONDS = 2.0
 SETTLE_SECONDS, STALL_SECONDS = 0.08, 0.04
 """The time in which all has been read that was sent before, if the process did not pause for longer than `STALL`."""
 MOST_PAUSES = 20
-"""After a hand-back. A process that pauses more often is so slow that lower ranks would wait for ever."""
+"""Those that delay a hand-back. A process that pauses more often is so slow that lower ranks would wait for ever."""
 LISTEN_SECONDS, LISTEN_MOST_SECONDS = 1.0, 5.0
 
 
@@ -99,22 +100,31 @@ class RankedTopic:
 
     def expire(self, now: float) -> float | None:
         """Note what time has ended; return the time of the next such end, or None."""
-        if self._settled is not None:
-            if now - self._seen > STALL_SECONDS and self._pauses < MOST_PAUSES:
-                self._settled = now + SETTLE_SECONDS  # what came in the pause is not read yet
-                self._pauses += 1
-            elif now >= self._settled:
-                self._settled = None
-            self._seen = now
-        if self._driver.standing != "moving":
+        due = None
+        if self._driver.standing == "moving":
+            due = self._at + (self._free if self._lets_go else LOST_SECONDS)
+            if self._lets_go:
+                self._settled = max(due, self._settled or due)
+        self._read_on(now)
+        if due is None:
             return self._settled
-        due = self._at + (self._free if self._lets_go else LOST_SECONDS)
         if now < due:
             return due
         standing: RankStanding = "free" if self._lets_go else "lost"
-        self._settle(now)  # even if this is noted late
+        self._lets_go = False
         self._become(RankDriver(self._driver.key, self._driver.rank, standing))
         return self._settled
+
+    def _read_on(self, now: float) -> None:
+        if self._settled is None:
+            return
+        if now - self._seen > STALL_SECONDS and self._pauses < MOST_PAUSES:
+            settled = max(self._settled, now + SETTLE_SECONDS)  # what came in the pause is not read yet
+            self._pauses += settled > self._settled
+            self._settled = settled
+        elif now >= self._settled:
+            self._settled = None
+        self._seen = now
 
     def hears(self, key: str, now: float) -> bool:
         """Whether messages of this publisher that were taken before may still pass."""
@@ -130,10 +140,11 @@ class RankedTopic:
         if key != driver.key and (not moves or not self._may_begin(rank)):
             return False
         if moves:
-            self._at, self._lets_go = now, False
+            self._at, self._lets_go, self._settled = now, False, None
             self._become(RankDriver(key, rank, "moving"))
         elif not self._lets_go and driver.standing in ("moving", "lost"):
             self._at, self._lets_go = now, True
+            self._settled, self._seen, self._pauses = now + self._free, now, 0
             self._become(RankDriver(key, rank, "moving"))
         return not moves or not self._is_deaf(key, now)
 

@@ -13,7 +13,7 @@ from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.loop import EventLoop
 from appliance.relay.ranked_topic import RankDriver, RankedTopic
 
-_CHECK_SECONDS, _SETTLING_SECONDS = 0.05, 0.01
+_CHECK_SECONDS, _SETTLING_SECONDS = 0.03, 0.01  # less than `STALL_SECONDS`
 
 
 class RankedTopics:

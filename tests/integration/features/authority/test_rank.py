@@ -34,6 +34,8 @@ FREE = 0.3
 """Seconds after a zero in which no lower rank is heard: `free base`."""
 QUICK = 0.1
 """The longest hand-over in seconds."""
+IN_FLIGHT = 0.02
+"""Seconds in which a command that the relay passed before a hand-over may reach the base, by another connection."""
 MOST = 1.0
 """The delay in seconds that a busy machine may add."""
 
@@ -140,13 +142,17 @@ def test_a_hundred_hand_overs_are_quick_and_never_mixed(
         let_go = site.gamepad.wait_for(event="commanded", speed=0.0, since=told)["at"]
         heard = site.base.wait_for(event="received", publisher="/planner", since=first)
         given.append(heard["at"] - let_go - FREE)
-        order = [event["publisher"] for event in site.base.events[mark:] if "publisher" in event]
-        at = order.index("/gamepad")
-        changes = sum(one != other for one, other in zip(order[at:], order[at + 1 :], strict=False))
-        assert changes <= 1, order
+        order = [event for event in site.base.events[mark:] if "publisher" in event]
+        drives = [event["at"] for event in order if event["publisher"] == "/gamepad" and event["speed"]]
+        mixed = [
+            one
+            for one in order
+            if one["publisher"] == "/planner" and drives[0] + IN_FLIGHT < one["at"] < drives[-1]
+        ]
+        assert not mixed, order
     record_property("ms", {name: _figures(seconds) for name, seconds in (("taken", taken), ("given", given))})
     assert min(given) > 0, "the planner was heard before the time of `free` was over"
-    assert statistics.median(taken) < QUICK
+    assert max(statistics.median(taken), statistics.median(given)) < QUICK
     assert max(taken + given) < QUICK + MOST
 
 
