@@ -358,6 +358,16 @@ class MonitorResume(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     expected: str | None = None
 
 
+@rest("operator", "GET", "/v1/monitors/{name}/values", name="monitor_values", problems=_NO_MONITOR)
+class MonitorValuesWanted(WaitingRequest[monitor_answers.MonitorReadout], frozen=True, tag="monitor values"):
+    """The present variables of a monitor, such as the position that a fence has. The query is recorded.
+
+    Variables of slices are not among them.
+    """
+
+    name: OneMonitor
+
+
 class TokenAdd(AdminRequest[token_answers.NewToken], frozen=True, tag="token add"):
     """Make a token that ends after `seconds`; its text is in the answer and nowhere else."""
 

@@ -12,7 +12,7 @@ from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.output import say_json
+from appliance.cli.output import say_json, say_row
 from rosmop.tool.terminal import say
 
 _Listed = TypeVar("_Listed", policy_answers.PolicyRevisionList, monitor_answers.MonitorRevisionList)
@@ -79,7 +79,14 @@ def _say_revision(
         return
     files = row.file if isinstance(row, policy_answers.PolicyRevision) else " ".join(row.names)
     mark = "in force" if row.in_force else ""
-    say(f"{row.revision:>5}  {_time(row.loaded)}  {actor(row.who)}: {row.note}  {files}  {mark}".rstrip())
+    say_row(
+        [
+            f"{row.revision:>5}",
+            _time(row.loaded),
+            f"{actor(row.who)}: {row.note}",
+            *filter(None, (files, mark)),
+        ]
+    )
 
 
 def _time(seconds: float) -> str:

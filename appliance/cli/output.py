@@ -6,6 +6,7 @@ Text from the network is printed without control characters and never as markup.
 import os
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from mmap import mmap
 from pathlib import Path
@@ -80,14 +81,37 @@ def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, li
     return sorted(found.items(), key=lambda item: -len(item[1]))
 
 
-def say_row(parts: Iterable[str], style: str = "") -> None:
-    first, *rest = parts
+def say_row(parts: Iterable[str], style: str = "", gap: str = _GAP) -> None:
+    """Write the parts of a row as one line; a narrow terminal gets line breaks, if possible between two parts."""
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-    line = first
+    for line in row_lines(map(printable, parts), width, gap):
+        terminal.say(line, style)
+
+
+def row_lines(parts: Iterable[str], width: int | None, gap: str = _GAP) -> list[str]:
+    """Return the lines of a row. A line is longer than `width` only if it is one word, such as a name to copy."""
+    first, *rest = parts
+    lines = [first]
     for part in rest:
-        if width is None or len(line) + len(_GAP) + len(part) <= width:
-            line += _GAP + part
+        if width is None or len(lines[-1]) + len(gap) + len(part.rstrip()) <= width:
+            lines[-1] += gap + part
         else:
-            terminal.say(line.rstrip(), style)
-            line = _INDENT + part
-    terminal.say(line, style)
+            lines.append(_INDENT + part)
+    if width is None:
+        return lines
+    return [
+        folded for number, line in enumerate(lines) for folded in _folded(line.rstrip(), width, bool(number))
+    ]
+
+
+def _folded(line: str, width: int, indented: bool) -> list[str]:
+    if len(line) <= width:
+        return [line]
+    return textwrap.wrap(
+        line.strip() if indented else line,
+        max(width, 2 * len(_INDENT)),
+        initial_indent=_INDENT if indented else "",
+        subsequent_indent=_INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

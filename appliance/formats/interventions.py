@@ -58,7 +58,8 @@ NO_INTERVENTION = frozenset(
         "packets refused", "enrolment refused", "renewal refused", "sign-on refused", "order refused",
         # orders that were refused, and looks
         "policy refused", "specifications refused", "bundle metadata rejected", "switchover failed", "rest call",
-        "topic looked into", "recording fetched", "recording read", "recording ordered", "recording closed",
+        "topic looked into", "monitor looked into",
+        "recording fetched", "recording read", "recording ordered", "recording closed",
         "recording missed", "ports checked",
         # the appliance itself
         "topics moved", "monitors restarted", "door failed", "adoption failed", "process failing", "probe failed",

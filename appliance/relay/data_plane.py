@@ -24,7 +24,7 @@ from appliance.relay.connections.upstream import PublisherConnection
 from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import GrantTable, PeerGrant
 from appliance.relay.loop import EventLoop
-from appliance.relay.monitors.interceptor import Interceptor
+from appliance.relay.monitors.interceptor import Interceptor, MonitorOrder
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.ranked_topics import RankedTopics
 from appliance.relay.relay_limits import RelayLimits
@@ -111,7 +111,7 @@ class DataPlane:
             self._upstream_answered(message)
         elif isinstance(message, messages.SpecificationsStated | messages.StateWanted):
             self.interceptor.state(message)
-        elif isinstance(message, messages.MonitorSwitched | messages.MonitorGiven | messages.StopWanted):
+        elif isinstance(message, MonitorOrder):
             self.interceptor.order(message)
         elif isinstance(message, messages.MonitorResumed | messages.RankFreed):
             self._release(message)

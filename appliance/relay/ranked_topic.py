@@ -50,6 +50,7 @@ class RankedTopic:
         self._ranks: dict[str, int] = {}
         self._driver = RankDriver(known.driver, known.driver_rank, known.standing)
         self._at = now  # the last motion; or the first zero after it, if the driver `lets_go`
+        self._lets_go = False
         self._settled: float | None = None  # None: lower ranks may move if the topic is free
         self._seen, self._pauses = now, 0
         self._settle(now)

@@ -36,6 +36,7 @@ from appliance.specifications.allocation import Allocation
 from appliance.specifications.givens import Givens, parsed, split, with_unit
 from appliance.specifications.in_force import InForce, Wanted, unknown_monitors
 from appliance.specifications.live_topics import Published, TopicFindings, judge_holds, judge_topics
+from appliance.specifications.monitor_values import MonitorValues
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.rollout import Parts, Relays, Rollout
 from appliance.specifications.specification_files import (
@@ -194,6 +195,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             [*told],
             lambda stops: store.save_setting(_STOPS, stops),
         )
+        self.values = MonitorValues(self.rollout.tell, lambda: self.revision, trail)
         self._ticking: asyncio.TimerHandle | None = None
         self._published = published
 
@@ -692,6 +694,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self.records.reported(message.events, message.lost)
             if self._ticking is None:
                 self._tick()
+        elif isinstance(message, messages.ValuesSeen):
+            self.values.received(message)
         else:
             self.rollout.received(message, relay)
 
@@ -702,6 +706,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     def relay_lost(self, relay: int) -> None:
         self.rollout.lost(relay)
+        self.values.relay_lost()
+
+    async def shown(self, request: admin.MonitorValuesWanted, who: str) -> answers.MonitorReadout:
+        """Return the variables of a monitor. Raises `UnknownMonitorError`."""
+        self._all_known([request.name])
+        return await self.values.of(request.name, who)
 
     # --- internals ---
 

@@ -27,6 +27,7 @@ from rosmop.run.interpreter import Interpreter
 from rosmop.run.margins import begin_margins, taken_margins
 from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, monitors_of
 from rosmop.run.outcomes import NOBODY, SHADOW_BUDGET, Margin, MessageSender, Outcome
+from rosmop.run.readout import Readout, read_out
 from rosmop.run.slice_quota import HolderOf, no_holder
 from rosmop.run.slices import LIMIT
 from rosmop.run.state import (
@@ -409,6 +410,21 @@ class MonitorSet:
         monitor = self.monitor(name)
         monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
+
+    def read_out(self, name: str, time_ns: int) -> Readout | None:
+        """Return the variables of a monitor, also of one in shadow mode, or None if there is none of this name.
+
+        The state stays where it is, so messages are as fast as before.
+        """
+        for part in (self, *self.shadows):
+            for monitor in part._monitors:
+                if monitor.name == name:
+                    if monitor.home is not None:
+                        monitor.home.show()
+                    compiled = part.compiled
+                    known = part.interpreter.variables
+                    return read_out(monitor.code, known, compiled.types, compiled.messages, time_ns)
+        return None
 
     def take_margins(self) -> Iterator[Margin]:
         """Yield the closest true and false results of comparisons since the last call, if compiled with `margins`."""

@@ -132,6 +132,8 @@ EVENTS: dict[str, str] = {
     " `detail.recording` is the id that the trigger's record had promised.",
     "topic looked into": "Messages of a topic were shown; `detail` has who requested them, and the `seconds` that the"
     " record covers.",
+    "monitor looked into": "Variables of a monitor were shown; `detail` has who requested them. Further requests of the"
+    " same client are in this record until none has come for a minute.",
     "rest call": "A REST call was answered; `detail` has the token's name in `who`, the method and the status.",
     "rest certificate replaced": "REST has another certificate, because the earlier one ended soon or lacked a name;"
     " `detail` has the SHA-256 of both. Clients that trust exactly the earlier one refuse it.",
@@ -238,7 +240,7 @@ SEVERITIES: dict[str, Severity] = {
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
-            "graph adopted", "graph released",
+            "monitor looked into", "graph adopted", "graph released",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (

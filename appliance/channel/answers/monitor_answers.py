@@ -1,6 +1,6 @@
 """The monitors: their state and counters, and what a change of them did."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 
@@ -29,6 +29,29 @@ class GivenState(msgspec.Struct, frozen=True):
     most: Annotated[
         int | float | None, doc("the greatest value, in the unit, or null if it is not a number")
     ] = None
+
+
+class MonitorReadout(msgspec.Struct, frozen=True):
+    """The variables of a monitor, as its relay has them now or had them when it last answered."""
+
+    name: str
+    values: Annotated[
+        dict[str, Any],
+        doc(
+            "by name; long values are cut and the rest is counted (`… 344 more`), NaN and infinity are strings, times"
+            " are seconds"
+        ),
+    ]
+    ages: Annotated[
+        dict[str, float | None],
+        doc(
+            "seconds since the last message of each event whose age the specification uses, or null if there was none"
+        ),
+    ]
+    age_seconds: Annotated[
+        float | None, doc("seconds since the relay answered, or null if it has not answered since the load")
+    ]
+    why_old: Annotated[str, doc("why the values are not the present ones; empty if they are")] = ""
 
 
 class MonitorState(msgspec.Struct, frozen=True):

@@ -633,6 +633,24 @@ class LookEnded(Message):
     number: int
 
 
+class ValuesWanted(Message):
+    """Control asks for the present variables of a monitor."""
+
+    number: int
+    monitor: str
+
+
+class ValuesSeen(Message):
+    """The variables, within limits (`rosmop/run/readout.py`); None if this relay does not run the monitor.
+
+    `ages` has the seconds since the last message of each event whose age the monitor uses; None: never.
+    """
+
+    number: int
+    values: dict[str, Any] | None
+    ages: dict[str, float | None] = msgspec.field(default_factory=dict)
+
+
 class MessageSeen(Message):
     """A message of a tapped topic; `time` is in nanoseconds since the epoch, `size` in bytes.
 
@@ -658,5 +676,5 @@ RelayLink = (
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
     | MonitorCallWanted | MonitorCallAnswered | RequestHeld | HeldRequestDecided | StopWanted | StopBegun
-    | RankFreed | RankReported
+    | RankFreed | RankReported | ValuesWanted | ValuesSeen
 )  # fmt: skip

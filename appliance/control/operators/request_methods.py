@@ -44,6 +44,7 @@ def request_methods(
         RequestMethod(admin.MonitorShadow, monitors.shadow, who=True),
         RequestMethod(admin.MonitorGive, monitors.give, who=True),
         RequestMethod(admin.MonitorResume, monitors.resume, who=True),
+        RequestMethod(admin.MonitorValuesWanted, monitors.shown, who=True, order=False),
         RequestMethod(admin.TokenList, tokens.listed),
         RequestMethod(admin.TokenAdd, tokens.add, who=True),
         RequestMethod(admin.TokenRotate, tokens.rotate, who=True),

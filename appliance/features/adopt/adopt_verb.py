@@ -14,7 +14,7 @@ from appliance.base.counted import counted
 from appliance.channel.admin import PolicyReload
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_here
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import say_json, say_row, usage_error
 from appliance.cli.standing import (
     WITHIN,
     NotStandingError,
@@ -187,7 +187,7 @@ def _show_lines(lines: list[CheckLine], *, as_json: bool) -> None:
         if as_json:
             say_json({"level": line.level, "about": line.about, "text": line.text})
         else:
-            say(printable(f"{line.level:<4}  {line.about:<{width}}  {line.text}"))
+            say_row([f"{line.level:<4}", f"{line.about:<{width}}", line.text])
 
 
 def _show_report(report: TakeOverReport, *, as_json: bool) -> None:

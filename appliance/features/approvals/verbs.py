@@ -8,7 +8,7 @@ import typer
 from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import say_json, say_row, usage_error
 from appliance.features.approvals.requests import (
     Approval,
     ApprovalsWanted,
@@ -88,7 +88,8 @@ def _say(appliance: Appliance, one: Approval) -> None:
     if appliance.as_json:
         say_json(msgspec.structs.asdict(one))
     else:
-        say(*_line(appliance, one))
+        line, style = _line(appliance, one)
+        say_row([line], style)
 
 
 def _line(appliance: Appliance, one: Approval) -> tuple[str, str]:

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import say_json
+from appliance.cli.output import say_json, say_row
 from appliance.features.authority.requests import (
     DriveAsk,
     DriveGive,
@@ -91,13 +91,15 @@ def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
 def _show(appliance: Appliance, one: GroupState) -> None:
     shown = appliance.host_in_words
     if one.ranks:
-        say(f"{one.group}: {one.standing}: {one.why}")
-        say(f"  rank: {' > '.join(one.ranks)}")
+        say_row([f"{one.group}: {one.standing}: {one.why}"])
+        say_row([f"  rank: {' > '.join(one.ranks)}"])
         return
     held = (
         f"held by {shown(one.holder)}, {one.left_seconds:g} s left without a message"
         if one.holder
         else "free"
     )
-    waiting = f"; waiting: {', '.join(map(shown, one.waiting))}" if one.waiting else ""
-    say(f"{one.group}: {held}{waiting}")
+    parts = [f"{one.group}: {held}"]
+    if one.waiting:
+        parts = [f"{parts[0]};", f"waiting: {', '.join(map(shown, one.waiting))}"]
+    say_row(parts, gap=" ")

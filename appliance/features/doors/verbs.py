@@ -7,7 +7,7 @@ import typer
 from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import moment, say_json, say_row
 from appliance.features.doors.requests import (
     ConnectedClient,
     DoorAdd,
@@ -72,13 +72,14 @@ def list_doors(appliance: Appliance) -> None:
         if appliance.as_json:
             say_json(row)
         else:
-            say(f"{row.name:<20}  {row.address:<15}  {_entry(row)}, {counted(row.connections, 'connection')}")
+            connections = counted(row.connections, "connection")
+            say_row([f"{row.name:<20}", f"{row.address:<15}", f"{_entry(row)}, {connections}"])
             for one in row.tickets:
                 say(f"    ticket {one.id} until {moment(one.expires)}, by {one.who}")
                 if one.warning:
                     say(f"    ! {one.warning}", "yellow")
             for client in row.clients:
-                say(f"    {_client(client)}")
+                say_row([f"    {_client(client)}"])
             if row.connections > len(row.clients) > 0:
                 say(f"    and {row.connections - len(row.clients)} more")
             for problem in filter(None, (row.trouble, row.warning)):

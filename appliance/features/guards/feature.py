@@ -18,6 +18,7 @@ FEATURE = Feature(
             "Stop a robot that runs away: monitors from presets, without editing a file.",
             {
                 "list": Verb(f"{_VERBS}:list_guards"),
+                "show": Verb("appliance.features.guards.show_verb:show"),
                 "suggest": Verb(f"{_VERBS}:suggest"),
                 "new": Verb(f"{_VERBS}:new"),
                 "set": Verb(f"{_VERBS}:set_values"),

@@ -17,10 +17,11 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import say_json, say_row
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.guards.guard_answers import GuardList, GuardRow, Suggestion
 from appliance.features.guards.guard_facts import preset_row, values_of
+from appliance.features.guards.guard_words import origin_in_words, state_in_words
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
@@ -92,7 +93,8 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
                       "origin": row.origin, "below": row.below, "digest": row.digest})  # fmt: skip
         else:
-            say(f"guard {row.name}: {_origin(row)} on {', '.join(row.topics.values())}, {_state(row)}")
+            about = f"guard {row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())},"
+            say_row([about, state_in_words(row)], gap=" ")
             for value in row.below:
                 say(f"    {value}", "yellow")
     for warning in body.warnings:
@@ -556,41 +558,3 @@ def _say_preset(preset: Preset) -> None:
             safe = f"; safe: {one.safe.removeprefix('== ')}" if one.safe else ""
             table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what + safe)
         say_table(table)
-
-
-def _origin(row: GuardRow) -> str:
-    match row.origin:
-        case "older":
-            return f"{row.preset} {row.version}, older: rosrv guard upgrade {row.name};"
-        case "changed":
-            return f"{row.preset} {row.version}, changed: not the text of the preset;"
-    return row.preset
-
-
-def _state(row: GuardRow) -> str:
-    acts = counted(row.stops, "stop")
-    match row.state:
-        case "holding":
-            return f"holds its topics: rosrv monitor resume {row.name}"
-        case "shadow":
-            return f"in shadow mode, {acts} only recorded"
-        case "off":
-            return f"disabled: rosrv monitor enable {row.name}"
-    if row.awaits:
-        resume = f"rosrv monitor resume {row.name}"
-        return f"in force, stops until it hears {row.awaits}; if that has another name now: {resume}"
-    end = (
-        ""
-        if row.confirm_by is None
-        else f", until {moment(row.confirm_by)} unless you run: rosrv monitor confirm"
-    )
-    return f"in force, {row.state}{'' if row.preset == 'withhold' else f', {acts}'}{_last_stop(row)}{end}"
-
-
-def _last_stop(row: GuardRow) -> str:
-    stop = row.last_stop
-    if stop is None:
-        return ""
-    when = f"since {moment(stop.since)}" if stop.until is None else f"last until {moment(stop.until)}"
-    who = f" ({stop.node} on {stop.host})" if stop.node else ""
-    return f", {when}{f': {stop.cause}' if stop.cause else ''}{who}"

@@ -15,11 +15,11 @@ from appliance.base.counted import counted
 from appliance.base.owner_access import is_named_there
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import Json, by_host, say_json
+from appliance.cli.output import Json, by_host, say_json, say_row
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation, explain, render
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError
 from appliance.features.policy_tools.grant import grant as grant_of
-from appliance.features.policy_tools.host_rights import rights_of_host
+from appliance.features.policy_tools.host_rights import parts_of_host, rights_of_host
 from appliance.features.policy_tools.policy_impact import PolicyImpact, cases_beside, impact_of
 from appliance.features.policy_tools.policy_input import (
     Enrolled,
@@ -221,7 +221,8 @@ def show_host(
         ),
     ],
 ) -> None:
-    """Show what a host may do: the rules of the policy in force that grant it something. Exit status 1 if none does.
+    """Show what a host may do: the rules of the policy in force that grant it something, and its part in each command
+    group of [Authority]. Exit status 1 if no rule grants it anything.
 
     Example: rosrv host show door:alice
     """
@@ -229,7 +230,14 @@ def show_host(
     host = _known_as(name, policy)
     if not appliance.as_json:
         say(f"{host}, by the policy in force:", "bold")
-    raise typer.Exit(_list_rights(appliance, policy, host))
+    status = _list_rights(appliance, policy, host)
+    address = asking_host(host, policy)
+    for part in parts_of_host(policy, address):
+        if appliance.as_json:
+            say_json({"host": str(address), **part._asdict()})
+        else:
+            say_row([part.text], "" if part.ranks or part.claim else "dim")
+    raise typer.Exit(status)
 
 
 def _known_as(name: str, policy: Policy) -> str:

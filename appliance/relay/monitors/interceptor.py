@@ -23,6 +23,8 @@ from appliance.channel.messages import (
     StateWanted,
     StopBegun,
     StopWanted,
+    ValuesSeen,
+    ValuesWanted,
 )
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.holds import hold_begun, taken
@@ -44,6 +46,9 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
     from rosmop.run.fast_path import BatchOptions, FastLane
     from rosmop.run.outcomes import Outcome, Published
+
+MonitorOrder = MonitorSwitched | MonitorGiven | StopWanted | ValuesWanted
+"""What control asks of monitors in force, beside new specifications."""
 
 _AFTER_DEFECT = 1.0
 _REPLAYED = "its publisher had latched this command before the relay connected to it; send it again"
@@ -206,11 +211,14 @@ class Interceptor:
         self._changed(None if self._stated is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
-    def order(self, message: MonitorSwitched | MonitorGiven | StopWanted) -> None:
+    def order(self, message: MonitorOrder) -> None:
         if isinstance(message, MonitorSwitched):
             self.switch(message.name, message.enabled)
         elif isinstance(message, StopWanted):
             self._reporter.send(StopBegun(message.number, self._stoppers(message.topic, begin=message.begin)))
+        elif isinstance(message, ValuesWanted):
+            found = None if self.monitors is None else self.monitors.read_out(message.monitor, self.now())
+            self._reporter.send(ValuesSeen(message.number, *(found or (None, {}))))
         else:
             self._given[message.name] = dict(message.values)
             self._apply()

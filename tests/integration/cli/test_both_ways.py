@@ -80,7 +80,7 @@ LOOKING = [
     ("monitor", "confirm"), ("monitor", "enforce", "nobody"), ("monitor", "set", "nobody", "vMax=1"),
     ("alarm", "list"), ("alarm", "acknowledge", "nothing", "--note", "seen"),
     ("alarm", "silence", "nothing", "--for", "1h"),
-    ("guard", "list"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
+    ("guard", "list"), ("guard", "show", "nobody"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
     ("door", "list"), ("door", "ticket", "nobody"), ("door", "remove", "nobody"), ("drive", "status"),
     ("drive", "take", "base", "--host", "robot"), ("drive", "give", "base"),
     ("drive", "assign", "base", "--host", "robot"), ("drive", "free", "base"), ("approval", "refuse", "48213"),

@@ -1,3 +1,4 @@
+import re
 import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,14 +29,29 @@ def test_a_fence_is_drawn_changed_and_enforced(
     reader = opened()
     page = reader.go("robot")
     row = page.locator("tr[data-guard=fence]")
+    expect(page.get_by_text("The guard has no position yet.")).to_be_visible()
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ros.start(["rostopic", "pub", "-r", "20", "/odom", "nav_msgs/Odometry", _ODOMETRY])
         appliance.recorded("--category", "publish", resource="/odom")  # from now on it can be watched
         expect(page.get_by_role("img", name="Map of fence")).to_be_visible()
+        expect(page.get_by_text("The guard has the robot at 1.5, 0, 0.5 m from the edge.")).to_be_visible()
         page.get_by_role("button", name="Watch").click()
-        expect(page.get_by_text("The robot is at 1.5, 0, 0.5 m from the edge.")).to_be_visible()
         expect(row).to_contain_text("distance to the edge 0.5 at least 0.2 m")
         assert reader.axe() == []
+        row.get_by_role("button", name="Values…").click()
+        known = page.get_by_role("dialog")
+        expect(known.get_by_role("row", name="atX")).to_contain_text("1.5")
+        expect(known.get_by_role("row", name="last foreign")).to_contain_text("none yet")
+        assert reader.axe() == []
+        known.get_by_role("button", name="Close").click()
+        assert [one["detail"]["who"] for one in appliance.recorded("--event", "monitor looked into")] == [
+            "first"
+        ]
+    # The source has ended, so the position grows old.
+    expect(page.get_by_text(re.compile(r"The guard has the robot at 1\.5, 0, .* s ago\."))).to_be_visible()
+    assert "pose: " in appliance.rosrv("guard", "show", "fence").stdout
+    watcher = opened(token("viewer", "onlooker")).go("robot")
+    expect(watcher.get_by_text("Operators see the position that the guard has.")).to_be_visible()
     row.get_by_role("button", name="Set…").click()
     polygon = page.get_by_label("polygon")
     polygon.fill("-1,-1 1,-1 1,1 -1,1")

@@ -202,7 +202,10 @@ class Oracle:
             assert not (calm and listened) or self.tried, f"the topic is free since {back}: {one}"
         settled = is_back and self._has_read_on(one.at)
         if not (one.passed and one.moves) and one.at < self.began + LISTEN_MOST_SECONDS:
-            self._note(one, may_begin=settled or heard is None or one.rank < heard.rank)
+            higher = self.given is None and (heard is None or one.rank < heard.rank)
+            self._note(
+                one, may_begin=settled or higher
+            )  # after an order, only what is certainly newer counts
         if one.passed and one.moves:
             self.noted.clear()
             self.tried.clear()

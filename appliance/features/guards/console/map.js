@@ -12,15 +12,16 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowD
 /** @typedef {import("./geometry.js").Point} Point */
 
 /**
- * @param {{name: string, polygon: Point[], margin: number, trail: (Point & {turned: number | null})[], draft?: Point[] | null,
- *   move?: (index: number, to: Point) => void}} given `draft`: a new polygon, whose corners `move` moves
+ * @param {{name: string, polygon: Point[], margin: number, robot: (Point & {turned: number | null}) | null, where: string, old?: boolean,
+ *   trail: (Point & {turned: number | null})[], draft?: Point[] | null, move?: (index: number, to: Point) => void}} given
+ *   `robot`: where the guard has it, `where` says so, `old`: perhaps no longer there; `trail`: seen positions; `draft`: a new
+ *   polygon, whose corners `move` moves
  */
-export function FenceMap({ name, polygon, margin, trail, draft = null, move }) {
+export function FenceMap({ name, polygon, margin, robot, where, old = false, trail, draft = null, move }) {
   const id = useId();
   const drawing = useRef(/** @type {SVGSVGElement | null} */ (null));
   const [held, setHeld] = useState(/** @type {number | null} */ (null));
-  const frame = useFrame([...polygon, ...(draft ?? []), ...trail], held !== null);
-  const last = trail.at(-1);
+  const frame = useFrame([...polygon, ...(draft ?? []), ...trail, ...(robot ? [robot] : [])], held !== null);
   const bounds = draft ?? polygon;
   const outside = trail.filter((one) => depth(one, bounds) < margin).length;
   const pixel = Math.max(frame.width, frame.height) / 320;
@@ -36,7 +37,6 @@ export function FenceMap({ name, polygon, margin, trail, draft = null, move }) {
     const size = event.shiftKey ? 1 : 0.1;
     move(index, { x: tenth(corner.x + step[0] * size), y: tenth(corner.y + step[1] * size) });
   };
-  const where = last ? `The robot is at ${short(last.x)}, ${short(last.y)}, ${short(Math.abs(depth(last, polygon)))} m ${depth(last, polygon) < 0 ? "outside of the fence" : "from the edge"}.` : "No position yet: Watch reads it.";
   return html`<figure class="fence">
     <svg ref=${drawing} class="fence-map" viewBox=${`${frame.x} ${-frame.y - frame.height} ${frame.width} ${frame.height}`} role=${move ? "group" : "img"} aria-label=${`Map of ${name}. ${where}`}
       onPointerMove=${(/** @type {PointerEvent} */ event) => held !== null && move?.(held, at(event))} onPointerUp=${() => setHeld(null)} onPointerCancel=${() => setHeld(null)}>
@@ -48,8 +48,8 @@ export function FenceMap({ name, polygon, margin, trail, draft = null, move }) {
       ${margin > 0 && html`<polygon class="fence-margin" clip-path=${`url(#${id})`} points=${points(bounds)} stroke-width=${2 * margin} />`}
       <polygon class="fence-edge" points=${points(bounds)} />
       ${trail.length > 1 && html`<polyline class="fence-trail" points=${points(trail)} />`}
-      ${last && html`<g class=${depth(last, bounds) < margin ? "fence-robot out" : "fence-robot"} transform=${`translate(${last.x} ${-last.y}) rotate(${(-(last.turned ?? 0) * 180) / Math.PI}) scale(${pixel})`}>
-        ${last.turned === null ? html`<circle r="6" />` : html`<path d="M10 0L-7 6L-4 0L-7 -6z" />`}</g>`}
+      ${robot && html`<g class=${`fence-robot${depth(robot, bounds) < margin ? " out" : ""}${old ? " old" : ""}`} transform=${`translate(${robot.x} ${-robot.y}) rotate(${(-(robot.turned ?? 0) * 180) / Math.PI}) scale(${pixel})`}>
+        ${robot.turned === null ? html`<circle r="6" />` : html`<path d="M10 0L-7 6L-4 0L-7 -6z" />`}</g>`}
       ${draft && move && draft.map((corner, index) => html`<circle key=${index} class="fence-corner" tabindex="0" role="button" cx=${corner.x} cy=${-corner.y} r=${7 * pixel}
         aria-label=${`Corner ${index + 1}: ${short(corner.x)}, ${short(corner.y)}. The arrow keys move it by 0.1 m, with Shift by 1 m.`} onKeyDown=${(/** @type {KeyboardEvent} */ event) => key(event, index, corner)}
         onPointerDown=${(/** @type {PointerEvent} */ event) => { /** @type {Element} */ (event.currentTarget).setPointerCapture(event.pointerId); setHeld(index); }} />`)}

@@ -14,10 +14,10 @@ import { Empty, Failure, Loading, Notice } from "#console/parts/notice.js";
 import { done } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
 import { Link } from "#console/router.js";
+import { Beliefs } from "./belief.js";
 import { CheckDriver } from "./driver.js";
-import { corners } from "./geometry.js";
-import { FenceMap } from "./map.js";
-import { constant, margins, trailOf } from "./margins.js";
+import { Area } from "./area.js";
+import { margins } from "./margins.js";
 import { Margins } from "./meter.js";
 import { useGuards } from "./state.js";
 import { Suggest } from "./suggest.js";
@@ -45,7 +45,7 @@ export function Guards() {
       : !rows.length ? html`<${Empty} icon="robot" title="No guard">A guard stops the robot when its commands end, when it leaves a fence or drives too fast. Suggest guards reads the graph and proposes them.</${Empty}>`
       : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Guard</th><th>State</th><th>Guards</th><th>How close it came</th><th class="number">Stopped</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((/** @type {any} */ one) => html`<${Guard} key=${one.name} guard=${one} guards=${guards} seen=${seen} />`)}</tbody></table></div>`}
-    ${rows.map((/** @type {any} */ one) => html`<${Fence} key=${one.name} guard=${one} seen=${seen} />`)}
+    ${rows.filter((/** @type {any} */ one) => one.loads.polygon).map((/** @type {any} */ one) => html`<div key=${one.name} class="panel-body"><h3><${Given} value=${one.name} most=${60} /></h3><${Area} guard=${one} seen=${seen} /></div>`)}
     ${open === "suggest" && html`<${Suggest} guards=${guards} close=${close} />`}${open === "driver" && html`<${CheckDriver} close=${close} />`}</section>`;
 }
 
@@ -60,7 +60,8 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
     <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(guard.name)}`}><strong><${Given} value=${guard.name} most=${60} /></strong></${Link}><div class="muted small">${guard.preset === guard.name ? "" : `${guard.preset}: `}${preset?.what}</div>
       ${guard.origin !== "current" && html`<div class="small"><${Badge} word=${guard.origin} tone="warn" /> ${guard.origin === "older" ? `the text of ${guard.preset} ${guard.version}; the present version is ${preset?.version}` : "not the text of the preset"}</div>`}</td>
     <td data-label="State"><span><${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />${guard.why_held && html`<div class="small muted"><${Given} value=${guard.why_held} most=${200} /></div>`}
-      ${guard.off_until && html`<div class="small muted">until <${Moment} at=${guard.off_until} /></div>`}${guard.confirm_by && html`<div class="small muted">returns to shadow mode at <${Moment} at=${guard.confirm_by} />, unless confirmed</div>`}</span></td>
+      ${guard.off_until && html`<div class="small muted">until <${Moment} at=${guard.off_until} /></div>`}${guard.confirm_by && html`<div class="small muted">returns to shadow mode at <${Moment} at=${guard.confirm_by} />, unless confirmed</div>`}
+      <div><${Button} small tone="plain" role="operator" title="The guard's variables, such as the position that it has; the audit log records it" onClick=${() => setOpen("values")}>Values…</${Button}></div></span></td>
     <td data-label="Guards"><span><${Given} value=${guard.topics.command} mono most=${60} />${guard.topics.by && html`<div class="small muted">by <${Given} value=${guard.topics.by} mono most=${60} /></div>`}</span></td>
     <td data-label="Margins">${found.length ? html`<${Margins} margins=${found} />` : html`<span class="muted small">${"–"}</span>`}</td>
     <td class="number" data-label=${guard.state === "shadow" ? "Would stop" : "Stopped"}>${guard.state === "shadow" ? html`<span class="muted" title="would have stopped">(${guard.stops})</span>` : guard.stops}</td>
@@ -73,6 +74,7 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
       ${guard.origin === "older" && html`<${Button} small role="admin" onClick=${() => setOpen("upgrade")}>Upgrade</${Button}>`}
       ${guard.state !== "shadow" && guard.state !== "holding" && html`<${Button} small role="operator" onClick=${() => setOpen("shadow")}>Shadow</${Button}>`}
       <${Button} small role="admin" tone="danger" onClick=${() => setOpen("remove")}>Remove</${Button}></div>
+      ${open === "values" && html`<${Beliefs} guard=${guard} close=${close} />`}
       ${open === "set" && html`<${SetValues} guard=${guard} preset=${preset} seen=${seen} guards=${guards} close=${close} />`}
       ${open === "enforce" && html`<${Enforce} guard=${guard} guards=${guards} path=${path} close=${close} />`}
       ${open === "shadow" && html`<${Confirm} title=${`Put ${guard.name} into shadow mode?`} verb="Shadow mode" role="operator" tone="danger" close=${close} act=${() => turn("is in shadow mode", "It only records what it would have done.", { shadow: true })}>
@@ -108,10 +110,4 @@ function Confirm(/** @type {{title: string, verb: string, role: "operator" | "ad
     await act();
   };
   return html`<${Dialog} title=${title} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role=${role} tone=${tone} onClick=${go}>${verb}</${Button}>`}>${children}</${Dialog}>`;
-}
-
-function Fence(/** @type {{guard: any, seen: Record<string, any[]>}} */ { guard, seen }) {
-  const polygon = corners(guard.loads.polygon ?? "");
-  if (!polygon) return null;
-  return html`<div class="panel-body"><h3><${Given} value=${guard.name} most=${60} /></h3><${FenceMap} name=${guard.name} polygon=${polygon} margin=${constant(guard, "margin") ?? 0} trail=${trailOf(guard, seen)} /></div>`;
 }

@@ -6,8 +6,8 @@ import { Dialog } from "#console/parts/dialog.js";
 import { Check, Field } from "#console/parts/field.js";
 import { Notice } from "#console/parts/notice.js";
 import { corners, written } from "./geometry.js";
-import { FenceMap } from "./map.js";
-import { constant, margins, trailOf } from "./margins.js";
+import { Area } from "./area.js";
+import { margins } from "./margins.js";
 import { Margins } from "./meter.js";
 
 /** @param {{guard: any, preset: any, seen: Record<string, any[]>, guards: ReturnType<typeof import("./state.js").useGuards>, close: () => void}} given */
@@ -33,7 +33,7 @@ export function SetValues({ guard, preset, seen, guards, close }) {
   return html`<${Dialog} wide title=${`Set values of ${guard.name}`} close=${close} foot=${foot}>
     <div class="form-grid">${preset.parameters.map((/** @type {any} */ one) => html`<${Value} key=${one.name} parameter=${one} value=${values[one.name] ?? inForce(guard, one)} set=${set(one.name)} wrong=${wrong.includes(one)} />`)}</div>
     ${ready && html`<${Outlook} tried=${tried} seen=${seen} loads=${loads} />`}
-    ${polygon && html`<${FenceMap} name=${guard.name} polygon=${polygon} margin=${constant(tried, "margin") ?? 0} trail=${trailOf(guard, seen)} draft=${draft ?? polygon}
+    ${polygon && html`<${Area} guard=${guard} tried=${tried} seen=${seen} draft=${draft ?? polygon}
       move=${(/** @type {number} */ index, /** @type {any} */ to) => set("polygon")(written((draft ?? polygon).map((one, at) => (at === index ? to : one))))} />`}
     ${loads.length > 0 && html`<${Check} label="Load even if the guard then holds its topics, until it is resumed" on=${hold} set=${setHold} />`}</${Dialog}>`;
 }

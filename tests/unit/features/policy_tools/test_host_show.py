@@ -26,10 +26,20 @@ default = site
 """
 
 
+GROUPS = """\
+[Authority]
+base = /cmd_vel
+rank base = 10.77.0.5/pad > door:alice > 10.77.0.5
+arm = /arm /arm/home
+take arm = 10.77.0.5
+ask arm = door:alice
+"""
+
+
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
     hosts = {"door:alice": address_of("198.19.240.2")}
-    policy = compile_policy(POLICY, file="site.ini", hosts=hosts)
+    policy = compile_policy(POLICY + GROUPS, file="site.ini", hosts=hosts)
     monkeypatch.setattr(policy_verbs, "compiled", lambda *_given: policy)
 
     def show(name: str) -> tuple[int, list[str]]:
@@ -46,10 +56,33 @@ def test_the_rights_of_a_door_are_listed_by_its_name(shown: Any, name: str) -> N
     status, lines = shown(name)
     assert status == 0
     assert lines[0] == "door:alice, by the policy in force:"
-    assert len(lines) == 4
+    assert len(lines) == 6
     assert "/goal" in lines[2]
     assert "needs an approval" in lines[2]
 
 
 def test_a_host_without_rights_has_none_listed(shown: Any) -> None:
-    assert shown("10.9.9.9") == (1, ["10.9.9.9, by the policy in force:", "no rule grants 10.9.9.9 anything"])
+    assert shown("10.9.9.9") == (
+        1,
+        [
+            "10.9.9.9, by the policy in force:",
+            "no rule grants 10.9.9.9 anything",
+            "[Authority] base (/cmd_vel): no part in it, so its messages and calls of these names are denied",
+            "[Authority] arm (/arm /arm/home): no part in it, so its messages and calls of these names are denied",
+        ],
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("alice", ["rank 2 of 3 as door:alice;", "may only ask for it"]),
+        (
+            "10.77.0.5",
+            ["rank 1 of 3 as 10.77.0.5/pad, rank 3 of 3 as 10.77.0.5;", "may take it while it is free"],
+        ),
+    ],
+)
+def test_the_rank_or_claim_of_a_host_in_each_group_is_listed(shown: Any, name: str, parts: list[str]) -> None:
+    lines = shown(name)[1][-2:]
+    assert all(part in line for part, line in zip(parts, lines, strict=True)), lines

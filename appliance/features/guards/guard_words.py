@@ -1,0 +1,43 @@
+"""Describe a guard's state for a person."""
+
+from appliance.base.counted import counted
+from appliance.cli.output import moment
+from appliance.features.guards.guard_answers import GuardRow
+
+
+def origin_in_words(row: GuardRow) -> str:
+    match row.origin:
+        case "older":
+            return f"{row.preset} {row.version}, older: rosrv guard upgrade {row.name};"
+        case "changed":
+            return f"{row.preset} {row.version}, changed: not the text of the preset;"
+    return row.preset
+
+
+def state_in_words(row: GuardRow) -> str:
+    acts = counted(row.stops, "stop")
+    match row.state:
+        case "holding":
+            return f"holds its topics: rosrv monitor resume {row.name}"
+        case "shadow":
+            return f"in shadow mode, {acts} only recorded"
+        case "off":
+            return f"disabled: rosrv monitor enable {row.name}"
+    if row.awaits:
+        resume = f"rosrv monitor resume {row.name}"
+        return f"in force, stops until it hears {row.awaits}; if that has another name now: {resume}"
+    end = (
+        ""
+        if row.confirm_by is None
+        else f", until {moment(row.confirm_by)} unless you run: rosrv monitor confirm"
+    )
+    return f"in force, {row.state}{'' if row.preset == 'withhold' else f', {acts}'}{_last_stop(row)}{end}"
+
+
+def _last_stop(row: GuardRow) -> str:
+    stop = row.last_stop
+    if stop is None:
+        return ""
+    when = f"since {moment(stop.since)}" if stop.until is None else f"last until {moment(stop.until)}"
+    who = f" ({stop.node} on {stop.host})" if stop.node else ""
+    return f", {when}{f': {stop.cause}' if stop.cause else ''}{who}"

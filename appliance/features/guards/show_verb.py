@@ -1,0 +1,97 @@
+"""The command `rosrv guard show`."""
+
+import re
+from typing import Annotated, Any
+
+import typer
+
+from appliance.channel import admin
+from appliance.channel.answers.monitor_answers import MonitorReadout
+from appliance.cli import completion
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import say_json, say_row
+from appliance.features.guards.guard_answers import GuardRow
+from appliance.features.guards.guard_words import origin_in_words, state_in_words
+from appliance.features.guards.requests import GuardsWanted
+from appliance.specifications.givens import with_unit
+from rosmop.tool.tables import add_row, say_table, table_of
+from rosmop.tool.terminal import refused, say
+
+_REMARK = re.compile(r"^ {4}\w[^/]*;\s+// (.+)$", re.MULTILINE)
+
+
+@speaks
+def show(
+    appliance: Appliance,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="GUARD",
+            help="Name as in `rosrv guard list`",
+            autocompletion=completion.monitors,
+            show_default=False,
+        ),
+    ],
+) -> None:
+    """Show a guard: its state, its parameters, and the values on which it decides now.
+
+    The audit log records who looked, because the values come from messages.
+
+    Example: rosrv guard show fence
+    """
+    guards = appliance.ask_or_exit(GuardsWanted(presets=False)).guards
+    row = next((one for one in guards if one.name == name), None)
+    if row is None:
+        known = ", ".join(one.name for one in guards) or "none is loaded"
+        raise refused([f"no guard is named {name}; there are: {known}"])
+    found = appliance.ask_or_exit(admin.MonitorValuesWanted(name))
+    if appliance.as_json:
+        say_json({"guard": row, "values": found.values, "ages": found.ages, "age_seconds": found.age_seconds,
+                  "why_old": found.why_old})  # fmt: skip
+        return
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
+    _say_guard(row)
+    _say_values(found, remarks((loaded.files or {}).get(row.file, "")))
+
+
+def remarks(text: str) -> dict[str, str]:
+    """Return the remark behind the declaration of each variable of a specification."""
+    found: dict[str, str] = {}
+    for line in _REMARK.finditer(text):
+        declared = line[0].partition("//")[0]
+        for name in re.findall(r"\b([A-Za-z_]\w*)\b(?=\s*[=,;])", declared):
+            found.setdefault(name, line[1])
+    return found
+
+
+def _say_guard(row: GuardRow) -> None:
+    say(f"{row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())}", "bold")
+    say_row([state_in_words(row)])
+    for value in row.below:
+        say(value, "yellow")
+    given = [f"{one.name} = {with_unit(one.value, one.unit)}" for one in row.given if one.kind != "topic"]
+    given += [f"{name} = {value}" for name, value in row.loads.items()]
+    for line in given:
+        say(f"    {line}", "dim")
+
+
+def _say_values(found: MonitorReadout, meanings: dict[str, str]) -> None:
+    if found.age_seconds is None:
+        say(f"its present values are not known: {found.why_old}", "yellow")
+        return
+    if found.why_old:
+        say(f"its values {found.age_seconds:.1f} s ago; {found.why_old}:", "yellow")
+    else:
+        say("its present values:")
+    table = table_of("    value", "", "meaning")
+    for name, value in found.values.items():
+        add_row(table, f"    {name}", _shown(value), meanings.get(name, ""))
+    say_table(table)
+    for event, past in found.ages.items():
+        say(f"    {event}: {'never' if past is None else f'{past:.2f} s ago'}")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
