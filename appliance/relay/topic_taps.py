@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
 
 from appliance.base import clock
 from appliance.channel.messages import LookEnded, LookWanted, Message, MessageSeen
@@ -73,7 +72,7 @@ class _Reader:
         self._header: Mapping[str, str] | None = None
         self._reader = PublisherReader({})
 
-    def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
+    def read(self, data: bytes) -> tuple[str, dict[str, object], str]:
         header = self._topic.header or {}
         if header is not self._header:
             self._header, self._reader = header, PublisherReader(header)

@@ -6,7 +6,7 @@ text: `nan`, `… 344 more`. Times and durations are seconds.
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from rosmop.form.compiled import SpecificationCode
 from rosmop.types import value_types
@@ -16,6 +16,8 @@ from rosmop.types.value_types import Type
 MOST_VALUES = 200
 MOST_ELEMENTS = 16
 MOST_CHARACTERS = 200
+Value: TypeAlias = "bool | int | float | bytes | bytearray | list[Value]"
+"""The value of a variable (`rosmop/types/value_types.py`)."""
 _CUT = "…"
 _AGE = "age("
 
@@ -23,7 +25,7 @@ _AGE = "age("
 class Readout(NamedTuple):
     """The variables by name, and the seconds since each event whose age the specification uses; None: never."""
 
-    values: dict[str, Any]
+    values: dict[str, object]
     ages: dict[str, float | None]
 
 
@@ -36,30 +38,32 @@ class _Reader:
         self._messages = messages
         self._left = MOST_VALUES
 
-    def value(self, kind: Type, value: Any) -> Any:
+    def value(self, kind: Type, value: Value) -> object:
         self._left -= 1
         if self._left < 0:
             raise _FullError
-        match kind:
-            case value_types.VectorType():
-                shown = [self.value(kind.element, one) for one in value[:MOST_ELEMENTS]]
-                return shown + ([_more(len(value) - MOST_ELEMENTS)] if len(value) > MOST_ELEMENTS else [])
-            case value_types.RecordType():
-                slots = self._messages.slots(kind.name).values()
-                return {slot.name: self.value(slot.type, one) for slot, one in zip(slots, value, strict=True)}
-            case value_types.TimeType() | value_types.DurationType():
-                return value / 1e9
+        if isinstance(value, list):
+            return self._list(kind, value)
         if isinstance(value, float):
             return value if math.isfinite(value) else str(value)
         if isinstance(value, bytes | bytearray):
             text = bytes(value[:MOST_CHARACTERS]).decode("utf-8", "backslashreplace")
             return text + (_more(len(value) - MOST_CHARACTERS) if len(value) > MOST_CHARACTERS else "")
-        return value
+        return value / 1e9 if isinstance(kind, value_types.TimeType | value_types.DurationType) else value
+
+    def _list(self, kind: Type, value: list[Value]) -> object:
+        if isinstance(kind, value_types.RecordType):
+            slots = self._messages.slots(kind.name).values()
+            return {slot.name: self.value(slot.type, one) for slot, one in zip(slots, value, strict=True)}
+        if not isinstance(kind, value_types.VectorType):
+            raise TypeError(f"{kind} has no elements")
+        shown = [self.value(kind.element, one) for one in value[:MOST_ELEMENTS]]
+        return shown + ([_more(len(value) - MOST_ELEMENTS)] if len(value) > MOST_ELEMENTS else [])
 
 
 def read_out(
     code: SpecificationCode,
-    variables: Mapping[str, Any],
+    variables: Mapping[str, Value],
     types: Mapping[str, Type],
     messages: MessageTypes,
     now: int,
@@ -67,10 +71,11 @@ def read_out(
     """Return the variables that all slices share, at the time `now` (ns of the monitors' clock)."""
     own = code.slicing.own if code.slicing is not None else ()
     shared = {name: each for name, each in code.variables.items() if each not in own}
-    reader, values, ages = _Reader(messages), dict[str, Any](), dict[str, float | None]()
+    reader, values, ages = _Reader(messages), dict[str, object](), dict[str, float | None]()
     for name, each in shared.items():
         if name.startswith(_AGE):
             last = variables[each]
+            assert isinstance(last, int)  # noqa: S101  it is a time
             ages[name.removeprefix(_AGE).removesuffix(")")] = (now - last) / 1e9 if 0 <= last <= now else None
             continue
         try:

@@ -647,7 +647,7 @@ class ValuesSeen(Message):
     """
 
     number: int
-    values: dict[str, Any] | None
+    values: dict[str, object] | None
     ages: dict[str, float | None] = msgspec.field(default_factory=dict)
 
 
@@ -662,7 +662,7 @@ class MessageSeen(Message):
     time: int
     type: str
     size: int
-    fields: dict[str, Any]
+    fields: dict[str, object]
     why: str = ""
 
 

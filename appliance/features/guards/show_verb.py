@@ -1,7 +1,7 @@
 """The command `rosrv guard show`."""
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -13,7 +13,6 @@ from appliance.cli.output import say_json, say_row
 from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_words import origin_in_words, state_in_words
 from appliance.features.guards.requests import GuardsWanted
-from appliance.specifications.givens import with_unit
 from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import refused, say
 
@@ -69,7 +68,7 @@ def _say_guard(row: GuardRow) -> None:
     say_row([state_in_words(row)])
     for value in row.below:
         say(value, "yellow")
-    given = [f"{one.name} = {with_unit(one.value, one.unit)}" for one in row.given if one.kind != "topic"]
+    given = [f"{one.name} = {one.value} {one.unit}".rstrip() for one in row.given if one.kind != "topic"]
     given += [f"{name} = {value}" for name, value in row.loads.items()]
     for line in given:
         say(f"    {line}", "dim")
@@ -91,7 +90,7 @@ def _say_values(found: MonitorReadout, meanings: dict[str, str]) -> None:
         say(f"    {event}: {'never' if past is None else f'{past:.2f} s ago'}")
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -7,6 +7,7 @@ raised a script error, or set a cookie.
 import re
 import urllib.parse
 from collections.abc import Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -16,6 +17,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, Request,
 from tests.support.processes import LIMIT as SECONDS
 from tests.support.waiting import eventually
 
+PICTURES = Path(__file__).resolve().parents[3] / "build" / "console"
 LIMIT = 2000 * SECONDS  # milliseconds to wait for an answer
 expect.set_options(timeout=LIMIT)
 _TELL_VIOLATIONS = """
@@ -103,6 +105,12 @@ class Reader:
         """Wait until the element has the text and is seen without scrolling."""
         expect(locator.first).to_contain_text(text)
         eventually(lambda: locator.first.evaluate(_SEEN_AT_ONCE), f"{text} is seen without scrolling")
+
+    def keep_picture(self, name: str) -> None:
+        """Save what the window shows without scrolling, for people, as `build/console/NAME-WIDTH.png`."""
+        size = self.page.viewport_size
+        assert size is not None
+        self.page.screenshot(path=PICTURES / f"{name}-{size['width']}.png")
 
     def axe(self) -> list[str]:
         self.settle()

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import os
 import re
 import urllib.parse
 import xmlrpc.client
@@ -106,6 +107,7 @@ def see(windows: list[Reader], place: Callable[[Page], Locator], text: str | re.
     for reader in windows:
         page = reader.page if "/console/now" in reader.page.url else reader.go("now")
         reader.sees(place(page), text)
+        reader.keep_picture(os.environ["PYTEST_CURRENT_TEST"].rpartition("::test_")[2].partition(" ")[0])
 
 
 def test_a_quiet_robot_says_so(windows: list[Reader]) -> None:
@@ -155,6 +157,7 @@ def test_a_waiting_call_is_decided_by_one_click_on_any_page(
         reader.sees(bar(page).locator(".waiting-call"), re.compile("agent.*publish /goal.*left"))
         reader.sees(lease, "For 30 s")
         reader.fits()
+        reader.keep_picture(f"a_waiting_call_on_{page.url.rpartition('/')[2]}")
         assert page.title().startswith("1 call waits")
         assert "icon-calls" in str(page.locator("link[rel=icon]").get_attribute("href"))
         lease.click()

@@ -15,7 +15,29 @@ import { ring } from "./sound.js";
 /** `at`: when they came, by the browser's monotonic clock, in milliseconds. `rows` is null before they are known. */
 export const held = createStore({ rows: /** @type {any[] | null} */ (null), error: /** @type {unknown} */ (null), at: 0 });
 
-export async function again() {
+const GAP = 200; // milliseconds between two requests: a storm of calls makes many records, and needs no request for each
+
+let fetching = /** @type {Promise<void> | null} */ (null);
+let stale = false;
+
+/** Fetch them; what changes meanwhile is fetched once more before the promise ends. */
+export function again() {
+  stale = true;
+  fetching ??= fetchAll().finally(() => {
+    fetching = null;
+  });
+  return fetching;
+}
+
+async function fetchAll() {
+  for (let first = true; stale; first = false) {
+    if (!first) await new Promise((done) => setTimeout(done, GAP));
+    stale = false;
+    await fetchOnce();
+  }
+}
+
+async function fetchOnce() {
   try {
     const { approvals } = await get("/v1/approvals");
     held.set({ rows: approvals, error: null, at: performance.now() });

@@ -7,7 +7,7 @@ import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
 import { Field } from "#console/parts/field.js";
 import { Given } from "#console/parts/given.js";
-import { Host, useHosts } from "#console/parts/host.js";
+import { Host, Sentence, useHosts } from "#console/parts/host.js";
 import { Empty, Failure, Loading } from "#console/parts/notice.js";
 import { done, failed } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
@@ -20,7 +20,7 @@ export function Drive() {
   return html`<section class="panel" aria-labelledby="drive"><div class="panel-head"><h2 id="drive">Who drives</h2></div>
     ${error && !value ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${2} />`
       : !rows.length ? html`<${Empty} icon="hosts" title="No command authority">Every host with the right to publish commands the robot. <code>[Authority]</code> in the policy names topics that one host at a time commands.</${Empty}>`
-      : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Group</th><th>Holder</th><th>Waits</th><th><span class="sr-only">Actions</span></th></tr></thead>
+      : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Group</th><th>Driver or holder</th><th>Waits</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((/** @type {any} */ one) => html`<${Group} key=${one.group} group=${one} again=${again} />`)}</tbody></table></div>`}</section>`;
 }
 
@@ -29,8 +29,8 @@ function Group(/** @type {{group: any, again: () => void}} */ { group, again }) 
   const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${wordOf(verb, group)}…</${Button}>`;
   return html`<tr data-group=${group.group}>
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
-    <td data-label="Holder"><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> <${Given} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
-    <td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>
+    <td data-label=${group.ranks.length ? "Driver" : "Holder"}><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> <${Sentence} value=${group.why} most=${200} />${group.held_seconds !== null && html`, <span class="nowrap">for ${lasting(group.held_seconds)}</span>`}<div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
+    ${group.ranks.length ? html`<td></td>` : html`<td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>`}
     <td><div class="row row-end">${group.ranks.length ? button("give", { disabled: !isStuck(group), why: "No lower rank waits for a person" }) : html`${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
 }

@@ -5,7 +5,7 @@ import { lasting } from "#console/moments.js";
 import { Badge } from "#console/parts/badge.js";
 import { Fact } from "#console/parts/fact.js";
 import { Given } from "#console/parts/given.js";
-import { Host } from "#console/parts/host.js";
+import { Host, Sentence } from "#console/parts/host.js";
 import { useResource } from "#console/parts/resource.js";
 import { get } from "#console/rest.js";
 
@@ -26,7 +26,7 @@ export function Drives() {
   const silent = rows.some((/** @type {any} */ one) => isSilent(one));
   const waits = rows.some((/** @type {any} */ one) => one.waiting.length);
   return html`<${Fact} name="Drives" to="/console/robot" tone=${silent || waits || rows.some(isStuck) ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
-    ${one.ranks.length ? html`<${Given} value=${one.group} most=${40} /> <${Badge} word=${one.standing} tone=${isStuck(one) ? "warn" : ""} /> <span class="muted"><${Given} value=${one.why} most=${200} /></span>` : one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
+    ${one.ranks.length ? html`<${Given} value=${one.group} most=${40} /> <${Badge} word=${one.standing} tone=${isStuck(one) ? "warn" : ""} /> <span class="muted"><${Sentence} value=${one.why} most=${200} />${one.held_seconds !== null && html`, <span class="nowrap">for ${lasting(one.held_seconds)}</span>`}</span>` : one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
     ${one.waiting.length > 0 && html` <${Badge} word="waits" tone="warn" /> <${Host} value=${one.waiting[0]} />${one.waiting.length > 1 && ` and ${one.waiting.length - 1} more`}`}</div>`)}</${Fact}>`;
 }
 

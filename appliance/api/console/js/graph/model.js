@@ -41,7 +41,7 @@ export function modelOf(graph, denials, wanted, shown = (address) => address, co
 export function attempts(denials) {
   const found = new Map();
   for (const record of denials) {
-    if (!record.resource || record.category === "rest" || !(record.caller_id || record.host) || isLateWithdrawal(record) || isSelftest(record)) continue;
+    if (!record.resource || record.category === "rest" || !(record.caller_id || record.host) || isLateWithdrawal(record) || isSelftest(record) || isHeld(record)) continue;
     const command = record.category === "command" || record.category === "parameters";
     const key = JSON.stringify([record.host, record.caller_id, record.category, command ? "" : record.resource]);
     const one = found.get(key);
@@ -54,6 +54,11 @@ export function attempts(denials) {
 /** Whether `rosrv selftest` was denied its own topic, which no other node uses. @param {any} record */
 export function isSelftest(record) {
   return record.resource === "/rosrv_selftest" && /^\/rosrv_selftest_(publisher|subscriber)$/.test(record.caller_id ?? "");
+}
+
+/** Whether a denial only says that the call waits for a person; it is shown as waiting. @param {any} record */
+export function isHeld(record) {
+  return String(record.reason ?? "").startsWith("held for approval ");
 }
 
 /** Whether a denial is the late withdrawal of a replaced node's registration, which is not an attempt to show. */

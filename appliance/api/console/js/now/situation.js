@@ -2,7 +2,7 @@
 
 import { byHostAndKind, grouped, othersOf, shownOf } from "../audit/rows.js";
 import { html } from "../html.js";
-import { isSelftest } from "../graph/model.js";
+import { isHeld, isSelftest } from "../graph/model.js";
 import { notable } from "../notable.js";
 import { Ago, useApplianceTime } from "../parts/ago.js";
 import { requested } from "../parts/badge.js";
@@ -13,7 +13,6 @@ import { Host } from "../parts/host.js";
 import { useStore } from "../store.js";
 
 const LATELY = 900; // seconds in which a denial is news
-const WAITS = /^held for approval /; // it waits for a person, and is shown as waiting
 
 export function Situation() {
   return html`<section class="situation" aria-label="Situation"><${FeatureParts} place="situation" /><${Denied} /></section>`;
@@ -22,7 +21,7 @@ export function Situation() {
 function Denied() {
   const denials = useStore(notable, (one) => one.denials);
   const now = useApplianceTime();
-  const [row] = byHostAndKind(grouped((denials ?? []).filter((one) => !isSelftest(one) && !WAITS.test(one.reason))));
+  const [row] = byHostAndKind(grouped((denials ?? []).filter((one) => !isSelftest(one) && !isHeld(one))));
   if (!row) return html`<${Fact} name="Denied" to="/console/audit?decision=deny&since=1d">${denials === null ? "…" : "nothing in the last day"}</${Fact}>`;
   const one = shownOf(row);
   const others = othersOf(row);

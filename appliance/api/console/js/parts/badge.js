@@ -20,8 +20,8 @@ export function Outcome(/** @type {{record: Record<string, any>}} */ { record })
   return html`<${Badge} word=${record.decision ?? record.severity} />`;
 }
 
-/** The word for a request: its category, or the call that gives the resource up. @param {Record<string, any>} record */
+/** The word for a request: its category, the call that gives the resource up, or the event of a record without either. @param {Record<string, any>} record */
 export function requested(record) {
   const call = String(record.detail?.call ?? "");
-  return record.category !== "command" && /^(unregister|unsubscribe)/.test(call) ? call : record.category;
+  return record.category !== "command" && /^(unregister|unsubscribe)/.test(call) ? call : record.category || record.event;
 }
