@@ -44,7 +44,7 @@ def test_long_values_are_cut() -> None:
     assert values["s"] == "x" * MOST_CHARACTERS + f"… {300 - MOST_CHARACTERS} more"
 
 
-def test_only_so_many_values_are_shown() -> None:
+def test_values_beyond_the_limit_are_left_out() -> None:
     values = read(on("", "".join(f"int n{number} = 0;" for number in range(MOST_VALUES + 5)))).values
     assert [*values.values()].count("…") == 5
 

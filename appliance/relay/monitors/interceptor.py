@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Outcome, Published
 
 MonitorOrder = MonitorSwitched | MonitorGiven | StopWanted | ValuesWanted
-"""What control asks of monitors in force, beside new specifications."""
+"""Control's orders and queries about monitors in force, beside new specifications."""
 
 _AFTER_DEFECT = 1.0
 _REPLAYED = "its publisher had latched this command before the relay connected to it; send it again"

@@ -74,6 +74,7 @@ def test_the_driver_and_a_hand_over_are_seen_as_they_happen(
         gamepad.send("0")
         shown(windows, "handed_back", re.compile(r"moving.*planner"))
         gamepad.send("0.5")
+        shown(windows, "the_gamepad_again", re.compile(r"moving.*gamepad"))
         gamepad.send("silent")
         shown(windows, "a_lost_gamepad", re.compile(r"lost.*gamepad"))
         for reader in windows:

@@ -73,7 +73,7 @@ def test_messages_that_waited_in_a_pause_of_the_relay_are_older_than_the_hand_ba
 
 @pytest.mark.parametrize(("pause", "wait"), [(0.04, 0.0), (FREE - 0.1, 0.0), (FREE - 0.05, 0.03)])
 def test_a_pause_in_the_free_time_delays_a_hand_back_only_if_it_ends_late(pause: float, wait: float) -> None:
-    """What came in a pause is read in `SETTLE` after it."""
+    """Messages that came in a pause are read in `SETTLE` after it."""
     it, now = topic(), START
     assert it.passes("pad", moves=True, now=now)
     assert it.passes("pad", moves=False, now=now)

@@ -114,7 +114,7 @@ async def test_values_of_an_earlier_revision_are_not_shown(desk: Desk) -> None:
 
 
 @virtual
-async def test_a_late_answer_is_for_nobody(desk: Desk) -> None:
+async def test_a_late_answer_is_discarded(desk: Desk) -> None:
     desk.relay.silent = True
     await desk.values.of("fence", "ann")
     desk.values.received(ValuesSeen(1, {"x": 9.0}))
