@@ -12,7 +12,6 @@ An immutable value holds all that is in force (`in_force.py`). A change replaces
 """
 
 import asyncio
-import datetime
 import json
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,17 +22,16 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import structlog
 
-from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replacement, Switched
-from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications import in_force
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.givens import Givens, parsed, split, with_unit
+from appliance.specifications.change_records import WORDS, ChangeRecords
+from appliance.specifications.givens import Givens, parsed, split
 from appliance.specifications.in_force import InForce, Wanted, unknown_monitors
 from appliance.specifications.live_topics import Published, TopicFindings, judge_holds, judge_topics
 from appliance.specifications.monitor_values import MonitorValues
@@ -46,7 +44,6 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
 )
 from appliance.specifications.specification_revisions import (
-    MOST_WARNINGS,
     NOTHING,
     Check,
     CheckBeside,
@@ -63,7 +60,6 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
-from appliance.telemetry.text_changes import changed_lines
 
 _log = structlog.get_logger()
 _ACTS = "monitor acts"
@@ -77,13 +73,6 @@ _NO_FOLDER = (
 
 
 _NO_FILES: tuple[list[str], list[str], list[str]] = ([], [], [])
-_EVENTS: dict[Switch, str] = {
-    True: "monitor enabled",
-    False: "monitor disabled",
-    SHADOW: "monitor in shadow mode",
-}
-_WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in shadow mode"}
-_NOT_LOADED = "not loaded"
 
 
 class UnknownMonitorError(Exception):
@@ -184,7 +173,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.site_keys = site_keys
         self._checks = _Checks(check, check_at_start, try_out)
         self._live = live
-        self._trail = trail
+        self._change_records = ChangeRecords(trail)
         self.now = InForce(switches=Switches(enable))
         self.rollout = Rollout(allocation, trail, on_fault, relays, slices=slices, parts=parts)
         self._attempting: set[str] = set()  # clients with a dry run under way
@@ -237,11 +226,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 self._enforce(new)
         await self.rollout.start(self.now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         if refused:
-            self._say_folder_refused(refused)
+            self._change_records.folder_refused(self.revision, refused)
         for name, error in checked.unbuilt.items():
-            self._say_unbuilt(name, error)
+            self._change_records.unbuilt(name, checked.monitors[name], error)
         for file, error in checked.left_out.items():
-            self._say_left_out(file, error)
+            self._change_records.left_out(file, error)
         self.returns.start(self.switches.states)
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown:  # the monitors were removed while the robot ran
@@ -445,14 +434,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if waited:
                 self._end_limit()
                 self.returns.end(promoted)
-                also = f": {', '.join(promoted)} in force" if promoted else ""
-                self._trail.happened(
-                    "specifications confirmed",
-                    f"revision {self.revision} of the specifications was confirmed{also}",
-                    category="monitor",
-                    resource="",
-                    who=who,
-                )
+                self._change_records.confirmed(self.revision, promoted, who)
                 await self.store.settled()
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
@@ -564,55 +546,19 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         await self.rollout.carried_out()
         return changed
 
-    def _say_folder_refused(self, findings: list[str]) -> None:
-        text = f"revision {self.revision} of the specifications stays in force, because the start refused the folder"
-        _log.error(text, findings=findings[:100])
-        self._trail.happened(
-            "specifications refused",
-            f"{text}: {findings[0]}",
-            severity=Severity.ALARM,
-            category="monitor",
-            resource="",
-            findings=findings[:100],
-            who=DISK,
-        )
-
-    def _say_unbuilt(self, name: str, error: str) -> None:
-        file = self.checked.monitors[name]
-        self._trail.happened(
-            "monitor not built",
-            f"{name} does nothing, because {file} has an error: {error};"
-            f" load a version without the error: rosrv monitor load {file}",
-            category="monitor",
-            resource=name,
-        )
-
-    def _say_left_out(self, file: str, error: str) -> None:
-        text = f"{file} is left out, because it has an error: {error}; its topics are not known, so nothing holds them"
-        _log.error(text)
-        fix = f"load a version without the error: rosrv monitor load {file}"
-        self._trail.happened("monitor not built", f"{text}; {fix}", category="monitor", resource=file)
-
-    @property
-    def off(self) -> dict[str, str]:
-        """Return the monitors that are disabled or in shadow mode, each with its state in words."""
-        return {name: _WORDS[to] for name, to in self.switches.states.items() if to is not True}
-
     def _say_switched(
         self, name: str, to: Switch, who: str, why: str = "", *, earlier: Switch | None
     ) -> None:
         until = self.returns.until(name) or self.returns.confirm_by(name)
-        end = "" if until is None else f" until {_moment(until)}{' unless confirmed' if to is True else ''}"
-        self._trail.happened(
-            _EVENTS[to],
-            f"{name} is {_WORDS[to]}{end}{why}",
-            severity=Severity.NOTICE,
-            category="monitor",
-            resource=name,
-            who=who,
-            earlier=_NOT_LOADED if earlier is None else _WORDS[earlier],
-            more=None if until is None else {"until": _moment(until)},
-        )
+        self._change_records.switched(name, to, who, why, earlier=earlier, until=until)
+
+    def _given_states(self, name: str) -> Mapping[str, answers.GivenState]:
+        return {one.name: one for one in self.givens.states(self.checked, name)}
+
+    @property
+    def off(self) -> dict[str, str]:
+        """Return the monitors that are disabled or in shadow mode, each with its state in words."""
+        return {name: WORDS[to] for name, to in self.switches.states.items() if to is not True}
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
         """Release the topics that monitors hold, and let them await no node; return the monitors that held any.
@@ -636,13 +582,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                     away.append(name)
                     continue
                 self.rollout.resumed(name)
-                self._trail.happened(
-                    "monitor resumed",
-                    f"the topics of {name} are released",
-                    category="monitor",
-                    resource=name,
-                    who=who,
-                )
+                self._change_records.resumed(name, who)
             if away:
                 text = f"{', '.join(away)} not resumed: the relay process is not running; resume when it runs again"
                 raise SpecificationsRefusedError([text])
@@ -664,28 +604,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                     partial(self._store_words, coming),
                     tell=[(name, messages.MonitorGiven(name, values))],
                 )
-                self._say_given(name, {one: present[one] for one in changed}, who)
+                self._change_records.given(
+                    name, self._given_states(name), {one: present[one] for one in changed}, who
+                )
                 await self.store.settled()
                 await self.rollout.carried_out()
             given = self.givens.states(self.checked, name)
             return answers.GivenSet(name, changed, given, self.revision, self.tag)
-
-    def _say_given(self, name: str, before: Mapping[str, messages.GivenValue], who: str) -> None:
-        given = {one.name: one for one in self.givens.states(self.checked, name)}
-        parts = [
-            f"{one} = {with_unit(given[one].value, given[one].unit)} (was {with_unit(old, given[one].unit)})"
-            for one, old in before.items()
-        ]
-        self._trail.happened(
-            "monitor set",
-            f"{name}: {', '.join(parts)}",
-            severity=Severity.NOTICE,
-            category="monitor",
-            resource=name,
-            who=who,
-            values={one: given[one].value for one in before},
-            before=dict(before),
-        )
 
     # --- the relay's messages ---
 
@@ -783,12 +708,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             others = ", ".join(order.kept)
             hint = [f"not of the folder, and kept: {others} (prune removes them)"] if others else []
             findings = error.findings + hint
-            self._trail.happened(
-                "specifications refused",
-                f"revision {self.revision} stays in force: {error.findings[0]}",
-                findings=findings[:100],
-                who=order.who,
-            )
+            self._change_records.refused(self.revision, error.findings[0], findings, order.who)
             raise SpecificationsRefusedError(findings) from error
         for name, to in put.items():
             earlier = before.states.get(name)
@@ -796,7 +716,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         for name in given:
             own = {one.name: one.default for one in new.givens.states(checked, name)}
             present = own | {one.name: one.value for one in before.givens.states(before.checked, name)}
-            self._say_given(name, {one: present[one] for one in given[name]}, order.who)
+            earlier_values = {one: present[one] for one in given[name]}
+            self._change_records.given(name, self._given_states(name), earlier_values, order.who)
         await self.store.settled()
         await self.rollout.all_taken()
         self._published()
@@ -904,26 +825,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._put_in_force(row, order.within)
         self._enforce(new)
         added, changed, removed = new.sources.difference(before)
-        self._trail.happened(
-            "specifications loaded",
-            f"revision {row.revision} of the specifications is in force: {order.note}",
-            category="monitor",
-            resource="",
-            who=order.who,
-            revision_of_specifications=row.revision,
-            sha256=fingerprint_of_all(new.sources.named()),
-            earlier_sha256=fingerprint_of_all(before.named()) if before.files else "",
-            diff=changed_lines(before.named(), new.sources.named()),
-            compiled_sha256=fingerprint(checked.compiled),
-            monitors=list(checked.monitors),
+        self._change_records.loaded(
+            row,
+            before,
+            new,
+            order.who,
+            began=began,
             off=self.off,
-            added=added,
-            changed=changed,
-            removed=removed,
-            began=list(began),
-            signed_by=checked.signed_by,
-            certificates=checked.certificates,
-            warnings=[*checked.warnings, *order.warnings][:MOST_WARNINGS],
+            changed=(added, changed, removed),
+            warnings=order.warnings,
         )
 
     def _keep_warnings(self) -> None:
@@ -942,16 +852,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self._say_switched(name, SHADOW, self.in_force.who, why, earlier=earlier.get(name))
         self.returns.keep(self.switches.states)
         for dropped in values:
-            self._trail.happened(
-                "monitor set",
-                dropped.text,
-                severity=Severity.WARNING,
-                category="monitor",
-                resource=dropped.monitor,
-                who=self.in_force.who,
-                values={dropped.name: dropped.now},
-                before={dropped.name: dropped.value},
-            )
+            self._change_records.dropped(dropped, self.in_force.who)
         self._store_words(self.now)
 
     def _store_words(self, now: InForce) -> None:
@@ -967,7 +868,3 @@ def _in_shadow(coming: InForce, files: Collection[str] = ()) -> set[str]:
 def _idle(file: str) -> str:
     fix = f"when it is corrected: rosrv monitor load {file}"
     return f"{file}:1:1: warning: it does nothing, because it has an error; {fix}"
-
-
-def _moment(seconds: float) -> str:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="seconds")
