@@ -74,8 +74,10 @@ class Base:
         x, y, self.turning = self.wanted
         before = self.velocity
         dx, dy = x - self.vx, y - self.vy
-        speed = math.hypot(self.vx, self.vy)
-        ux, uy = (self.vx / speed, self.vy / speed) if speed > 0 else (1.0, 0.0)
+        # A base that stands sets out in the direction that it is commanded.
+        way = (self.vx, self.vy) if self.vx or self.vy else (dx, dy)
+        size = math.hypot(*way)
+        ux, uy = (way[0] / size, way[1] / size) if size > 0 else (1.0, 0.0)
         along = dx * ux + dy * uy
         across = (dx - along * ux, dy - along * uy)
         along = max(-self.braking * seconds, min(self.gathering * seconds, along))

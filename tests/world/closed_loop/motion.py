@@ -180,7 +180,6 @@ class Person:
     """When the person turns back, in ms."""
     places: list[Point] = field(default_factory=list)
     """The place at each step of the world, the last one first."""
-    in_way: bool = False
     stepped_in: bool = False
     """Whether the person came from beside the base's way, nearer than the separation distance."""
 
@@ -197,8 +196,6 @@ class SeparationWorld(DrivenWorld):
     preset: ClassVar[str] = "separation"
     returns = False
     """Whether a scanner that was silent may send again."""
-    stood = True
-    """Whether the base stood a step ago."""
 
     def plan(self) -> None:
         r = self.random
@@ -280,6 +277,10 @@ class SeparationWorld(DrivenWorld):
 
     def scanner(self, period: float, delay: float) -> None:
         r = self.random
+        self.motions: list[int] = []
+        """When the base got each motion."""
+        self.looks: list[tuple[int, int]] = []
+        """When each scan arrived, and when it was made."""
         count = r.choice((120, 240, 360))
         self.far = r.choice((3.0, 8.0, 30.0)) if not self.live else 12.0
         self.near = 0.05
@@ -300,9 +301,14 @@ class SeparationWorld(DrivenWorld):
             data, valid = self.scan(found)
             arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
             whole = self.fault != "cut"
-            self.after(arrived, lambda: self.arrive(data, valid, whole=whole))
+            made = self.now
+            self.after(arrived, lambda: self._arrive(made, data, valid, whole=whole))
 
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
+
+    def _arrive(self, made: int, data: bytes, valid: "bool | None", *, whole: bool) -> None:
+        self.looks.append((self.now, made))
+        self.arrive(data, valid, whole=whole)
 
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         self.say("by", data, 5, whole=whole)
@@ -370,7 +376,6 @@ class SeparationWorld(DrivenWorld):
     def harm(self) -> None:
         for person in self.persons:
             self._follow(person)
-        self.stood = math.hypot(*self.base.velocity) <= 0.01
         self.escaped = self.escaped and not self._caught()
         places = [(*geometry.nearest_on(wall, self.base.x, self.base.y), 0.0) for wall in self.walls]
         places += [(one.x, one.y, PERSON_RADIUS) for one in self.persons if not one.stepped_in]
@@ -391,15 +396,17 @@ class SeparationWorld(DrivenWorld):
                 self.broken(law, f"the base touches {what} at {towards:.2f} m/s")
 
     def _follow(self, person: Person) -> None:
-        """Note whether a person steps into the base's way from beside it, so near that no moving base can stop."""
-        person.places = [(person.x, person.y), *person.places[:100]]
-        # The motion of a base that stood was judged a lag ago.
-        steps = 1 + self.base.lag // 10 if self.stood else 1
-        before = person.places[min(steps, len(person.places) - 1)]
+        """Note whether a person has stepped into the base's way from beside it, so near that no moving base can stop.
+
+        What counts is where the person was at the last look before the motion passed that the base executes.
+        """
+        person.places = [(person.x, person.y), *person.places[:300]]
         is_in = self._in_way(person.x, person.y)
+        steps = (self.now - self._looked()) // 10
+        before = person.places[min(max(steps, 1), len(person.places) - 1)]
         if not is_in:
             person.stepped_in = False
-        elif not person.in_way and not self._in_way(*before):
+        elif not person.stepped_in and not self._in_way(*before):
             speed = math.hypot(*self.base.velocity)
             delay = self.reaction + self.silent
             needed = (
@@ -409,7 +416,16 @@ class SeparationWorld(DrivenWorld):
             )
             away = math.dist((person.x, person.y), (self.base.x, self.base.y)) - PERSON_RADIUS
             person.stepped_in = away < needed + self.margin
-        person.in_way = is_in
+
+    def _looked(self) -> int:
+        """Return when the scanner looked last before the motion passed that the base executes."""
+        passed = next((at for at in reversed(self.motions) if at + self.base.lag <= self.now), self.now)
+        return next((seen for arrived, seen in reversed(self.looks) if arrived <= passed), self.now)
+
+    def received(self, at: int, legs: Legs) -> None:
+        super().received(at, legs)
+        if travels(legs):
+            self.motions.append(at)
 
     def _in_way(self, x: float, y: float) -> bool:
         vx, vy = self.base.velocity
