@@ -187,9 +187,11 @@ class SpeedWorld(World):
             )
         at, before, turned = self.before
         seconds = max(0.1, (self.now - at) / 1000)
-        if speed > before + self.growth * seconds * (
-            1 + 1e-6
-        ) or turn > turned + self.turn_growth * seconds * (1 + 1e-6):
+        rounded = 1 + 1e-6  # the Ackermann types have numbers of 32 bits
+        if (
+            speed > (before + self.growth * seconds) * rounded
+            or turn > (turned + self.turn_growth * seconds) * rounded
+        ):
             law = "L6" if self.fresh_from > at else "L1"
             self.broken(
                 law,
