@@ -19,7 +19,7 @@ FEATURE = Feature(
             {
                 "list": Verb(f"{_VERBS}:list_guards"),
                 "show": Verb("appliance.features.guards.show_verb:show"),
-                "suggest": Verb(f"{_VERBS}:suggest"),
+                "suggest": Verb("appliance.features.guards.suggest_verb:suggest"),
                 "new": Verb(f"{_VERBS}:new"),
                 "set": Verb(f"{_VERBS}:set_values"),
                 "enforce": Verb(f"{_VERBS}:enforce"),

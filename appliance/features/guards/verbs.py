@@ -1,4 +1,4 @@
-"""The commands `rosrv guard list|suggest|new|set|enforce|upgrade|remove`."""
+"""The commands `rosrv guard list|new|set|enforce|upgrade|remove`."""
 
 import shlex
 import tempfile
@@ -19,7 +19,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import say_json, say_row
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
-from appliance.features.guards.guard_answers import GuardList, GuardRow, Suggestion
+from appliance.features.guards.guard_answers import GuardList, GuardRow
 from appliance.features.guards.guard_facts import preset_row, values_of
 from appliance.features.guards.guard_words import origin_in_words, state_in_words
 from appliance.features.guards.presets import (
@@ -33,7 +33,6 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.requests import (
     GuardNew,
-    GuardSuggestionsWanted,
     GuardsWanted,
     GuardTry,
     GuardUpgrade,
@@ -104,36 +103,6 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
             say(warning, "yellow")
     if not appliance.as_json:
         say("the presets for further guards:" if body.guards else "no guard is loaded; the presets:", "bold")
-
-
-@speaks
-def suggest(appliance: Appliance) -> None:
-    """Propose guards for the topics of the running robot, as commands to paste. Nothing changes.
-
-    Values in the commands come from the present rates of topics; all others are defaults.
-
-    Example: rosrv guard suggest
-    """
-    found = appliance.ask_or_exit(GuardSuggestionsWanted())
-    if appliance.as_json:
-        for guard in found.loaded:
-            say_json({"loaded": guard.name, "preset": guard.preset, "topics": guard.topics})
-        for one in found.suggestions:
-            say_json({"preset": one.preset, "name": one.name, "topics": one.topics, "measured": one.measured,
-                      "values": one.values, "command": one.command, "others": one.others})  # fmt: skip
-        for sentence in found.left_out:
-            say_json({"left_out": sentence})
-        return
-    for guard in found.loaded:
-        say(f"loaded: {guard.name} ({guard.preset} on {guard.topics['command']})", "green")
-    for one in found.suggestions:
-        _say_suggestion(one)
-    for sentence in found.left_out:
-        say(sentence, "yellow")
-    if not (found.suggestions or found.loaded):
-        say(
-            "no topic now commands a base or an arm: start the robot's nodes, or name a topic: rosrv guard new --help"
-        )
 
 
 @speaks
@@ -531,20 +500,6 @@ def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> N
                 end.exit_code != 1
             ):  # nothing is recorded, or the recorder is off, and this was said: the plan holds
                 raise
-
-
-def _say_suggestion(one: Suggestion) -> None:
-    set_by = {**one.measured, **one.values}
-    rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
-                     if each.name not in set_by and each.name != "limits")  # fmt: skip
-    notes = [
-        f"from the present rate: {', '.join(one.measured)}" if one.measured else "",
-        f"defaults, which you should check: {rest}" if rest else "",
-        *(f"instead of {one.topics[name]}: {', '.join(topics)}" for name, topics in one.others.items()),
-    ]
-    say(one.command)
-    say(f"    {one.what}", "dim")
-    say(f"    {'; '.join(filter(None, notes))}", "dim")
 
 
 def _say_preset(preset: Preset) -> None:

@@ -75,6 +75,13 @@ def run_one(
     return world.run()
 
 
+def planned_act(preset: str, seed: int) -> str:
+    """Return what is to happen to the guard in a world, or an empty text; the world is planned, and not run."""
+    world = WORLDS[preset](seed)
+    world.plan()
+    return world.planned_act
+
+
 def replay(preset: str, seed: int, alone: str = "") -> str:
     return f"python -m tests.world.closed_loop --replay {preset} {seed}{alone and f' --alone {alone}'}"
 

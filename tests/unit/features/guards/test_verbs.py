@@ -13,7 +13,7 @@ import typer
 from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import GivenSet, GivenState, Replacement, Switched
 from appliance.cli.output import say_json
-from appliance.features.guards import verbs
+from appliance.features.guards import suggest_verb, verbs
 from appliance.features.guards.guard_answers import (
     GuardList,
     GuardPlan,
@@ -290,7 +290,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
         "fence acts before rate\n"
         "the presets for further guards:\n"
     )
-    run(verbs.suggest, Robot(None))
+    run(suggest_verb.suggest, Robot(None))
     assert capsys.readouterr().out == (
         "loaded: mine (deadman on /cmd_vel)\n"
         "rosrv guard new fence\n"
@@ -303,7 +303,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     )
     robot = Robot(None)
     robot.as_json = True
-    run(verbs.suggest, robot)
+    run(suggest_verb.suggest, robot)
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert lines[0] == {"loaded": "mine", "preset": "deadman", "topics": {"command": "/cmd_vel"}}
     assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})

@@ -1,0 +1,128 @@
+"""The command `rosrv guard suggest`."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated
+
+import typer
+
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import say_json
+from appliance.features.guards.guard_answers import Suggestion
+from appliance.features.guards.present_scan import MOST_SCANS, SCAN, WITHOUT, Scans, permitted
+from appliance.features.guards.presets import PRESETS
+from appliance.features.guards.requests import GuardSuggestionsWanted
+from appliance.features.table import recorded_messages
+from rosmop.tool.last_messages import last_messages
+from rosmop.tool.terminal import say
+
+_SINCE = "5s"
+
+
+@speaks
+def suggest(
+    appliance: Appliance,
+    *,
+    with_scan: Annotated[
+        bool,
+        typer.Option(
+            "--with-scan",
+            help="Also print what the last recorded scan would permit, from the flight recorder",
+        ),
+    ] = False,
+) -> None:
+    """Propose guards for the topics of the running robot, as commands to paste. Nothing changes.
+
+    Values in the commands come from the present rates of topics; all others are defaults. `--with-scan` reads the
+    scans of the last five seconds from the flight recorder: over REST this needs the role of an investigator.
+
+    Example: rosrv guard suggest
+    """
+    found = appliance.ask_or_exit(GuardSuggestionsWanted())
+    by_scan = [one for one in found.suggestions if with_scan and one.preset in WITHOUT]
+    if appliance.as_json:
+        for guard in found.loaded:
+            say_json({"loaded": guard.name, "preset": guard.preset, "topics": guard.topics})
+        for one in found.suggestions:
+            say_json({"preset": one.preset, "name": one.name, "topics": one.topics, "measured": one.measured,
+                      "values": one.values, "command": one.command, "others": one.others})  # fmt: skip
+        for sentence in found.left_out:
+            say_json({"left_out": sentence})
+    else:
+        for guard in found.loaded:
+            say(f"loaded: {guard.name} ({guard.preset} on {guard.topics['command']})", "green")
+        for one in found.suggestions:
+            _say_suggestion(one)
+        for sentence in found.left_out:
+            say(sentence, "yellow")
+        if not (found.suggestions or found.loaded):
+            say(
+                "no topic now commands a base or an arm: start the robot's nodes, or name a topic:"
+                " rosrv guard new --help"
+            )
+    if by_scan:
+        _say_permitted(appliance, by_scan)
+    elif with_scan and not appliance.as_json:
+        say(f"no proposed guard limits a velocity by a scan ({', '.join(WITHOUT)})")
+
+
+def _say_suggestion(one: Suggestion) -> None:
+    set_by = {**one.measured, **one.values}
+    rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
+                     if each.name not in set_by and each.name != "limits")  # fmt: skip
+    notes = [
+        f"from the present rate: {', '.join(one.measured)}" if one.measured else "",
+        f"defaults, which you should check: {rest}" if rest else "",
+        *(f"instead of {one.topics[name]}: {', '.join(topics)}" for name, topics in one.others.items()),
+    ]
+    say(one.command)
+    say(f"    {one.what}", "dim")
+    say(f"    {'; '.join(filter(None, notes))}", "dim")
+
+
+def _say_permitted(appliance: Appliance, guards: Sequence[Suggestion]) -> None:
+    topics = [one.topics["by"] for one in guards]
+    scans, why_not = _scans(appliance, topics)
+    for one in guards:
+        topic = one.topics["by"]
+        row = {"scan": topic, "guard": one.name}
+        recorded = scans.get(topic, [])
+        why = why_not or (
+            "" if recorded else f"{topic} has no scan in the last {_SINCE} of the flight recorder"
+        )
+        permits = dict(_permits(one, recorded)) if recorded else {}
+        if recorded and permits[""] is None:
+            why = f"the last message of {topic} is not a valid scan: {one.preset} would stop the base"
+        if appliance.as_json:
+            say_json({**row, "unknown": why} if why else {**row, "permits": permits})
+        elif why:
+            say(f"{one.name}: what it would permit is not known: {why}", "yellow")
+        else:
+            say(f"{one.name}: {_sentence(topic, permits)}")
+
+
+def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Scans], str]:
+    recorded = recorded_messages()
+    if recorded is None:
+        return {}, "this appliance has no flight recorder"
+    types = dict.fromkeys(topics, SCAN)
+    try:
+        with recorded(appliance, _SINCE, None, types) as spans:
+            return last_messages(spans, types, MOST_SCANS), ""
+    except typer.Exit:  # the recorder is off, does not record the topic, or cannot be read, and this was said
+        return {}, "the flight recorder has no scan"
+
+
+def _permits(one: Suggestion, scans: Scans) -> Iterator[tuple[str, float | None]]:
+    """Yield what the guard would permit with its own values (no name), and with each of the less safe ones."""
+    values = {**one.measured, **one.values}
+    yield "", permitted(one.preset, values, scans)
+    for name, value in WITHOUT[one.preset].items():
+        yield f"{name}={value}", permitted(one.preset, {**values, name: value}, scans)
+
+
+def _sentence(topic: str, permits: dict[str, float | None]) -> str:
+    own, *others = permits.items()
+    text = f"the present scan of {topic} permits {own[1]:.2f} m/s forward"
+    return text + "".join(
+        f"; {name} would permit {speed:.2f} m/s, below the standard" for name, speed in others
+    )
