@@ -134,6 +134,9 @@ class Deliveries:
         self.told.append((incarnation.name, call.method, call.parameters))
         self._note(Told(incarnation, call))
 
+    def push_unasked(self, incarnation: Incarnation, _key: str, call: NodeCall) -> None:
+        self.push(incarnation, call)
+
     def list_of(self, incarnation: Incarnation, topic: str) -> tuple[str, ...] | None:
         return self._lists.get((incarnation.key, topic))
 

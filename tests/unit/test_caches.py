@@ -148,6 +148,7 @@ BY_HAND = {
     "appliance/master/endpoints/delivery.py::_queues": OPEN,
     "appliance/master/endpoints/delivery.py::_used": "if len(self._used) + len(self._unused) >= _MOST_KEPT",
     "appliance/master/endpoints/node_ports.py::_routes": "if len(self._routes) > _MOST_ROUTES",
+    "appliance/master/endpoints/unasked_calls.py::_nodes": OPEN,
     "appliance/policy/groups.py::_kept": TEXT,
     "appliance/policy/host_sets.py::_networks": TEXT,
     "appliance/policy/policy.py::standings": "if len(self.standings) >= _KEPT_HOSTS",

@@ -234,12 +234,13 @@ class ParameterCalls:
         return outcomes
 
     def _written(self, write: ParameterWrite, reserved: Reservation | None, outcome: Answer) -> None:
+        before, _ = standing_at(self.mirror.tree, write.key)
         if reserved is not None and _is_set(outcome, write):
             self.mirror.set(write.key, write.value, reserved)
-            self.subscribers.parameter_set(write.key, write.value, write.caller.caller_id)
+            self.subscribers.parameter_set(write.key, write.value, write.caller.caller_id, before)
         elif reserved is None and outcome[0] == 1:
             self.mirror.delete(write.key)
-            self.subscribers.parameter_deleted(write.key)
+            self.subscribers.parameter_deleted(write.key, before)
 
     async def _call_rosmaster(self, calls: list[Wanted]) -> list[Answer | Exception]:
         if not calls:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import structlog
 
 from appliance.base import clock
+from appliance.master.endpoints.unasked_calls import UnaskedCalls
 from appliance.master.graph.registry import Incarnation, Life, Registry
 from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
@@ -244,6 +245,11 @@ class Delivery:
         self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
         self._lists: dict[str, dict[str, _List]] = {}  # by node and topic
+        self._unasked = UnaskedCalls[Incarnation, NodeCall](
+            lambda incarnation, call: nodes.client(incarnation).call(
+                call.method, MASTER_NAME, *call.parameters
+            )
+        )
 
     @property
     def waiting(self) -> int:
@@ -272,6 +278,11 @@ class Delivery:
         queue.calls.append(call)
         self._weigh(queue, call.weight)
         self._start(queue)
+
+    def push_unasked(self, incarnation: Incarnation, key: str, call: NodeCall) -> None:
+        """Tell a node what it perhaps never asked for; `UnaskedCalls` says how."""
+        if not self._silent:
+            self._unasked.push(incarnation, key, call)
 
     def list_of(self, incarnation: Incarnation, topic: str) -> tuple[str, ...] | None:
         """Return the list that the node has, or will get; None without one."""
@@ -309,12 +320,14 @@ class Delivery:
             self._weigh(queue, -one.weight)
 
     def drop(self, incarnation: Incarnation) -> None:
+        self._unasked.drop(incarnation)
         self._lists.pop(incarnation.key, None)
         queue = self._queues.pop(incarnation.key, None)
         if queue is not None:
             self._held.give_back(incarnation.host, queue.weight)
 
     def close(self) -> None:
+        self._unasked.clear()
         for worker in self._workers.values():
             worker.cancel()
 

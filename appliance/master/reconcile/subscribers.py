@@ -25,7 +25,7 @@ from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree, standing_at
 from roswire.xmlrpc import Value
 
-_MOST_PARTS = 1000  # of a namespace, for a node whose subscriptions are unknown
+_MOST_PARTS = 1000  # of a change, for a node whose subscriptions are unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class Subscribers:
 
     def _wanted(self, node: Incarnation, topic: str) -> tuple[str, ...] | None:
         if (Kind.SUBSCRIPTION, topic) in node.registrations:
-            return self._publishers_for(node, topic)
+            return self.publishers_for(node, topic)
         return () if (Kind.SUBSCRIPTION, topic) in node.shelf else None
 
     def _state_value(self, node: Incarnation, key: str) -> None:
@@ -96,14 +96,14 @@ class Subscribers:
             valued.add(key)
             self._tell_parameter(node, key)
 
-    def _publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
+    def publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
         hidden = self.relay.hides_publishers(topic)
         return self.registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
 
     # --- lists of publishers ---
 
     def list_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
-        uris = self._publishers_for(subscriber, topic)
+        uris = self.publishers_for(subscriber, topic)
         self.delivery.answered(subscriber, topic, uris)
         return uris
 
@@ -119,6 +119,12 @@ class Subscribers:
 
     def remind(self, subscriber: Incarnation, topic: str) -> None:
         self._state(subscriber, Kind.SUBSCRIPTION, topic, again=True)
+
+    def remind_besides(self, subscriber: Incarnation, topic: str, uris: Iterable[str]) -> None:
+        """Send a list with these URIs beside the publishers: a node keeps its connections until the new ones stand."""
+        wanted = self._wanted(subscriber, topic) if subscriber.life is Life.LIVE else None
+        if wanted is not None:
+            self.delivery.push_list(subscriber, topic, tuple(dict.fromkeys((*wanted, *uris))))
 
     def renew_all(self, topic: str) -> None:
         """Have every subscriber drop a topic's publishers and connect again, at their new ports."""
@@ -160,13 +166,16 @@ class Subscribers:
     def value_given(self, subscriber: Incarnation, key: str) -> None:
         self._valued.setdefault(subscriber, set()).add(key)
 
-    def parameter_deleted(self, key: str) -> None:
-        self.parameter_set(key, {}, None)
+    def parameter_deleted(self, key: str, before: Value) -> None:
+        self.parameter_set(key, {}, None, before)
 
-    def parameter_set(self, key: str, value: Value, caller_id: str | None) -> None:
-        """Send a value to the subscribers. The node that set it gets no update of the same key."""
+    def parameter_set(self, key: str, value: Value, caller_id: str | None, before: Value) -> None:
+        """Send a value to the subscribers; `before` is the earlier one, or None.
+
+        The node that set it gets no update of the same key.
+        """
         if self.unasked:
-            self._tell_unasked(key, value, caller_id)
+            self._tell_unasked(key, value, caller_id, before)
         if not self.registry.tells_parameters:
             return
         calls: dict[str, NodeCall] = {}
@@ -179,18 +188,18 @@ class Subscribers:
                 if self.may_read_value(subscriber, update.key, update.value):
                     self.delivery.push(subscriber, calls[update.key])
 
-    def _tell_unasked(self, key: str, value: Value, caller_id: str | None) -> None:
-        """Send a change, and each part of a namespace, because roscpp caches the parts by their own keys."""
-        updates = [(key, value), *itertools.islice(_parts_of(key, value), _MOST_PARTS)]
+    def _tell_unasked(self, key: str, value: Value, caller_id: str | None, before: Value) -> None:
+        """Send what changed, and each part of a namespace, because roscpp caches the parts by their own keys."""
+        changes = [*itertools.islice(_changes_of(key, value, before), _MOST_PARTS)]
         for node in [*self.unasked]:
             if node.life in ENDED:
                 self.unasked.discard(node)
             if node.life is not Life.LIVE or node.name == caller_id:
                 continue
-            for changed, part in updates:
+            for changed, part in changes:
                 told = (Kind.PARAMETER, changed) in node.registrations
                 if not told and self.may_know_value(node, changed, part):
-                    self.delivery.push(node, _param_update(changed, settled(part)))
+                    self.delivery.push_unasked(node, changed, _param_update(changed, settled(part)))
 
     def tell_parameters(self, subscriber: Incarnation) -> None:
         for key in subscriber.resources(Kind.PARAMETER):
@@ -233,12 +242,23 @@ def settled(value: Value) -> Value:
     return {name: settled(member) for name, member in value.items()} if isinstance(value, dict) else value
 
 
-def _parts_of(key: str, value: Value) -> Iterator[tuple[str, Value]]:
-    if isinstance(value, dict):
-        for name, member in value.items():
-            below = f"{key.rstrip('/')}/{name}"
-            yield below, member
-            yield from _parts_of(below, member)
+def _changes_of(key: str, value: Value, before: Value) -> Iterator[tuple[str, Value]]:
+    """Yield the keys whose values differ, from the top; `{}` for a key that is gone."""
+    if _same(value, before):
+        return
+    yield key, value
+    now, then = (part if isinstance(part, dict) else {} for part in (value, before))
+    for name in {**then, **now}:
+        yield from _changes_of(f"{key.rstrip('/')}/{name}", now.get(name, {}), then.get(name))
+
+
+def _same(one: Value, other: Value) -> bool:
+    """Return whether two values are equal for a node, to which 1, 1.0 and True are not."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_same(part, other[name]) for name, part in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return type(one) is type(other) and one == other
 
 
 def _upwards(key: str) -> Iterator[str]:

@@ -113,10 +113,10 @@ class OrderedServer:
         self.broken: Exception | None = None
         self.told: list[tuple[str, str | None]] = []
 
-    def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
+    def parameter_set(self, key: str, _value: Any, caller_id: str, _before: Any) -> None:
         self.told.append((key, caller_id))
 
-    def parameter_deleted(self, key: str) -> None:
+    def parameter_deleted(self, key: str, _before: Any) -> None:
         self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:

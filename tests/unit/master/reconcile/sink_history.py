@@ -152,7 +152,7 @@ class History(ControlParts):
             case "set", key, value:  # the ROS master has accepted it in an earlier turn
                 self.sinks.flush()
                 put(self.parameters, key, value, HOST)
-                self.subscribers.parameter_set(key, value, None)
+                self.subscribers.parameter_set(key, value, None, None)
             case "move", number, address:
                 if (node := self._known(number)) is not None:
                     self.registry.reached_at(node, address)

@@ -1,0 +1,126 @@
+"""Updates of parameters to nodes that perhaps never asked for them: they cost little, and delay nothing."""
+
+import asyncio
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from appliance.master.endpoints.unasked_calls import UnaskedCalls
+from appliance.rpc.xmlrpc_client import CallFailedError
+from roswire.xmlrpc import Value
+from tests.support.autojump import run as run_alone
+
+TAKEN: Value = [1, "", 0]
+FOREIGN: Value = [-1, "not subscribed", 0]
+
+
+@dataclass(frozen=True)
+class Node:
+    name: str
+
+    @property
+    def key(self) -> str:
+        return self.name
+
+
+@dataclass
+class Robot:
+    """Nodes that answer to a call of a key as `answer` says."""
+
+    answer: Callable[[str, str], Value] = lambda _node, _key: TAKEN
+    silent: set[str] = field(default_factory=set)
+    got: list[tuple[str, str, int]] = field(default_factory=list)
+    tried: Counter[str] = field(default_factory=Counter)
+
+    async def call(self, node: Node, call: tuple[str, int]) -> Value:
+        self.tried[node.name] += 1
+        if node.name in self.silent:
+            await asyncio.sleep(3)
+            raise CallFailedError("no answer")
+        await asyncio.sleep(0.001)
+        self.got.append((node.name, *call))
+        return self.answer(node.name, call[0])
+
+
+def run(robot: Robot, story: Callable[[UnaskedCalls[Node, tuple[str, int]]], Awaitable[None]]) -> Robot:
+    async def whole() -> None:
+        await story(UnaskedCalls(robot.call))
+
+    run_alone(whole())
+    return robot
+
+
+def test_a_node_gets_the_newest_value_of_a_key_that_changes_without_a_pause() -> None:
+    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+        for number in range(1000):
+            calls.push(Node("/cpp"), "/speed", ("/speed", number))
+            await asyncio.sleep(0.005)
+        await asyncio.sleep(1)
+
+    robot = run(Robot(), story)
+    assert robot.got[-1] == ("/cpp", "/speed", 999)
+    assert len(robot.got) < 40
+
+
+def test_a_key_to_which_a_node_did_not_subscribe_is_sent_once() -> None:
+    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+        for number in range(10):
+            calls.push(Node("/py"), "/a/b", ("/a/b", number))
+            await asyncio.sleep(1)
+
+    assert run(Robot(lambda _node, _key: FOREIGN), story).got == [("/py", "/a/b", 0)]
+
+
+def test_a_key_is_sent_again_after_its_namespace_was_taken() -> None:
+    """rospy knows a new part of a namespace only with the namespace."""
+
+    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+        for key in ("/a/b", "/a", "/a/b"):
+            calls.push(Node("/py"), key, (key, 1))
+            await asyncio.sleep(1)
+
+    keys = [
+        key for _node, key, _n in run(Robot(lambda _n, key: TAKEN if key == "/a" else FOREIGN), story).got
+    ]
+    assert keys == ["/a/b", "/a", "/a/b"]
+
+
+@pytest.mark.parametrize("others", [1, 50])
+def test_nodes_that_never_answer_get_nothing_more_and_others_do(others: int) -> None:
+    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+        for number in range(600):
+            for name in ("/js", *(f"/cpp{one}" for one in range(others))):
+                calls.push(Node(name), "/speed", ("/speed", number))
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(5)
+
+    robot = run(Robot(silent={"/js"}), story)
+    assert robot.tried["/js"] == 5
+    last = {name: number for name, _key, number in robot.got}
+    assert last == {f"/cpp{one}": 599 for one in range(others)}
+
+
+def test_a_node_that_hangs_for_some_seconds_gets_the_newest_value_afterwards() -> None:
+    robot = Robot(silent={"/cpp"})
+
+    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+        for number in range(8):
+            calls.push(Node("/cpp"), "/speed", ("/speed", number))
+            await asyncio.sleep(1)
+        robot.silent.clear()
+        await asyncio.sleep(5)
+
+    assert run(robot, story).got == [("/cpp", "/speed", 7)]
+
+
+def test_nothing_is_sent_after_the_end() -> None:
+    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+        for number in range(3):
+            calls.push(Node(f"/{number}"), "/speed", ("/speed", number))
+        calls.drop(Node("/0"))
+        calls.clear()
+        await asyncio.sleep(10)
+
+    assert run(Robot(), story).got == []
