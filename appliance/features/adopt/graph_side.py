@@ -1,7 +1,8 @@
 """Change RVMaster's graph for an adoption: by orders that are decided, charged and recorded like a node's own calls."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Protocol
 
 from appliance.features.adopt.places import NodePlace
@@ -92,12 +93,28 @@ class AdoptedGraph:
         self.denied.pop(entry, None)
         await self.order(place.host, _UNREGISTER[kind], name, resource, detail)
 
-    def tell(self, names: Iterable[str]) -> None:
-        """Send the subscribers of adopted nodes their lists, with the URIs of the appliance."""
+    def tell(self, names: Iterable[str], besides: Mapping[str, Iterable[str]] = MappingProxyType({})) -> None:
+        """Send the subscribers of adopted nodes their lists, with the URIs of the appliance.
+
+        `besides` has more URIs for topics.
+        """
         for name in names:
             node = self.registry.holder(name)
-            for topic in () if node is None else node.resources(Kind.SUBSCRIPTION):
-                self.subscribers.remind(node, topic)  # type: ignore[arg-type]  # it is not None
+            if node is None:
+                continue
+            for topic in node.resources(Kind.SUBSCRIPTION):
+                if topic in besides:
+                    self.subscribers.remind_besides(node, topic, besides[topic])
+                else:
+                    self.subscribers.remind(node, topic)
+
+    def given(self, node: Incarnation, topic: str) -> tuple[str, ...]:
+        """Return the appliance's URIs of a topic's publishers, as a subscriber has them."""
+        return self.subscribers.publishers_for(node, topic)
+
+    async def absent(self) -> int:
+        """Return the number of subscriptions that are not yet connected through the appliance."""
+        return sum(1 for _absent in self.subscribers.absent(self.nodes()))
 
     def nodes(self) -> list[Incarnation]:
         """Return the nodes of the robot, also those that the policy or a failure suspended."""

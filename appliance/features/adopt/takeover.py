@@ -43,8 +43,14 @@ from appliance.features.adopt.places import (
     names_to_resolve,
     parsed,
 )
+from appliance.features.adopt.subscriber_lists import (
+    lists_of,
+    rows_of,
+    send_lists,
+    until_connected,
+    until_least,
+)
 from appliance.master.graph.registry import Incarnation
-from appliance.policy.model import Address
 from appliance.rpc.master_reader import (
     ORDER,
     PUBLICATION,
@@ -64,8 +70,9 @@ from roswire.xmlrpc import Value
 MASTER_NAME = "/master"
 LAST_WORD_SECONDS = 5.0  # an ordered end of the appliance waits 10 s for the whole
 _READINGS = 5
-_AT_ONCE_OF_HOST = 16
 _LISTS_SECONDS = 2.0
+_BESIDES_SECONDS = 1.0  # for the lists before and after the last one
+_REMINDERS = 2
 _PAUSE_SECONDS = 0.02
 _AT_ONCE = 50  # registrations without a pause for other callers
 _KEPT_PARAMETER = "run_id"
@@ -198,6 +205,8 @@ class AdoptOperation:
         await self.machine("forward")
         await self.passed("forward")
         while True:
+            if reads and not readings:
+                await self._connect(graph, places)
             self.graph.tell(places.found)
             await self._until_told()
             await self.passed("tell")
@@ -267,6 +276,13 @@ class AdoptOperation:
         until = clock.now() + _LISTS_SECONDS
         while self.waiting() and clock.now() < until:
             await asyncio.sleep(_PAUSE_SECONDS)
+
+    async def _connect(self, graph: MasterGraph, places: Places) -> None:
+        """Have the nodes connect through the appliance; until that stands, they keep their earlier connections."""
+        self.graph.tell(places.found, lists_of(graph))
+        await self._until_told()
+        await until_least(self.graph.absent)
+        await self.passed("connect")
 
     async def _cuts(self, graph: MasterGraph, places: Places) -> dict[str, object]:
         """Return the ports to cut, found before subscribers get their lists: rospy hears twice until the cut."""
@@ -529,37 +545,32 @@ class AdoptOperation:
     async def _last_word(self, graph: MasterGraph, nodes: list[tuple[Incarnation, set[Entry]]]) -> list[str]:
         """Send each subscriber its list in this graph; return the nodes that did not take it.
 
-        A host that does not answer delays only its own nodes, and the whole only for `LAST_WORD_SECONDS`.
+        Before, it gets this list beside the appliance's, and keeps its connections until the new ones stand. A node
+        that does not connect gets its list again: roscpp gives a publisher up after one failed call. A host that does
+        not answer delays only its own nodes, and the whole only for some seconds.
         """
-        publishers: dict[str, list[str]] = {}
-        for kind, topic, name in sorted(graph.entries):
-            if kind == PUBLICATION and name in graph.nodes:
-                publishers.setdefault(topic, []).append(graph.nodes[name])
-        failed: set[str] = set()
-        turns: dict[Address, asyncio.Semaphore] = {}
-
-        async def tell(node: Incarnation, topic: str) -> None:
-            async with turns.setdefault(node.host, asyncio.Semaphore(_AT_ONCE_OF_HOST)):
-                if node.name in failed:
-                    return
-                try:
-                    uris: list[Value] = [*publishers.get(topic, [])]
-                    await self.call(node.call_uri, "publisherUpdate", topic, uris)
-                except CallFailedError:
-                    failed.add(node.name)
-
-        calls = {
-            asyncio.create_task(tell(node, topic)): node.name
+        lists = lists_of(graph)
+        rows = [
+            (node, topic)
             for node, entries in nodes
             for kind, topic, _name in sorted(entries)
             if kind == SUBSCRIPTION
-        }
-        late: set[asyncio.Task[None]] = set()
-        if calls:
-            _done, late = await asyncio.wait(calls, timeout=LAST_WORD_SECONDS)
-        for call in late:
-            call.cancel()
-        return sorted(failed.union(calls[call] for call in late))
+        ]
+        if self.forwards:
+            both = {
+                (node, topic): [*dict.fromkeys((*lists.get(topic, []), *self.graph.given(node, topic)))]
+                for node, topic in rows
+            }
+            await send_lists(self.call, both, _BESIDES_SECONDS)
+            await until_connected(self.call, rows_of(lists, rows))
+        last = {(node, topic): lists.get(topic, []) for node, topic in rows}
+        failed = await send_lists(self.call, last, LAST_WORD_SECONDS)
+        for _ in range(_REMINDERS):
+            missing = await until_connected(self.call, rows_of(lists, rows))
+            if not missing:
+                break
+            await send_lists(self.call, {row: last[row] for row in missing}, _BESIDES_SECONDS)
+        return failed
 
 
 def _is_new(entry: Entry, node: Incarnation, there: MasterGraph) -> bool:

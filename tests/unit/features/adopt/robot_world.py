@@ -43,6 +43,11 @@ class RobotNode:
     alive: bool = True
     lists: dict[str, list[str]] = field(default_factory=dict)
     """The last list of publishers of each topic."""
+    earlier: list[tuple[str, list[str]]] = field(default_factory=list)
+    """All lists that came by calls of the operation."""
+    fails: int = 0
+    """Lists after which the node does not connect, because its call to a publisher fails."""
+    connected: dict[str, list[str]] = field(default_factory=dict)
 
     def entries(self) -> set[Entry]:
         return {
@@ -237,6 +242,14 @@ class RobotWorld:
             return [1, "", ["TCPROS", "base", uri.port + 1000]]
         if method == "publisherUpdate":
             node.lists[str(params[0])] = _texts(params[1])
+            node.earlier.append((str(params[0]), _texts(params[1])))
+            if node.fails:
+                node.fails -= 1
+            else:
+                node.connected[str(params[0])] = _texts(params[1])
+        if method == "getBusInfo":
+            rows = [(topic, one) for topic, uris in node.connected.items() for one in uris]
+            return [1, "", [[0, one, "i", "TCPROS", topic, True] for topic, one in rows]]
         return [1, "", node.port]
 
     async def _passed(self, step: str) -> None:

@@ -1,4 +1,3 @@
-import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -10,11 +9,12 @@ from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.machine_facts import RobotMaster
 from appliance.features.adopt.takeover import AdoptError
 from appliance.master.graph.registry import Kind
+from tests.support import autojump
 from tests.support.control_parts import ControlParts
 from tests.unit.features.adopt.robot_world import LINK, KilledError, RobotWorld
 
 MANY = 10_000
-TAKE = ("read", "parameters", "register", "forward", "tell", "cut", "read again", "taken")
+TAKE = ("read", "parameters", "register", "forward", "connect", "tell", "cut", "read again", "taken")
 GIVE = ("silence", "stand in", "give", "withdraw", "give again", "tell", "given", "forget", "released")
 
 
@@ -30,7 +30,7 @@ def run(story: Callable[[RobotWorld], Coroutine[Any, Any, None]], *, nodes: bool
         await story(world)
         return world
 
-    return asyncio.run(told())
+    return autojump.run(told())
 
 
 def require_taken(world: RobotWorld) -> None:
@@ -330,6 +330,49 @@ def test_the_rosout_of_the_robot_is_skipped_silently() -> None:
         world.record = msgspec.structs.replace(world.record, wanted=False)
         await world.until_settled()
         assert world.master.entries == world.truth()
+
+    run(story)
+
+
+def test_a_node_keeps_its_connections_until_the_new_ones_stand() -> None:
+    """roscpp ends a connection as soon as a list lacks its publisher, and connects to a new one only later."""
+
+    async def story(world: RobotWorld) -> None:
+        def lists() -> dict[tuple[str, str], set[str]]:
+            return {
+                (one.name, topic): {*one.lists[topic]} for one in world.robot.values() for topic in one.lists
+            }
+
+        connecting: dict[tuple[str, str], set[str]] = {}
+        world.after["connect"] = lambda: connecting.update(lists())
+        await world.until_settled()
+        adopted = lists()
+        own = {
+            (one.name, topic): {other.uri for other in world.robot.values() if topic in other.publishes}
+            for one in world.robot.values()
+            for topic in one.subscribes
+        }
+        assert own == {row: connecting[row] - adopted[row] for row in own}
+        assert all(connecting[row] >= adopted[row] for row in own)
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        for (name, topic), uris in own.items():
+            given = [{*found} for about, found in world.robot[name].earlier if about == topic]
+            assert given == [adopted[name, topic] | uris, uris]
+
+    run(story)
+
+
+def test_a_node_that_does_not_connect_after_the_release_gets_its_list_again() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.robot["/rviz"].fails = 2  # both lists of the release
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        require_given(world)
+        assert world.robot["/rviz"].connected == {"/odom": [world.robot["/base"].uri]}
+        assert len(world.robot["/rviz"].earlier) == 3
+        assert len(world.robot["/teleop"].earlier) == 2
 
     run(story)
 

@@ -1,0 +1,113 @@
+"""Send subscribers their lists of publishers, and wait until they are connected to these.
+
+roscpp ends a connection at once when the list lacks its publisher, and connects to a new one some tenths of a second
+later. So at a change of masters a node first gets a list with both, and only afterwards the one that it shall keep.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+
+from appliance.base import clock
+from appliance.features.adopt.places import NodeCaller
+from appliance.master.graph.registry import Incarnation
+from appliance.policy.model import Address
+from appliance.rpc.master_reader import PUBLICATION, MasterGraph
+from appliance.rpc.xmlrpc_client import CallFailedError
+from roswire.xmlrpc import Value
+
+_AT_ONCE_OF_HOST = 16
+_CONNECT_SECONDS = 1.5  # as long, at most, a node hears twice
+_STILL_SECONDS = 0.5
+_PAUSE_SECONDS = 0.02
+
+Subscription = tuple[Incarnation, str]
+
+
+def lists_of(graph: MasterGraph) -> dict[str, list[str]]:
+    """Return the URIs of the publishers of each topic."""
+    lists: dict[str, list[str]] = {}
+    for kind, topic, name in sorted(graph.entries):
+        if kind == PUBLICATION and name in graph.nodes:
+            lists.setdefault(topic, []).append(graph.nodes[name])
+    return lists
+
+
+async def send_lists(call: NodeCaller, lists: Mapping[Subscription, list[str]], seconds: float) -> list[str]:
+    """Send each list; return the names of the nodes that did not take it in that time.
+
+    A host that does not answer delays only its own nodes.
+    """
+    failed: set[str] = set()
+    turns: dict[Address, asyncio.Semaphore] = {}
+
+    async def tell(node: Incarnation, topic: str, uris: list[str]) -> None:
+        async with turns.setdefault(node.host, asyncio.Semaphore(_AT_ONCE_OF_HOST)):
+            if node.name in failed:
+                return
+            try:
+                await call(node.call_uri, "publisherUpdate", topic, [*uris])
+            except CallFailedError:
+                failed.add(node.name)
+
+    calls = {asyncio.create_task(tell(node, topic, uris)): node.name for (node, topic), uris in lists.items()}
+    late: set[asyncio.Task[None]] = set()
+    if calls:
+        _done, late = await asyncio.wait(calls, timeout=seconds)
+    for one in late:
+        one.cancel()
+    return sorted(failed.union(calls[one] for one in late))
+
+
+async def until_least(number: Callable[[], Awaitable[int]]) -> None:
+    """Wait until the number is 0, or does not fall any more."""
+    least, last, still = math.inf, clock.now() + _CONNECT_SECONDS, math.inf
+    while (now := await number()) and clock.now() < min(last, still):
+        if now < least:
+            least, still = now, clock.now() + _STILL_SECONDS
+        await asyncio.sleep(_PAUSE_SECONDS)
+
+
+def rows_of(lists: Mapping[str, list[str]], rows: Iterable[Subscription]) -> dict[Subscription, set[str]]:
+    """Return the URIs to which each subscription shall connect; a node connects to itself without a socket."""
+    wanted = {(node, topic): {*lists.get(topic, [])} - {node.api_text} for node, topic in rows}
+    return {row: uris for row, uris in wanted.items() if uris}
+
+
+async def until_connected(
+    call: NodeCaller, wanted: dict[Subscription, set[str]]
+) -> dict[Subscription, set[str]]:
+    """Wait until nodes tell that they are connected; return what is missing, of nodes that answer."""
+
+    async def look(node: Incarnation) -> None:
+        try:
+            connected = _inbound(await call(node.call_uri, "getBusInfo"))
+        except CallFailedError:
+            connected = None
+        for row in [row for row in wanted if row[0] is node]:
+            wanted[row] -= wanted[row] if connected is None else connected.get(row[1], set())
+            if not wanted[row]:
+                del wanted[row]
+
+    async def number() -> int:
+        looks = [asyncio.create_task(look(node)) for node in {node for node, _topic in wanted}]
+        if looks:
+            _done, late = await asyncio.wait(looks, timeout=_STILL_SECONDS)
+            for one in late:
+                one.cancel()
+        return sum(map(len, wanted.values()))
+
+    await until_least(number)
+    return wanted
+
+
+def _inbound(answer: Value) -> dict[str, set[str]]:
+    """Return the URIs of the publishers to which a node says that it is connected, by topic."""
+    found: dict[str, set[str]] = {}
+    match answer:
+        case [1, _, [*rows]]:
+            for row in rows:
+                match row:
+                    case [_, str(uri), "i", _, str(topic), True, *_]:
+                        found.setdefault(topic, set()).add(uri)
+    return found
