@@ -160,6 +160,29 @@ def without_gap(numbers: Sequence[int]) -> bool:
     return list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
+_PACKAGE = """\
+<package format="2">
+  <name>rosrv_nodelets</name><version>1.0.0</version><description>A nodelet of the tests.</description>
+  <maintainer email="nobody@example.com">ROSRV</maintainer><license>Apache-2.0</license>
+  <depend>nodelet</depend>
+  <export><nodelet plugin="${prefix}/nodelets.xml"/></export>
+</package>
+"""
+_NODELETS = """\
+<library path="echo_nodelet">
+  <class name="rosrv_nodelets/Echo" type="rosrv_nodelets::Echo" base_class_type="nodelet::Nodelet"/>
+</library>
+"""
+_FLAGS = {
+    "bonded": ["-lbondcpp"],
+    "goals": ["-lactionlib", "-lboost_thread"],
+    "echo_nodelet": [
+        *("-shared", "-fPIC", "-lnodeletlib", "-lclass_loader"),
+        *(f"-I/usr/include/{name}" for name in ("pluginlib", "class_loader", "rcpputils", "rcutils")),
+    ],
+}
+
+
 @functools.cache
 def roscpp_program(name: str) -> Path:
     source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"
@@ -169,8 +192,25 @@ def roscpp_program(name: str) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)  # one at a time; a second process waits and finds it
         if target.exists() and header.stat().st_mtime > target.stat().st_mtime:
             target.unlink()
-        subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)
+        subprocess.run(
+            [str(ROOT / "scripts" / "build-roscpp"), str(source), str(target), *_FLAGS.get(name, [])],
+            check=True,
+        )
     return target
+
+
+def nodelet_library(prefix: Path) -> dict[str, str]:
+    """Lay out a package with the nodelet `rosrv_nodelets/Echo`; return the environment in which a manager finds it."""
+    package, library = "rosrv_nodelets", prefix / "lib" / "libecho_nodelet.so"
+    index, share = prefix / "share/ament_index/resource_index", prefix / "share" / package
+    for folder in (library.parent, index / "packages", index / "nodelet__pluginlib__plugin", share):
+        folder.mkdir(parents=True)
+    shutil.copy(roscpp_program("echo_nodelet"), library)
+    (index / "packages" / package).touch()
+    (index / "nodelet__pluginlib__plugin" / package).write_text(f"share/{package}/nodelets.xml\n")
+    (share / "package.xml").write_text(_PACKAGE)
+    (share / "nodelets.xml").write_text(_NODELETS)
+    return {"AMENT_PREFIX_PATH": str(prefix), "ROS_PACKAGE_PATH": f"{share}:/usr/share"}
 
 
 def has_ros() -> bool:
