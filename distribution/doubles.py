@@ -137,9 +137,9 @@ COUNTS = (
     Count("classes", "classes in tests", 660, 200, classes_in_tests),
     Count("happened", "doubles of the audit trail in tests", 1, 0, doubles_of_the_trail),
     Count("namespaces", "calls of `SimpleNamespace` in tests", 206, 0, lambda: calls_in_tests("SimpleNamespace")),
-    Count("casts", "calls of `cast` in tests", 164, 0, lambda: calls_in_tests("cast")),
+    Count("casts", "calls of `cast` in tests", 148, 0, lambda: calls_in_tests("cast")),
     Count("outside", "lines of 100 that are outside of test functions", 59, 40, lines_outside_of_tests),
-    Count("nightly", "lines of unit files that are nightly as a whole", 10400, 4000, lines_of_nightly_unit_files),
+    Count("nightly", "lines of unit files that are nightly as a whole", 10100, 4000, lines_of_nightly_unit_files),
 )  # fmt: skip
 
 

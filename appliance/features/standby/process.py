@@ -13,7 +13,7 @@ import secrets
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import structlog
 
@@ -49,13 +49,24 @@ def main(lifeline_fd: int, membership: Path) -> None:
     found = load_membership(membership)
     if found is None:
         raise FileNotFoundError(f"{membership} is missing")
-    asyncio.run(LeaseProcess(found, lifeline_fd, Path.cwd() / EPOCH).run())
+    asyncio.run(LeaseProcess.opened(found, lifeline_fd, Path.cwd() / EPOCH).run())
 
 
 class LeaseProcess:
-    """Runs the lease; `epoch_file` has the greatest epoch of earlier runs."""
+    """Runs the lease; `epoch_file` has the greatest epoch of earlier runs.
 
-    def __init__(self, membership: Membership, lifeline_fd: int, epoch_file: Path) -> None:
+    `peers` sends to the other appliance and receives from it, `asking` asks the witness.
+    """
+
+    def __init__(
+        self,
+        membership: Membership,
+        supervisor: Channel,
+        epoch_file: Path,
+        *,
+        peers: socket.socket,
+        asking: socket.socket,
+    ) -> None:
         self._membership = membership
         self._epoch_file = epoch_file
         self._stored = stored_epoch(epoch_file)
@@ -64,7 +75,7 @@ class LeaseProcess:
         self._lease = ApplianceLease(own, other, session, self._stored, clock.since_boot())
         self._witness = WitnessChannel(own, bytes.fromhex(membership.witness_key), session)
         self._peer = PeerChannel(own, other, bytes.fromhex(membership.peer_key))
-        self.supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self.supervisor = supervisor
         self.child = Child(
             self.supervisor,
             lease_link.LeaseLink,
@@ -72,9 +83,8 @@ class LeaseProcess:
             linked=self.control_linked,
             lost=lambda _reason: self.control_linked(),
         )
-        self.peers = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        # The kernel chooses this port, so that no other host can fill the buffer with forged answers.
-        self.asking = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.peers = peers
+        self.asking = asking
         self._report = lease_link.ReplicationReported(0, False, None)
         self._present = False
         self._service = ServiceWatch()
@@ -85,6 +95,16 @@ class LeaseProcess:
         self._told: lease_link.LeaseState | None = None
         self._told_at = 0.0
         self._wake = asyncio.Event()
+
+    @classmethod
+    def opened(cls, membership: Membership, lifeline_fd: int, epoch_file: Path) -> Self:
+        """Return the process with its sockets open. Raise `OSError` or `ValueError` if the epoch cannot be read."""
+        stored_epoch(epoch_file)  # before a socket is open
+        lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        peers = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        # The kernel chooses this port, so that no other host can fill the buffer with forged answers.
+        asking = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        return cls(membership, lifeline, epoch_file, peers=peers, asking=asking)
 
     async def run(self) -> None:
         """Raise `OSError` if the epoch cannot be stored: the appliance is then passive."""

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import socket
 from collections import deque
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from appliance.base import clock
+from appliance.channel import messages
 from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.membership import Membership
@@ -22,9 +22,8 @@ from appliance.features.standby.replication_frames import Stored
 from appliance.features.standby.replication_sender import ReplicationLag
 from appliance.features.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from tests.support.examples import examples
+from tests.support.memory_channel import memory_link
 from tests.support.virtual_clock import VirtualClock
-
-pytestmark = pytest.mark.nightly
 
 ADDRESSES = {"a": "10.0.0.2", "b": "10.0.0.3"}
 KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
@@ -51,6 +50,14 @@ class Feed:
     def release(self, _number: int) -> None: ...
 
 
+class Datagrams:
+    def __init__(self, sent: deque[bytes]) -> None:
+        self._sent = sent
+
+    def sendto(self, datagram: bytes, _to: tuple[str, int]) -> None:
+        self._sent.append(datagram)
+
+
 class Store:
     history = "history"
 
@@ -75,10 +82,11 @@ class Pair:
         self.gate = WitnessGate(self.witness, peers, "nonce")
         self.requests, self.answers = deque[bytes](), deque[bytes]()
         self.to_lease, self.to_control = deque[Any](), deque[Any]()
-        here, self.supervisor = socket.socketpair()
-        self.lease = LeaseProcess(MEMBERSHIP, here.detach(), folder / "epoch")
+        lifeline, _supervisor = memory_link(messages.Lifeline)
+        away: Any = Datagrams(deque())
+        asking: Any = Datagrams(self.requests)
+        self.lease = LeaseProcess(MEMBERSHIP, lifeline, folder / "epoch", peers=away, asking=asking)
         parts: Any = self.lease
-        parts.send = lambda _from, datagram, to: self.requests.append(datagram) if to[1] == 7411 else None
         parts.child = SimpleNamespace(tell=self.to_control.append)
         self.database = Store()
         self.standby = 0  # the last change on the standby's disk
@@ -171,11 +179,6 @@ class Pair:
     def close(self) -> None:
         for task in self.waiting:
             task.cancel()
-        self.supervisor.close()
-        parts: Any = self.lease
-        parts.peers.close()
-        parts.asking.close()
-        parts.supervisor.close()
 
 
 async def run(pair: Pair, steps: list[str]) -> None:
