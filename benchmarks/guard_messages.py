@@ -1,4 +1,4 @@
-"""What a guard costs for one message: `python -m benchmarks.guard_messages`.
+"""The cost of a guard for one message: `python -m benchmarks.guard_messages`.
 
 Each preset runs with its defaults in the engine and module of a relay. Each of its topics gets 50 messages a second, of
 a robot that stands for two seconds and then drives slowly. A time is the median of the processor time of 2,000 messages

@@ -398,7 +398,7 @@ class SeparationWorld(DrivenWorld):
     def _follow(self, person: Person) -> None:
         """Note whether a person has stepped into the base's way from beside it, so near that no moving base can stop.
 
-        What counts is where the person was at the last look before the motion passed that the base executes.
+        The place counts that the person had at the last look before the motion passed that the base executes.
         """
         person.places = [(person.x, person.y), *person.places[:300]]
         is_in = self._in_way(person.x, person.y)
