@@ -6,8 +6,6 @@ this module and `mavros` add the common ones.
 
 from itertools import islice
 
-from rosbags.typesys import Stores, get_typestore
-
 from roswire.definitions import Definitions
 from roswire.mavros import MAVROS
 
@@ -93,6 +91,8 @@ _NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages
 
 
 def standard_definitions() -> Definitions:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  most verbs need no definitions
+
     store = get_typestore(Stores.ROS1_NOETIC)
     files = _ADDITIONAL | MAVROS | _messages_of_actions()
     for name in store.fielddefs:

@@ -11,11 +11,12 @@ import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from typing import TYPE_CHECKING
 
 from appliance.base.input_files import open_given
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 _NAMESPACE = b"rosrv"
 _ED25519 = b"ssh-ed25519"
@@ -57,6 +58,9 @@ def signer(keys: Sequence[str], text: str, signature: str) -> str:
     """Return the name of the key that signed; empty if no keys are configured. Raises `UnsignedError`."""
     if not keys:
         return ""
+    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415  every verb that reads settings loads this file
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415  as above
+
     if not signature:
         raise UnsignedError(f"it has no signature of the site (site_keys in appliance.yaml): {_HOW}")
     try:
@@ -80,7 +84,7 @@ def signer(keys: Sequence[str], text: str, signature: str) -> str:
     return name_of(line)
 
 
-def sign(text: str, key: Ed25519PrivateKey) -> str:
+def sign(text: str, key: "Ed25519PrivateKey") -> str:
     """Return the signature, as `ssh-keygen -Y sign -n rosrv` writes it."""
     raw = key.sign(_message(text, _HASHES[0]))
     public = _wire(_ED25519, key.public_key().public_bytes_raw())
@@ -90,7 +94,7 @@ def sign(text: str, key: Ed25519PrivateKey) -> str:
     return "\n".join(["-----BEGIN SSH SIGNATURE-----", *lines, "-----END SSH SIGNATURE-----", ""])
 
 
-def public_line(key: Ed25519PrivateKey) -> str:
+def public_line(key: "Ed25519PrivateKey") -> str:
     return f"ssh-ed25519 {base64.b64encode(_wire(_ED25519, key.public_key().public_bytes_raw())).decode()}"
 
 
