@@ -54,7 +54,9 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
     try:
         query = parse_qs(text, keep_blank_values=True)
         for operation in OPERATIONS:
-            named = _named(operation.path.split("/"), parts)
+            named = _named(operation.path, parts)
+            if named is None and operation.former:
+                named = _named(operation.former, parts)
             if operation.method == asked.method and named is not None:
                 order = _order(operation, named, query, asked, dry_run=dry_run)
                 if order is not None:
@@ -94,7 +96,8 @@ def _written(value: Any) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
-def _named(template: list[str], parts: list[str]) -> dict[str, str] | None:
+def _named(path: str, parts: list[str]) -> dict[str, str] | None:
+    template = path.split("/")
     if len(template) != len(parts):
         return None
     both = list(zip(template, parts, strict=True))

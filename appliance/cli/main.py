@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from appliance import __version__
+from appliance.base.os_errors import with_remedy
 from appliance.base.user_errors import UserError
 from appliance.cli.first_contact import first_contact
 from appliance.cli.lazy import application
@@ -79,10 +80,7 @@ def main() -> None:
             sys.stderr.write(f"rosrv: {error}\n")
             sys.exit(1)
         if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE:
-            advice = "; run this as root" if isinstance(error, PermissionError) else ""
-            sys.stderr.write(
-                f"rosrv: {printable(str(error.filename or 'output'))}: {error.strerror}{advice}\n"
-            )
+            sys.stderr.write(f"rosrv: {printable(with_remedy(error, error.filename or 'output'))}\n")
             sys.exit(2)
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}:{last.lineno}"

@@ -18,6 +18,7 @@ import typer
 from appliance.api.front.moments import in_full
 from appliance.base import actors
 from appliance.base.atomic_files import NotLastingError, write_where_told
+from appliance.base.os_errors import with_remedy
 from appliance.base.timestamps import local_minute
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
@@ -60,7 +61,7 @@ def write_new(file: Path, text: str, *, verb: str) -> None:
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
     except OSError as error:
-        raise usage_error(f"cannot write {file}: {error.strerror}", verb=verb) from error
+        raise usage_error(f"cannot write {with_remedy(error, file)}", verb=verb) from error
     with os.fdopen(descriptor, "w", encoding="utf-8") as made:
         made.write(text)
 

@@ -146,7 +146,10 @@ def _master_of(state: Path) -> tuple[str, str]:
     try:
         settings = load_resolved(state / "run" / "config.json")
     except (OSError, ValueError) as error:
-        raise NotStandingError(f"no appliance has run in {state}: {error}") from None
+        why = error.strerror if isinstance(error, OSError) else error
+        raise NotStandingError(
+            f"no appliance has run in {state} ({why}): name its state directory with --state"
+        ) from None
     return f"http://127.0.0.1:{settings.listen_address[1]}", link_address() or "127.0.0.1"
 
 

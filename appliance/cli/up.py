@@ -82,7 +82,7 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         str | None, typer.Option(metavar="HOST:PORT", help="Where REST listens; port 0: any; or off")
     ] = None,
     api_tls: Annotated[
-        str | None, typer.Option(help="on, or off: clear text, on a loopback address only")
+        str | None, typer.Option(help="true, or false: clear text, on a loopback address only")
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print a JSON object when nodes may connect")

@@ -42,7 +42,11 @@ def read_inputs(settings: Settings, robot: str | None = None) -> range:
     author = _last_author(state)
     if settings.monitors is not None and author in ("", DISK):
         _require_specifications(settings.monitors, settings.site_keys, kept=author == DISK)
-    return read_node_ports(settings, robot)
+    try:
+        return read_node_ports(settings, robot)
+    except StartError as error:
+        hint = "" if is_named_there(settings.policy) else _NOTHING
+        raise StartError(f"{error}{hint}") from None
 
 
 def read_node_ports(settings: Settings, robot: str | None = None) -> range:
@@ -58,8 +62,7 @@ def read_node_ports(settings: Settings, robot: str | None = None) -> range:
     except PolicyRefusedError as error:
         if not stored.complete or stored.policy is not None:
             return DEFAULT_PORTS  # RVMaster decides; it has the whole state
-        hint = "" if is_named_there(settings.policy) else _NOTHING
-        raise StartError(f"{error}{hint}") from None
+        raise StartError(str(error)) from None
 
 
 class _Stored(NamedTuple):

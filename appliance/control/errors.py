@@ -6,7 +6,7 @@ class UnknownThingError(Exception):
 
 
 class SenselessError(Exception):
-    """The request makes no sense."""
+    """The request is well-formed, but cannot be carried out as it is; the message says why."""
 
 
 class UnavailableError(Exception):

@@ -82,7 +82,7 @@ def pairing_in(state: Path) -> "Pairing | None":
 
 
 def machine_work_in(state: Path) -> "MachineWork | None":
-    """Return what a feature does on the machine in the supervisor, or None."""
+    """Return the feature's work in the supervisor, which may change the machine; None if there is none."""
     return next((machine(state) for machine in members("machine_side", "machine")), None)
 
 

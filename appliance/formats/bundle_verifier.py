@@ -449,6 +449,8 @@ def main(arguments: list[str]) -> int:
             why = f"{given.bundle}: not an evidence bundle: {error}" if bad else str(error)
             if isinstance(error, OSError) and error.filename:
                 why = f"{error.filename}: {error.strerror}"
+                if given.bundle.is_dir() and Path(error.filename).parent == given.bundle:
+                    why = f"{given.bundle}: not an evidence bundle: it has no {Path(error.filename).name}"
             print(printable(f"nothing can be verified: {why}"))
             return 2
         verifier.run()

@@ -75,8 +75,7 @@ class ForwardingProcess:
 class ProgressReports:
     """Reports the progress to control.
 
-    A new control process first gets the last report again: by comparing it with its predecessor's records, it detects
-    changes that were missed.
+    A new control process first gets the last report again, and compares it with the records of its predecessor.
     """
 
     def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:

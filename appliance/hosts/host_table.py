@@ -96,8 +96,9 @@ class HostTable:
         """Return the row of an enrolled host. Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
-            known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
-            raise UnknownHostError(f"no host {name[:80]!r} is enrolled; the enrolled hosts: {known}")
+            known = ", ".join(host.name for host in self.enrolled()[:20])
+            others = f"the enrolled hosts: {known}" if known else "enrol it: rosrv host add NAME"
+            raise UnknownHostError(f"no host {name[:80]!r} is enrolled; {others}")
         return row
 
     def at(self, address: str) -> HostRow | None:
@@ -140,7 +141,10 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """Return the address for a host; `awaited` has the names of promised addresses. Raises `HostRefusedError`."""
+        """Return a free address for a host. Raises `HostRefusedError`.
+
+        `awaited` has the addresses that are promised to hosts that will enrol, with their names.
+        """
         declared = self.declared.hosts.get(name)
         before = self.rows.get(name)
         kept = before.address if before else declared.address if declared else None
@@ -157,7 +161,9 @@ class HostTable:
         try:
             address = ipaddress.IPv4Address(wanted)
         except ValueError:
-            raise HostRefusedError(f"{wanted[:80]!r} is not an IPv4 address") from None
+            raise HostRefusedError(
+                f"address: {wanted[:80]!r} is not an IPv4 address of {self.pool}"
+            ) from None
         ends = (self.pool.network_address, self.pool.broadcast_address)
         if address not in self.pool or address in ends or str(address) == self.own_address:
             raise HostRefusedError(f"{address} is not an address of a host in {self.pool}")

@@ -116,7 +116,7 @@ class BootHold:
         return not self._in_force.exists() or any(map(_holds, self._backends))
 
     def put(self) -> bool:
-        """Hold, if armed; return whether other machines were held before, and another program had removed the rules.
+        """Hold other machines off, if armed; return whether another program had removed the rules of an earlier hold.
 
         Raises `FirewallError`; without a working back end, nothing is held.
         """

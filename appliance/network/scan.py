@@ -45,7 +45,7 @@ def addresses_of(host: str) -> tuple[str, ...]:
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
-        raise NetworkError(f"the host {host!r} is unknown: {error.strerror}") from error
+        raise NetworkError(f"the host {host!r} is unknown: {error.strerror}; give its address") from error
     addresses = tuple(dict.fromkeys(str(entry[4][0]) for entry in found))
     for address in addresses:
         if _is_own(address):

@@ -64,7 +64,7 @@ def rights_to_keep(request: Request, call: str, resource: str, *, namespace: boo
 
 
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
-    """Return the rights of an action that a person names; `touched` are those on its parameters."""
+    """Return all rights that an action needs; `touched` are its rights to parameters."""
     rights = [Right(request)]
     if (command := COMMAND_FOR.get(request.category)) is not None:
         rights.append(Right(_of(request, Category.COMMAND, command)))

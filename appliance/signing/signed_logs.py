@@ -27,7 +27,7 @@ Open = Callable[[Path], int]
 
 
 class Acknowledgement(msgspec.Struct, frozen=True):
-    """The order of an operator who knows why a log, or the memory of it, is no longer there."""
+    """An operator's statement that a log, or the memory of it, is missing for a known reason."""
 
     first: int
     last: int

@@ -19,7 +19,7 @@ _NOT_DECLARED = "not declared"
 
 
 class DroppedValue(NamedTuple):
-    """A given value that a new text does not allow, and the text's own value, which applies instead."""
+    """A given value that the new file does not allow, and the default that applies instead."""
 
     monitor: str
     name: str
@@ -86,8 +86,12 @@ def parsed(
     for name, value in values.items():
         one = known.get(name)
         if one is None:
-            names = ", ".join(known) or "nothing is given to it"
-            findings.append(f"{monitor} has no given {name}; there are: {names}")
+            names = (
+                f"there are: {', '.join(known)}"
+                if known
+                else "it declares none (`given` in its specification)"
+            )
+            findings.append(f"{monitor} has no given {name}; {names}")
         elif one.kind == _TOPIC:
             text = f"{monitor}: {name} is a topic, which only a load can replace, because the state belongs to a topic"
             findings.append(f"{text}: rosrv monitor load FILE --set {monitor}.{name}={_shown(value)}")

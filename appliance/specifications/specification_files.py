@@ -179,7 +179,11 @@ def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[s
 def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
     try:
         if not _is(stat.S_ISDIR, folder):
-            raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
+            raise SpecificationsRefusedError(
+                [
+                    f"{folder}: the folder of specifications does not exist; create it, or name another with --monitors"
+                ]
+            )
         paths = {path.name: path for path, _is_folder in entries_of(folder) if path.match("*.rv")}
     except OSError as error:
         raise _unreadable(folder, error) from error

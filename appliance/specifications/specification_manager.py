@@ -284,7 +284,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
         row = await self._find(request.revision)
         if row is None:
-            raise UnknownMonitorError(f"revision {request.revision} of the specifications does not exist")
+            raise UnknownMonitorError(
+                f"there is no revision {request.revision} of the specifications: rosrv monitor revisions lists all"
+            )
         texts = msgspec.structs.asdict(sources_of(row))
         return msgspec.convert(self._described(row) | texts, answers.RevisionTexts)
 

@@ -270,7 +270,7 @@ class EndTable:
 
 
 def replicated_ends(connection: sqlite3.Connection, kind: EndKind) -> dict[str, tuple[int, float]] | None:
-    """Return the stored end of each name, and the seconds that it had left at the active appliance's last reading.
+    """Return the stored end of each name, and the seconds left when the active appliance last read its clock.
 
     None: the active appliance has an earlier version, whose ends `EndTable` imports at a takeover.
     """

@@ -142,7 +142,10 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def put(self, table: str, *row: Value, ahead: bool = True) -> None:
-        """Store a row; with `ahead`, it survives the process from then on. Raises `ChangeError` and `StoreError`."""
+        """Store a row. With `ahead`, it survives an end of the process as soon as this returns.
+
+        Raises `ChangeError` and `StoreError`.
+        """
         self._submit(Put(table, [row]), ahead=ahead)
 
     def delete(self, table: str, *conditions: Condition, ahead: bool = True, **equal: Value) -> None:

@@ -131,7 +131,7 @@ class StateDirectory:
         except OSError as error:
             listener.close()
             raise StartError(
-                f"{path} cannot be created: {error}; name a shorter path with --state DIR"
+                f"{path} cannot be created: {error.strerror or error}; name a shorter path with --state DIR"
             ) from error
         finally:
             os.umask(mask)

@@ -35,7 +35,7 @@ def health_router(collector: Collector) -> APIRouter:
 
     @router.get("/metrics", dependencies=viewer)
     def metrics() -> Response:
-        """Return the same state as metrics."""
+        """Return the state of `/v1/health` as Prometheus metrics."""
         registry = CollectorRegistry()
         registry.register(RobotMetrics(health_of(collector)))
         if collector.bundles is not None:

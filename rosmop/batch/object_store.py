@@ -60,4 +60,9 @@ def _errors(uri: str) -> Iterator[None]:
     except RecordingError:
         raise
     except Exception as error:
-        raise RecordingError(f"cannot read {uri}: {error}") from error
+        hint = (
+            "; put AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY into the environment"
+            if "credentials" in str(error)
+            else ""
+        )
+        raise RecordingError(f"cannot read {uri}: {error}{hint}") from error

@@ -143,7 +143,7 @@ class FieldLocator:
         return Spot(end, 0)
 
     def element(self, item: FixedField | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
-        """Return the position of an element. If it does not exist, the event does not happen."""
+        """Return the position of an element, with a check that the array has it: otherwise the event does not occur."""
         index = step.index or 0
         if isinstance(item, FixedField):
             return start.plus(index * (item.size // (item.count or 1)))

@@ -24,9 +24,9 @@ class _EndSymbols(Symbols):
 
 
 def with_observed_topics(compiled: Compiled) -> Compiled:
-    """Return the set with `acts_on` of each specification; functions that read an observed message first find its end.
+    """Return the compiled specifications with `acts_on`, and with a check of the length of observed messages.
 
-    Only events on which the actions of a specification depend need this.
+    Only the events on which an action depends get this check.
     """
     functions, symbols = dict(compiled.functions), _EndSymbols()
     symbols.sites = [*compiled.sites]

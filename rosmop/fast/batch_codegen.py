@@ -280,7 +280,7 @@ def _set(local: int, value: bytes) -> bytes:
 class TopicCodegen:
     """Writes the code for one topic. Raises `NotCompiledError` if every message would be left.
 
-    Without `topic`, it leaves the messages that a safe message replaces.
+    If `topic` is empty, messages that a safe message would replace are left to the interpreter.
     """
 
     def __init__(

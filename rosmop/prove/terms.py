@@ -79,7 +79,7 @@ def opposite(condition: Term) -> Term:
 
 
 def choice(test: Term, yes: Term, no: Term) -> Term:
-    """`test ? yes : no` for terms or structures of terms. A part that only one of them has is taken from it."""
+    """`test ? yes : no` for terms or structures of terms. A part that only one of them has is used as it is."""
     if z3.is_true(test) or no is None or yes is no:
         return yes
     if z3.is_false(test) or yes is None:

@@ -393,10 +393,10 @@ def of_slice(
     category: str,
     passed: int | None = None,
 ) -> Explanation | None:
-    """Return the events that caused a verdict in the slice of a binding (parameters by number).
+    """Return the events that caused a verdict in one slice: `values` has the parameters of its binding, by number.
 
-    The last event, or the deadline that has `passed`, gave the verdict. Returns None if it is unknown whether
-    a needed event happened in this slice.
+    `passed` is the deadline that gave the verdict; without it, the last event did. Returns None if the trail does
+    not tell whether an event belongs to this slice.
     """
     own: dict[EventOccurrence, bool] = {}
     happened: list[EventOccurrence] = []

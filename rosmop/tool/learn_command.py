@@ -33,9 +33,9 @@ def learn_monitors(
     as_json: bool,
 ) -> int:
     if out is not None and out.exists():
-        raise program.usage_error(f"{out} already exists")
+        raise program.usage_error(f"{out} already exists: name a new file with --output")
     if len({os.path.realpath(bag) for bag in options.bags}) < len(options.bags):
-        raise program.usage_error("a recording is given twice: it would test itself")
+        raise program.usage_error("a recording is given twice: it would test itself; give each one once")
     with batch_session(program, options) as session:
         surveys, failures = _surveys(session, topics or ["*"])
         recorded = _definitions(program, [survey for _number, survey in surveys])

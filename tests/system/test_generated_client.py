@@ -156,8 +156,8 @@ CALLS = {
     "remove_recording": Call(lambda done: {"recording_id": done["record_now"]["id"]}),
 }  # fmt: skip
 REFUSED: dict[str, dict[str, Any]] = {
-    "standby": {}, "promote_standby": {}, "acknowledge_alarm": {}, "silence_alarm": {},
-    "drive_take": {"group": "base"}, "drive_give": {"group": "base"}, "drive_ask": {"group": "base"},
+    "standby": {}, "switch_standby": {}, "acknowledge_alarm": {}, "silence_alarm": {},
+    "drive_assign": {"group": "base"}, "drive_free": {"group": "base"}, "drive_ask": {"group": "base"},
     "remove_door": {"door_name": "alice"}, "make_door_ticket": {"door_name": "alice"},
     "make_own_ticket": {}, "plan_guard": {}, "approve": {"number": 48213}, "approval_refuse": {"number": 48213},
     "end_sessions": {"name": "alice"}, "sign_out": {"session": "0" * 12},

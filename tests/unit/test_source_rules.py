@@ -315,7 +315,7 @@ WALL_CLOCK = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
-        "features/evidence/verbs.py", "features/logbook/report_verb.py", "cli/durations.py",
+        "features/logbook/report_verb.py", "cli/durations.py",
         "features/monitor_tools/reset_verb.py", "features/policy_tools/policy_input.py",
         "features/tunnels/protect_verb.py",
         "base/timestamps.py",

@@ -149,22 +149,27 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
             return answer(done, operation.status)
         return tagged(done) if operation.of is not None else done
 
-    path = operation.path
-    for name, converted in CONVERTORS.items():
-        path = path.replace(name, converted)
     has_model = given is not Response
     options: dict[str, Any] = {"response_model": given} if has_model else {"response_class": Response}
-    router.add_api_route(
-        path,
-        endpoint,
-        name=operation.name,
-        description=inspect.cleandoc(operation.words),
-        methods=[operation.method],
-        tags=[operation.tag],
-        status_code=operation.status,
-        responses=_responses(operation, own),
-        **options,
-    )
+    for path in filter(None, (operation.path, operation.former)):
+        router.add_api_route(
+            _converted(path),
+            endpoint,
+            name=operation.name,
+            description=inspect.cleandoc(operation.words),
+            methods=[operation.method],
+            tags=[operation.tag],
+            status_code=operation.status,
+            responses=_responses(operation, own),
+            include_in_schema=path == operation.path,
+            **options,
+        )
+
+
+def _converted(path: str) -> str:
+    for name, converted in CONVERTORS.items():
+        path = path.replace(name, converted)
+    return path
 
 
 def _check(

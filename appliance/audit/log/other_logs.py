@@ -12,7 +12,7 @@ from appliance.signing.signed_logs import OtherLog
 
 
 class OtherLogs:
-    """The logs that the signer named last; `hold` gets records about them."""
+    """The other logs that the signer has signed. `hold` receives a record for each change."""
 
     def __init__(self, make: MakeRecord, hold: Callable[[AuditRecord], None]) -> None:
         self._make = make

@@ -40,7 +40,7 @@ def read_public_key(path: Path) -> bytes:
     try:
         return parse_public_key(read_given(path), path)
     except OSError as error:
-        raise KeyUnreadableError(f"{path}: {error.strerror}") from error
+        raise KeyUnreadableError(f"the public key {path} cannot be read: {error.strerror}") from error
 
 
 def parse_public_key(pem: bytes, path: Path) -> bytes:
@@ -48,9 +48,13 @@ def parse_public_key(pem: bytes, path: Path) -> bytes:
     try:
         key = load_pem_public_key(pem)
     except (ValueError, UnsupportedAlgorithm) as error:
-        raise KeyUnreadableError(f"{path}: not a public key in PEM: {error}") from error
+        raise KeyUnreadableError(
+            f"{path}: not a public key in PEM; the appliance's is STATE/control/audit.pub"
+        ) from error
     if not isinstance(key, Ed25519PublicKey):
-        raise KeyUnreadableError(f"{path}: not an Ed25519 public key")
+        raise KeyUnreadableError(
+            f"{path}: not an Ed25519 public key; the appliance's is STATE/control/audit.pub"
+        )
     return key.public_bytes_raw()
 
 

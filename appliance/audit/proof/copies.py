@@ -132,7 +132,7 @@ def read_copies(file: Path) -> list[SignedCheckpoint]:
                 if copy is not None:
                     found.append(copy)
     except OSError as error:
-        raise CopiesUnreadableError(f"{file}: {error.strerror}") from error
+        raise CopiesUnreadableError(f"the checkpoints {file} cannot be read: {error.strerror}") from error
     if not found:
         raise CopiesUnreadableError(
             f"{file}: no checkpoint in it; it takes lines of 'rosrv audit checkpoints', or of a syslog receiver"

@@ -90,11 +90,17 @@ def times_given(since: str | None, until: str | None) -> tuple[int | None, int |
     Raises `TimestampError`.
     """
     now = clock.wall_ns()
-    begin = None if since is None else parse_timestamp(since, now, None)
-    end = None if until is None else parse_timestamp(until, now, None)
+    begin, end = _time("--since", since, now), _time("--until", until, now)
     if begin is not None and end is not None and begin > end:
         raise TimestampError(f"--since {since} is later than --until {until}")
     return begin, end
+
+
+def _time(option: str, text: str | None, now: int) -> int | None:
+    try:
+        return None if text is None else parse_timestamp(text, now, None)
+    except TimestampError as error:
+        raise TimestampError(f"{option}: {error}") from None
 
 
 def in_utc(since: str | None) -> str | None:

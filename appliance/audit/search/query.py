@@ -70,7 +70,7 @@ def network_of(host: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network | Non
 
 
 def with_network(wanted: Filter) -> Filter:
-    """Replace an address or network in `host`, whose text may differ from that of records."""
+    """Move an address or network in `host` to `hosts`, in the form that records have."""
     network = None if wanted.host is None else network_of(wanted.host)
     return wanted if network is None else msgspec.structs.replace(wanted, host=None, hosts=(str(network),))
 

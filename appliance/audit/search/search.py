@@ -91,7 +91,7 @@ def export(path: Path, wanted: Filter, page: int = 1000, *, newest_first: bool =
 
 
 class LogSnapshot:
-    """A log as it is now, for a report that reads few of its records, and reads them in several steps.
+    """An unchanging view of the log, for a report that reads it in several steps.
 
     Its methods raise `LogUnreadableError`.
     """
@@ -203,7 +203,7 @@ def _sequence(cursor: str | None) -> int | None:
     if cursor is None:
         return None
     if not (cursor.isdecimal() and cursor.isascii() and len(cursor) <= 18):
-        raise FilterError("cursor: not one that a search gave")
+        raise FilterError("cursor: not one that a search printed; leave it out to begin at the first page")
     return int(cursor)
 
 

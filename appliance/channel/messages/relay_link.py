@@ -32,9 +32,9 @@ class OrdersCarriedOut(Message):
 
 
 class NodePlaced(Message):
-    """An incarnation, with the listening socket that replaces its TCPROS port.
+    """A node, with the listening socket that replaces its TCPROS port.
 
-    `monitors`: it is the appliance's own publisher, whose port sends the messages that monitors publish.
+    `monitors`: the node is the appliance's own publisher of the messages that monitors make.
     """
 
     descriptors: ClassVar[int] = 1

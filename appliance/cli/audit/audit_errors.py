@@ -12,6 +12,7 @@ from appliance.audit.log.record_format import printable
 from appliance.audit.log.signatures import KeyUnreadableError
 from appliance.audit.proof.copies import CopiesUnreadableError
 from appliance.audit.search.query import FilterError
+from appliance.base.os_errors import with_remedy
 from appliance.base.timestamps import TimestampError
 from appliance.cli.connection.admin_client import NotRunningError
 
@@ -39,10 +40,8 @@ class Errors(ContextDecorator):
                 raise typer.Exit(self._unread)
             case KeyboardInterrupt():
                 raise typer.Exit(0)
-            case PermissionError():
-                fail(f"{error.filename}: {error.strerror}; run this as root", CANNOT_READ)
             case OSError():
-                fail(f"{error.filename or 'output'}: {error.strerror}", CANNOT_READ)
+                fail(with_remedy(error, error.filename or "output"), CANNOT_READ)
 
 
 def note(text: str) -> None:

@@ -52,7 +52,7 @@ def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
         return msgspec.convert(body, admin.answer_to(type(request)))
     except msgspec.ValidationError as error:
         raise NotRunningError(
-            f"{rest.url}: this appliance's version gives a different answer: {error}"
+            f"{rest.url}: this appliance's version gives a different answer: {error}; use the rosrv of its version"
         ) from None
 
 

@@ -166,7 +166,9 @@ class RestClient:
             case 429 | 503 if wait is not None and kind != "standby":
                 return NotRunningError(f"{self.url}: {detail}; try again in {wait} s")
         if kind == "unknown-path":
-            return NotRunningError(f"{self.url}: this appliance's version does not offer that over REST")
+            return NotRunningError(
+                f"{self.url}: this appliance's version does not offer that over REST: run this on its machine"
+            )
         return RestProblemError(answer.status_code, kind, detail.split("\n"), problem.get("findings"))
 
 
@@ -190,9 +192,9 @@ def _place_of(url: str) -> tuple[str, bool]:
     try:
         parts = urlsplit(url)
         host, _port = parts.hostname, parts.port
-    except ValueError as error:
-        raise ValueError(f"--api {url!r} is not a URL: {error}") from None
-    if parts.scheme not in ("http", "https") or not host:
+    except ValueError:
+        host = None
+    if host is None or parts.scheme not in ("http", "https"):
         raise ValueError(f"--api {url!r} is not a URL: write https://HOST:PORT, as `rosrv up` prints it")
     if parts.username is not None or parts.path.strip("/") or parts.query or parts.fragment:
         raise ValueError(f"--api {url!r}: write scheme, host and port only: {parts.scheme}://HOST:PORT")

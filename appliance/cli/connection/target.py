@@ -95,6 +95,12 @@ class Appliance(typer.Context):
     def way(self) -> "AdminSocket | RestWay":
         return self._target.way
 
+    def state_here(self, verb: str) -> Path:
+        """Return the state directory of this machine's appliance; exit with status 2 for one that REST reaches."""
+        if isinstance(self.way, AdminSocket):
+            return self.way.state
+        raise usage_error("this works on the appliance's machine only: give --state instead of --api", verb)
+
     @property
     def said(self) -> bool:
         return self._target.said

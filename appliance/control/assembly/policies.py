@@ -239,7 +239,7 @@ class Policies(Revisions[RevisionRow]):
     async def _kept_revision(self, number: int) -> RevisionRow:
         row = self.in_force if number == self.revision else await self._find(number)
         if row is None:
-            raise UnknownThingError(f"there is no revision {number}")
+            raise UnknownThingError(f"there is no revision {number}: rosrv policy revisions lists all")
         return row
 
     def _text(self, row: RevisionRow, known: PolicyContext) -> answers.PolicyKnown:

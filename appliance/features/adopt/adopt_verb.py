@@ -12,7 +12,7 @@ import typer
 from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.channel.admin import PolicyReload
-from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_here
 from appliance.cli.output import say_json, say_row, usage_error
 from appliance.cli.standing import (
@@ -70,7 +70,7 @@ def adopt(
 
     Example: rosrv adopt --check
     """
-    state = _state_of(appliance)
+    state = appliance.state_here(_VERB)
     if os.geteuid() != 0:
         raise usage_error("the rules and sockets of this machine need root: run it with sudo", verb=_VERB)
     try:
@@ -94,11 +94,6 @@ def adopt(
     except NetworkError as error:
         typer.echo(f"{_VERB}: {error}", err=True)
         raise typer.Exit(1) from None
-
-
-def _state_of(appliance: Appliance) -> Path:
-    assert isinstance(appliance.way, AdminSocket)  # noqa: S101  `speaks_here` offers no other way
-    return appliance.way.state
 
 
 def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | None) -> None:

@@ -95,7 +95,9 @@ def _opened(state: Path) -> Iterator[StateStore]:
     try:
         owner = folder.stat()
     except OSError as error:
-        raise NetworkError(f"{folder} cannot be read: {error.strerror}") from None
+        raise NetworkError(
+            f"{folder} cannot be read: {error.strerror}; give the appliance's state directory with --state"
+        ) from None
     user, group = os.geteuid(), os.getegid()
     os.setegid(owner.st_gid)
     os.seteuid(owner.st_uid)

@@ -57,8 +57,7 @@ def release(
 
     Example: rosrv release
     """
-    assert isinstance(appliance.way, AdminSocket)  # noqa: S101  `speaks_here` offers no other way
-    state = appliance.way.state
+    state = appliance.state_here(_VERB)
     if os.geteuid() != 0:
         raise usage_error("the rules and sockets of this machine need root: run it with sudo", verb=_VERB)
     try:

@@ -184,8 +184,8 @@ def verify(
 def _files(source: AuditSource, other: Path) -> tuple[FileLog, FileLog]:
     if not isinstance(source, FileLog):
         fail("--other needs the logs' files: run this with --state, on any machine with copies of both", 2)
-    if not other.is_dir():
-        fail(f"{other}: no such directory; give the other appliance's state directory with --other", 2)
+    if not (other / "control").is_dir():
+        fail(f"{other} is not a state directory: give the other appliance's with --other", 2)
     return source, FileLog(other)
 
 

@@ -283,8 +283,9 @@ class DriveOrders:
     def _group(self, name: str) -> AuthorityGroup:
         group = self._policy().authority.get(name)
         if group is None:
-            known = ", ".join(sorted(self._policy().authority)) or "none"
-            raise UnknownThingError(f"[Authority] has no group {name[:64]!r}; its groups: {known}")
+            known = ", ".join(sorted(self._policy().authority))
+            others = f"its groups: {known}" if known else "add groups to the policy's section [Authority]"
+            raise UnknownThingError(f"[Authority] has no group {name[:64]!r}; {others}")
         return group
 
     def _host(self, text: str) -> Address:

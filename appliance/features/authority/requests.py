@@ -61,22 +61,24 @@ class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/take", name="drive_take", body=GroupHost, problems=_NO_GROUP
+    "operator", "POST", "/v1/drive/{group}/assign", name="drive_assign", body=GroupHost, problems=_NO_GROUP,
+    former="/v1/drive/{group}/take",
 )  # fmt: skip
 class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
-    """Give a group to a host that may take it, or that may override its holder."""
+    """Assign a group to a host that may take it, or that may override its holder."""
 
     group: GroupName
     host: str
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/give", name="drive_give", body=GroupGift, problems=_NO_GROUP
+    "operator", "POST", "/v1/drive/{group}/free", name="drive_free", body=GroupGift, problems=_NO_GROUP,
+    former="/v1/drive/{group}/give",
 )  # fmt: skip
 class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
-    """End the authority of a group's holder: the group is given to a host, or to the first waiting host.
+    """Take a group from its holder; it is assigned to a host, or to the first waiting host.
 
-    A group with a rank is handed back, so that all its ranks may move again.
+    In a group with ranks, all hosts may drive again, also after a driver was lost.
     """
 
     group: GroupName

@@ -62,8 +62,9 @@ class DoorTable:
     def of(self, name: str) -> DoorRow:
         row = self._rows.get(name)
         if row is None or row.removed is not None:
-            known = ", ".join(row.name for row in self.live()[:20]) or "none"
-            raise UnknownThingError(f"there is no door {name[:80]!r}; the doors are: {known}")
+            known = ", ".join(row.name for row in self.live()[:20])
+            others = f"the doors are: {known}" if known else "add it: rosrv door add NAME"
+            raise UnknownThingError(f"there is no door {name[:80]!r}; {others}")
         return row
 
     def in_slot(self, slot: int) -> DoorRow | None:

@@ -14,14 +14,13 @@ import typer
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.filter_options import Since, Until
-from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
-from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.connection.admin_client import AdminSocket, RestProblemError
 from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import time_given
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.features.evidence.bundle import (
     BundleError,
@@ -66,8 +65,7 @@ def export_evidence(
     with Errors():
         if (recording is None) is (since is None) or (recording is not None and until is not None):
             raise usage_error("give a recording, or --since (and --until)")
-        now = clock.wall_ns()
-        span = TimeSpan(parse_timestamp(since or "0s", now, None), parse_timestamp(until or "0s", now, None))
+        span = TimeSpan(time_given("--since", since or "0s"), time_given("--until", until or "0s"))
         size, part = 0, name_to_make(output)
         if os.path.lexists(output):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))

@@ -97,7 +97,10 @@ def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     Example: sudo rosrv fleet leave
     """
     if not (state / FOLDER).is_dir():
-        raise usage_error(f"{state} has no membership of `rosrv fleet join`", _VERB)
+        raise usage_error(
+            f"{state} has no membership of `rosrv fleet join`; name the state directory that has one with --state",
+            _VERB,
+        )
     try:
         shutil.rmtree(_unfinished(state), ignore_errors=True)
         shutil.rmtree(state / FOLDER)

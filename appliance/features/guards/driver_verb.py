@@ -7,11 +7,11 @@ import typer
 
 from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, usage_error
 from appliance.features.guards.driver_outcomes import CONSENT, QUESTION, REQUEST, RESTARTED, status_of
 from appliance.features.guards.guard_answers import DriverCheck
-from appliance.features.guards.presets import DRIVER_CHECK, GuardError
+from appliance.features.guards.presets import DRIVER_CHECK
 from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
 from rosmop.tool.terminal import say
 
@@ -51,10 +51,8 @@ def check_driver(
 
     Example: rosrv guard check-driver /cmd_vel --by /odom
     """
-    seconds = span_given("--for", longest, "2s", _VERB)
-    request = DriverCheckBegin(topic, by, seconds, span_given("--within", within, "30s or 5m", _VERB))
-    _require_bounds("--for", "longest", seconds)
-    _require_bounds("--within", "patience", request.patience)
+    seconds = _bounded("--for", "longest", longest)
+    request = DriverCheckBegin(topic, by, seconds, _bounded("--within", "patience", within))
     _require_consent(seconds, yes=yes)
     check = appliance.ask_or_exit(request)
     if not appliance.as_json:
@@ -65,11 +63,9 @@ def check_driver(
     raise typer.Exit(status_of(check.outcome))
 
 
-def _require_bounds(option: str, name: str, seconds: float) -> None:
-    try:
-        DRIVER_CHECK.parameter(name).checked(f"{seconds:g}")
-    except GuardError as error:
-        raise usage_error(f"{option}: {error}", _VERB) from None
+def _bounded(option: str, name: str, text: str) -> float:
+    bounds = DRIVER_CHECK.parameter(name)
+    return bounded_span(option, text, f"{bounds.least}s", f"{bounds.most}s", _VERB)
 
 
 def _require_consent(seconds: float, *, yes: bool) -> None:

@@ -41,6 +41,7 @@ from appliance.features.guards.presets import (
     text_of,
     topics_in,
     types_in,
+    unknown_guard,
     with_values,
 )
 from appliance.features.guards.released import origin_of
@@ -327,7 +328,7 @@ class GuardOrders:
     def _guard(self, name: str) -> tuple[Preset, str]:
         guards = self._guards()
         if name not in guards:
-            raise UnknownThingError(f"no guard is named {name}; there are: {', '.join(guards) or 'none'}")
+            raise UnknownThingError(unknown_guard(name, guards))
         return guards[name], self._monitors.sources.files[self._monitors.checked.monitors[name]]
 
     def _acts_of(self, name: str) -> int:

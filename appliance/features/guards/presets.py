@@ -14,6 +14,7 @@ from pathlib import Path
 
 from appliance.base.shipped import SHIPPED
 from appliance.base.user_errors import UserError
+from appliance.base.validation_messages import meant
 from appliance.features.guards import old_form
 from appliance.features.guards.old_form import Head
 from rosmop.types import given_lists
@@ -185,9 +186,20 @@ class Guard:
     values: Mapping[str, str] = field(default_factory=dict)
 
 
+def unknown_guard(name: str, guards: Collection[str]) -> str:
+    known = (
+        f"the guards are: {', '.join(guards)}"
+        if guards
+        else "none is loaded: rosrv guard suggest proposes some"
+    )
+    return f"no guard is named {name[:80]}{meant(name, guards)}; {known}"
+
+
 def preset_named(name: str) -> Preset:
     if name not in PRESETS:
-        raise GuardError(f"there is no preset {name!r}; use one of: {', '.join(PRESETS)}")
+        raise GuardError(
+            f"there is no preset {name!r}{meant(name, PRESETS)}; use one of: {', '.join(PRESETS)}"
+        )
     return PRESETS[name]
 
 

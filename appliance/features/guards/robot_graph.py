@@ -44,7 +44,7 @@ class TopicFacts(NamedTuple):
 
 @dataclass(frozen=True)
 class GraphedRobot:
-    """Commands with common drivers. `namespace` tells it from the other robots, and is empty without others."""
+    """One robot of the graph: commands that have common drivers. `namespace` is empty if it is the only one."""
 
     namespace: Namespace
     commands: tuple[TopicFacts, ...]

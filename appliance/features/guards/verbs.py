@@ -29,6 +29,7 @@ from appliance.features.guards.presets import (
     described,
     file_of,
     preset_of,
+    unknown_guard,
     with_values,
 )
 from appliance.features.guards.requests import (
@@ -405,8 +406,7 @@ def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str
     texts = loaded.files or {}
     guards = {row.name: row for row in loaded.monitors if preset_of(texts.get(row.file, ""))}
     if name not in guards:
-        known = ", ".join(guards) or "none is loaded; see rosrv guard suggest"
-        raise GuardError(f"no guard is named {name}; there are: {known}")
+        raise GuardError(unknown_guard(name, guards))
     return loaded, guards[name], texts[guards[name].file]
 
 

@@ -42,9 +42,9 @@ def logs_of(own: Log, other: Path | None, verb: str) -> dict[str, Log]:
         raise usage_error(
             "--other needs the logs' files: give --state, on any machine with copies of both", verb=verb
         )
-    if not other.is_dir():
+    if not (other / "control").is_dir():
         raise usage_error(
-            f"{other}: no such directory; give the other appliance's state directory", verb=verb
+            f"{other} is not a state directory: give the other appliance's with --other", verb=verb
         )
     partner = FileLog(other)
     if own.present() == partner.present():

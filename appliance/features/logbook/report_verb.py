@@ -166,7 +166,10 @@ def _end_of(file: Path) -> int:
     try:
         text = str(msgspec.json.decode(file.read_bytes())["until_utc"])
         return parse_timestamp(text, clock.wall_ns())
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise usage_error(f"--after: {file} cannot be read: {error.strerror}", verb=_VERB) from error
+    except (ValueError, KeyError, TypeError) as error:
         raise usage_error(
-            f"{file}: not a report of `rosrv report interventions --json`: {error}", verb=_VERB
+            f"--after: {file} is not a report: give the output of `rosrv report interventions --json`",
+            verb=_VERB,
         ) from error

@@ -9,7 +9,7 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import rule_text
 from appliance.audit.log.repetition import KIND
 from appliance.channel.messages.relay_link import NO_GRANT
-from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, asked
+from appliance.features.policy_tools.grant import NO_DECISION, DecidedRequest, UngrantableError, asked
 from appliance.policy.commands import CALLS
 from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
@@ -32,7 +32,7 @@ def asks_policy(record: AuditRecord) -> bool:
 def asked_of(record: AuditRecord) -> DecidedRequest:
     what = DENIALS.get(record.event)
     if what is None:
-        raise UngrantableError("it is not a record of a decision about a host's call")
+        raise UngrantableError(NO_DECISION)
     if isinstance(what, str):
         raise UngrantableError(f"no change of the policy would allow it: {what}")
     if record.rule is None and record.reason.startswith(f"{record.host} is blocked by "):  # `Policy.blocked`

@@ -40,7 +40,9 @@ def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = Fal
     tool = stock_tool(asked.request.caller_id)
     if whole_tool:
         if tool is None:
-            raise UngrantableError(f"{asked.request.caller_id or 'the caller'} is not a stock tool of ROS")
+            raise UngrantableError(
+                f"{asked.request.caller_id or 'the caller'} is not a stock tool of ROS: leave out --tool"
+            )
         asked = asked.with_tool(tool)
     found = grant(current.text, current.file, known, asked)
     needs = [] if tool is None else grant(found.text, current.file, known, asked.with_tool(tool)).added

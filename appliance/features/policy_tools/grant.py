@@ -26,6 +26,11 @@ from appliance.policy.sections import ASK, BY_CATEGORY, DEFAULT, GROUPS, OPTIONS
 _MOST_LINES = 8  # the most lines that one grant may change, besides one for each right
 
 
+NO_DECISION = (
+    "it is not a record of a decision about a host's call: rosrv audit search --deny lists the denied ones"
+)
+
+
 class UngrantableError(Exception):
     """No rule can grant a request; the message gives the reason."""
 
@@ -215,7 +220,7 @@ def asked(
     try:
         request = Request(ipaddress.ip_address(host), caller_id, Category(category), resource)
     except ValueError:
-        raise UngrantableError("it is not a record of a decision about a host's call") from None
+        raise UngrantableError(NO_DECISION) from None
     call, key = str(detail.get("call", resource)), detail.get("key")
     if request.category is not Category.COMMAND:
         return DecidedRequest(request, rights_of(request))

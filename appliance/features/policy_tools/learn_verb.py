@@ -11,6 +11,7 @@ import typer
 from appliance.audit.search.filter_options import Since
 from appliance.base.counted import counted
 from appliance.base.input_files import names_of_hosts
+from appliance.base.os_errors import with_remedy
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
@@ -146,6 +147,6 @@ def _write(output: Path, text: str) -> None:
     try:
         descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
     except OSError as error:
-        raise usage_error(f"{output}: {error.strerror}") from error
+        raise usage_error(with_remedy(error, output)) from error
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
         file.write(text)

@@ -17,13 +17,13 @@ from appliance.audit.log.record_format import LogEntry
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
 from appliance.base.input_files import read_given_text
-from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli import output
 from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance
+from appliance.cli.durations import time_given
 from appliance.features.policy_tools.recorded_requests import RecordedPeriod, period_since, request_of
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
@@ -71,7 +71,7 @@ def _network(text: str) -> Network:
     try:
         return canonical_network(ipaddress.ip_network(text))
     except ValueError as error:
-        raise usage_error(f"--robot: {error}") from error
+        raise usage_error(f"--robot: {error}; write 192.168.1.20 or 192.168.1.0/24") from error
 
 
 def _enrolled(text: str) -> tuple[str, Address]:
@@ -79,7 +79,7 @@ def _enrolled(text: str) -> tuple[str, Address]:
     try:
         return name, canonical_address(ipaddress.ip_address(address))
     except ValueError as error:
-        raise usage_error(f"--enrolled: expected NAME=ADDRESS, found {text!r}") from error
+        raise usage_error(f"--enrolled: {text!r} is not NAME=ADDRESS, such as arm=10.0.0.7") from error
 
 
 def policy_in_force(
@@ -114,7 +114,7 @@ def _over_rest(appliance: Appliance) -> PolicyInForce:
         return msgspec.convert(appliance.rest.call("GET", "/v1/policy"), PolicyInForce)
     except msgspec.ValidationError as error:
         text = f"{appliance.place}: this appliance's version gives a different answer: {error}"
-        raise usage_error(text) from error
+        raise usage_error(f"{text}; use the rosrv of its version") from error
     except (NotRunningError, RestProblemError) as error:
         raise usage_error(str(error)) from error
 
@@ -142,8 +142,9 @@ def requests_of_file(file: Path) -> Iterator[Request]:
             fields = json.loads(line)
             yield request_of(fields["host"], fields["caller_id"], fields["category"], fields["resource"])
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            reason = f"{type(error).__name__}: {error}"
-            raise usage_error(f"{file}:{number}: not a request: {reason}") from error
+            raise usage_error(
+                f"{file}:{number}: not a request: write an object with host (an address), caller_id, category, resource"
+            ) from error
 
 
 def live_now(appliance: Appliance) -> list[LiveRight]:
@@ -161,12 +162,8 @@ def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
         except (LogUnreadableError, NotRunningError, FilterError) as error:
             raise usage_error(str(error)) from error
 
-    try:
-        now = clock.wall_ns()
-        asked = None if since is None else parse_timestamp(since, now, None)
-    except TimestampError as error:
-        raise usage_error(str(error)) from error
-    return period_since(read, asked, now)
+    asked = None if since is None else time_given("--since", since, "rosrv policy")
+    return period_since(read, asked, clock.wall_ns())
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:

@@ -312,6 +312,10 @@ def test(
     """
     beside = cases or cases_beside(file)
     results = _judge_or_exit(file, robot, enrolled, beside).results
+    if not results and not is_named_there(beside):
+        raise usage_error(
+            f"there is no file {beside}: write test cases into it, or name another with --cases"
+        )
     if not results:  # a file of cases has at least one
         read_text(beside)
     failed = [result for result in results if not result.passed]

@@ -90,7 +90,7 @@ def _of_policy(services: Services) -> Routes:
             str, Query(max_length=64, description="30d (ago), a date, or RFC 3339", examples=["7d"])
         ] = "30d",
     ) -> PolicyUses:
-        """Which rules of the policy in force the recorded requests needed, as `rosrv policy unused` says it."""
+        """Return the rules of the policy in force that recorded requests used, as `rosrv policy unused` does."""
         moment = given(since)
         current = await ask(control, PolicyWanted(), bearer)
         live = (await ask(control, RegistrationsWanted(), bearer)).registrations

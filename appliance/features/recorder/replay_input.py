@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
-from appliance.base.timestamps import parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
+from appliance.cli.durations import time_given
 from appliance.cli.monitor_program import MONITOR
 from appliance.cli.output import say_json
 from appliance.features.recorder import requests as recording_requests
@@ -45,16 +45,14 @@ class Piece(NamedTuple):
 
 
 def span_of(since: str | None, until: str | None) -> Span:
-    now = clock.wall_ns()
-    try:
-        span = Span(
-            0 if since is None else parse_timestamp(since, now, None),
-            now if until is None else min(now, parse_timestamp(until, now, None)),
-        )
-    except ValueError as error:
-        raise MONITOR.usage_error(str(error)) from None
+    now, verb = clock.wall_ns(), "rosrv monitor"
+    span = Span(
+        0 if since is None else time_given("--since", since, verb),
+        now if until is None else min(now, time_given("--until", until, verb)),
+    )
     if span.since >= span.until:
-        raise MONITOR.usage_error("--since must be before --until")
+        end = "now" if until is None else f"--until {until}"
+        raise MONITOR.usage_error(f"--since {since} is not before {end}")
     return span
 
 

@@ -14,6 +14,7 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
 from appliance.base.counted import counted
+from appliance.base.os_errors import with_remedy
 from appliance.base.timestamps import local_text
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
@@ -223,13 +224,13 @@ def fetch(
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
     if os.path.lexists(target):
         raise usage_error(f"{target} already exists: remove it, or name another file with --output")
+    body = appliance.ask_or_exit(recording_requests.RecordingWanted(recording))
     part = name_to_make(target)
     try:
         os.close(_private(part))
     except OSError as error:
-        raise usage_error(f"{part}: {error.strerror}") from None
+        raise usage_error(f"cannot write {with_remedy(error, target)}") from None
     try:
-        body = appliance.ask_or_exit(recording_requests.RecordingWanted(recording))
         bag = bag_of(appliance, body.id, part)
         if bag is not part:
             shutil.copyfile(bag, part)
@@ -240,7 +241,7 @@ def fetch(
         elif whole:
             part.replace(target)
     except OSError as error:
-        raise usage_error(f"{error.filename2 or error.filename or target}: {error.strerror}") from None
+        raise usage_error(with_remedy(error, error.filename2 or error.filename or target)) from None
     finally:
         part.unlink(missing_ok=True)
     if not whole:

@@ -28,6 +28,7 @@ from appliance.features.standby.membership import (
 )
 from appliance.features.standby.process import EPOCH, stored_epoch
 from appliance.features.standby.sealed_authority import sealed_authority
+from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import foreign
 from rosmop.tool.terminal import refused, say
 
@@ -150,11 +151,19 @@ def _plan(options: JoinOptions, settings: Settings, earlier: Membership | None) 
             ]
         )
     followers = _followers(options.followers)
-    for text in (options.address, options.other, options.witness, options.fixed, *followers.values()):
+    given = {
+        "--address": options.address,
+        "--other": options.other,
+        "--witness": options.witness,
+        "--fixed": options.fixed,
+    }
+    for option, text in (*given.items(), *(("--follower", text) for text in followers.values())):
         try:
             IPv4Address(text)
         except ValueError:
-            raise usage_error(f"{text!r} is not an IPv4 address", _VERB) from None
+            raise usage_error(
+                f"{option} {text!r} is not an IPv4 address, such as 192.168.1.2", _VERB
+            ) from None
     try:
         epoch = stored_epoch(options.state / "lease" / EPOCH)
     except (OSError, ValueError) as error:
@@ -180,7 +189,10 @@ def _plan(options: JoinOptions, settings: Settings, earlier: Membership | None) 
 def _ports(options: JoinOptions, settings: Settings) -> tuple[str, ...]:
     if options.ports is not None:
         return tuple(part.strip() for part in options.ports.split(","))
-    nodes = read_node_ports(settings)
+    try:
+        nodes = read_node_ports(settings)
+    except StartError as error:
+        raise usage_error(f"{error}; give --ports FIRST-LAST, or the appliance's --config", _VERB) from None
     single = [settings.listen_address[1], *(() if settings.api_address is None else settings.api_address[1:])]
     if 0 in single:
         raise usage_error(

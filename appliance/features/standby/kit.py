@@ -78,7 +78,7 @@ def make_kits(plan: PairPlan) -> Kits:
         )
 
     if plan.name == plan.other:
-        raise ValueError(f"both appliances have the name {plan.name}")
+        raise ValueError(f"both appliances have the name {plan.name}: give --name or --other-name")
     followers = {
         name: {"address": address, "key": secrets.token_hex(32)} for name, address in plan.followers.items()
     }

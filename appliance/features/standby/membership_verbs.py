@@ -134,7 +134,7 @@ def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     try:
         membership = load_membership(path)
         if membership is None:
-            raise usage_error(f"{state} is not the state of one of two appliances", _VERB)
+            raise _single(state)
         # Without secrets: `join` compares it with the file that it gets.
         left = replace(membership, witness_key="", peer_key="", key="")
         save_membership(path.with_name(LEFT_FILE), left)
@@ -165,6 +165,13 @@ def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     )
 
 
+def _single(state: Path) -> typer.Exit:
+    return usage_error(
+        f"{state} is not the state of one of two appliances; name another with --state, or run rosrv standby join",
+        _VERB,
+    )
+
+
 def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     """Forget the stored epoch, so that the next start takes the witness's epoch. Stop the appliance first.
 
@@ -174,7 +181,7 @@ def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     Example: rosrv standby repair
     """
     if not path_of(state).exists():
-        raise usage_error(f"{state} is not the state of one of two appliances", _VERB)
+        raise _single(state)
     directory = StateDirectory(state)
     file = state / "lease" / EPOCH
     try:

@@ -24,8 +24,12 @@ _FIXED_AUTHORITY = (
 def pairing_in(state: Path) -> Pairing | None:
     try:
         membership = load_membership(path_of(state))
-    except (MembershipError, OSError) as error:
+    except MembershipError as error:
         raise StartError(str(error)) from error
+    except OSError as error:
+        raise StartError(
+            f"{state} cannot be used as the state directory: {error.strerror}; name another with --state"
+        ) from error
     if membership is None:
         return None
     name, other = membership.name, membership.other

@@ -19,7 +19,7 @@ _WAITS = (
 
 
 class SharedAuthority(StoredAuthority):
-    """The authority of the state, whose key the signer of this appliance may not have."""
+    """The certificate authority of a pair. The signer of this appliance may lack its key."""
 
     def __init__(self, signer: Authority, kept: HostTables) -> None:
         super().__init__(signer, kept)

@@ -30,7 +30,7 @@ class TopicLooks:
         topics = {topic.name: topic for topic in self._graph.present().topics}
         topic = topics.get(request.topic)
         if topic is None:
-            near = meant(request.topic, topics)
+            near = meant(request.topic, topics) or ": rosrv topic list shows all topics"
             raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}{near}")
         if not topic.mediated:
             raise SenselessError(

@@ -94,7 +94,8 @@ def info(appliance: Appliance, topic: _Topic) -> None:
     found = next((row for row in body.topics if row.name == topic), None)
     if found is None:
         known = [row.name for row in body.topics]
-        raise usage_error(f"no node publishes or subscribes to {topic}{meant(topic, known)}", "rosrv topic")
+        near = meant(topic, known) or ": rosrv topic list shows all topics"
+        raise refused([f"rosrv topic: no node publishes or subscribes to {printable(topic)}{near}"])
     if appliance.as_json:
         say_json(found)
     else:

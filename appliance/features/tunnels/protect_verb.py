@@ -111,12 +111,12 @@ def protect(
     """
     seconds = bounded_span("--within", within, "0.05s", "1m", "rosrv protect", bare="s")
     if sum((apply, check is not None, remove)) > 1:
-        _fail("--apply, --check and --remove exclude one another")
+        _fail("--apply, --check and --remove exclude one another: give one")
     try:
         services = protection.parse_services(open_services or ())
         chosen = protection.parse_ports(ports) if ports is not None else protection.local_port_range()
         if (users or groups) and not strict:
-            _fail("--user and --cgroup are for --strict")
+            _fail("--user and --cgroup need --strict")
         local = protection.LocalCallers(tuple(users or ()), tuple(groups or ())) if strict else None
         if check is not None:
             _check(_CheckTarget(check, name, chosen, services, seconds), running)

@@ -78,7 +78,7 @@ class PortRange:
     def __post_init__(self) -> None:
         if not 1 <= self.first <= self.last <= MAX_PORT:
             raise ValueError(
-                f"{self.first}-{self.last} is not a range of ports (1 to {MAX_PORT}, smaller first)"
+                f"{self.first}-{self.last} is not a range of ports: give FIRST-LAST (1 to {MAX_PORT}, smaller first)"
             )
 
     @classmethod
@@ -210,7 +210,7 @@ class PacketRule:
 
 @dataclass(frozen=True)
 class ForwarderAccess:
-    """The access of a user to one receiver only."""
+    """A user of this machine that may connect to one receiver, and to nothing else."""
 
     uid: int
     address: str

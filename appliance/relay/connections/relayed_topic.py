@@ -259,8 +259,8 @@ class RelayedTopic:
     ) -> None:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
-        With `wanted`, the topic stays connected even without a subscriber. `call` is for the pump. A topic that was
-        `guarded` once carries commands, even when the guard is off.
+        With `wanted`, the topic stays connected even without a subscriber. `call` returns the call of the
+        compiled module, if any. A topic that once was `guarded` counts as one of commands, even when the guard is off.
         """
         self._is_command |= guarded
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)

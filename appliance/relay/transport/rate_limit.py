@@ -153,7 +153,7 @@ class SharedRateLimit:
 
 
 class RateAllowance:
-    """The allowance of one holder in a limit."""
+    """One holder's part of a shared rate limit."""
 
     __slots__ = ("__weakref__", "_flow", "_name")
 

@@ -40,6 +40,8 @@ function wordOf(verb, group) {
   return group.ranks.length ? "Free" : SAID[verb];
 }
 
+const WORDS = { take: "assign", give: "free", ask: "ask" };
+
 function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => void, close: () => void}} */ { verb, group, again, close }) {
   const [host, setHost] = useState(verb === "give" ? (group.waiting[0] ?? "") : "");
   const hosts = useHosts();
@@ -47,7 +49,7 @@ function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => 
   const give = verb === "give";
   const go = async () => {
     try {
-      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: give ? { to: host } : { host }, match: "*" });
+      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${WORDS[verb]}`, { json: give ? { to: host } : { host }, match: "*" });
       done(body.ranks.length ? `${body.group} is ${body.standing}` : body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
       close();
     } catch (failure) {

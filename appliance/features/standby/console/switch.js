@@ -22,7 +22,7 @@ function Confirm(/** @type {{name: string, other: any, close: () => void}} */ { 
   const go = async () => {
     setError(null);
     try {
-      await ask("POST", "/v1/standby/promote", { match: "*" });
+      await ask("POST", "/v1/standby/switch", { match: "*" });
     } catch (failure) {
       if (!isLost(failure)) return setError(failure);
     }

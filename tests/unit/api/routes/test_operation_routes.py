@@ -77,10 +77,14 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/guards/yard/upgrade", {}),
     ("POST", "/v1/guards/yard/upgrade?confirm_within=300&hold=1", {"topics": {"state": "/joint_states"}}),
     ("POST", "/v1/guards/plan?hold=1", {"name": "fence", "values": {"margin": "0.5"}}),
-    ("POST", "/v1/drive/base/take", {"host": "robot"}),
-    ("POST", "/v1/drive/base/give", {}),
-    ("POST", "/v1/drive/base/give", {"to": "10.0.0.7"}),
+    ("POST", "/v1/drive/base/assign", {"host": "robot"}),
+    ("POST", "/v1/drive/base/free", {}),
+    ("POST", "/v1/drive/base/free", {"to": "10.0.0.7"}),
     ("POST", "/v1/drive/base/ask", {"host": "robot"}),
+    # Former paths
+    ("POST", "/v1/drive/base/take", {"host": "robot"}),
+    ("POST", "/v1/drive/base/give", {"to": "10.0.0.7"}),
+    ("POST", "/v1/standby/promote", None),
     ("POST", "/v1/approvals/17/approve", {}),
     ("POST", "/v1/approvals/17/approve", {"seconds": 30}),
     ("POST", "/v1/approvals/17/refuse", None),
@@ -113,7 +117,7 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/alarms/silence", {"kind": "recorder", "seconds": 3600}),
     ("POST", "/v1/alarms/silence", {"kind": "recorder"}),
     ("POST", "/v1/hosts/reload", None),
-    ("POST", "/v1/standby/promote", None),
+    ("POST", "/v1/standby/switch", None),
     ("DELETE", "/v1/hosts/laptop", None),
     ("DELETE", "/v1/sso/sessions/0123456789ab", None),
     ("DELETE", "/v1/sso/people/sso%3Aalice%40example.org", None),
@@ -144,7 +148,7 @@ LEAST = {
             "confirm_monitors", "switch_monitors", "switch_monitor", "record_now", "tell_host_ports", "reload_hosts",
             "set_monitor", "block_host", "unblock_host", "acknowledge_alarm", "silence_alarm",
             "make_door_ticket", "plan_guard", "monitor_values",
-            "approve", "approval_refuse", "drive_take", "drive_give", "drive_ask",
+            "approve", "approval_refuse", "drive_assign", "drive_free", "drive_ask",
         ),
         "operator",
     ),
@@ -152,7 +156,7 @@ LEAST = {
         (
             "load_policy", "load_monitors", "replace_monitor", "remove_monitors", "remove_monitor",
             "roll_back_monitors", "remove_recording", "tokens", "revoke_token", "enrol_host", "host_token",
-            "new_host_kit", "revoke_host", "promote_standby", "new_guard", "set_guard", "upgrade_guard", "check_driver",
+            "new_host_kit", "revoke_host", "switch_standby", "new_guard", "set_guard", "upgrade_guard", "check_driver",
             "add_door",
             "remove_door", "sso_sessions", "end_sessions",
         ),
@@ -481,7 +485,7 @@ def routes() -> dict[str, set[str]]:
 
 
 def test_routes_written_by_hand_are_for_these_roles() -> None:
-    named = {f"{one.method} {one.path}": one.name for one in NAMED}
+    named = {f"{one.method} {path}": one.name for one in NAMED for path in (one.path, one.former) if path}
     of_table = {
         path: {"operator" if any(one.dry_run and one.name == name for one in NAMED) else LEAST[name]}
         for path, name in named.items()

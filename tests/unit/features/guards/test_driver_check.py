@@ -219,5 +219,5 @@ def test_a_time_out_of_range_is_refused_before_the_warning() -> None:
     arguments = ["guard", "check-driver", "/cmd_vel", "--by", "/odom", "--for", "20s", "--yes"]
     answer = CliRunner().invoke(app, arguments)
     assert answer.exit_code == 2
-    assert "--for: longest=20 is outside of 0.2..10 s" in answer.output
+    assert "--for 20s is out of bounds: write 0.2s to 10s" in answer.output
     assert "driven slowly" not in answer.output

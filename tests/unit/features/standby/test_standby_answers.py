@@ -67,7 +67,7 @@ def asked(gate: RequestGate, method: str, target: str, **more: Any) -> httpx.Res
     [
         ("GET", "/v1/status"), ("GET", "/v1/graph"), ("GET", "/v1/live"), ("GET", "/v1/policy"),
         ("GET", "/v1/hosts"), ("GET", "/v1/challenge"), ("POST", "/v1/policy/reload"), ("POST", "/v1/hosts/reload"),
-        ("POST", "/v1/standby/promote"), ("DELETE", "/v1/blocks/10.0.0.7"),
+        ("POST", "/v1/standby/switch"), ("DELETE", "/v1/blocks/10.0.0.7"),
     ],
 )  # fmt: skip
 def test_the_problem_names_the_active_appliance(gate: RequestGate, method: str, target: str) -> None:

@@ -298,7 +298,7 @@ async def test_a_revoked_host_leaves_the_policy_first(bench: Bench) -> None:
     assert bench.order == ["policy []", "expel 10.113.11.2"]
     assert body.taken_back == 3
     assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
-    with pytest.raises(HostRefusedError, match="the enrolled hosts: none"):
+    with pytest.raises(HostRefusedError, match="enrol it: rosrv host add NAME"):
         await bench.revoke("a")
 
 

@@ -1,0 +1,24 @@
+"""Errors of the operating system in the words of a message: the file, the reason, and how to remove it."""
+
+import errno
+from pathlib import Path
+
+_REMEDIES = {
+    errno.EACCES: "run this as root",
+    errno.EDQUOT: "free some space, or name another disk",
+    errno.EEXIST: "name a new file",
+    errno.EISDIR: "name a file",
+    errno.ENOSPC: "free some space, or name another disk",
+    errno.EPERM: "run this as root",
+    errno.EROFS: "name a place that can be written",
+}
+
+
+def with_remedy(error: OSError, place: object = None) -> str:
+    """Return the text for users; `place` is the file if the error does not name it."""
+    where = error.filename if place is None else place
+    why = error.strerror or str(error)
+    remedy = _REMEDIES.get(error.errno or 0, "")
+    if isinstance(error, FileNotFoundError) and where and not Path(str(where)).absolute().parent.is_dir():
+        remedy = "create its folder first"
+    return "; ".join(filter(None, (f"{where}: {why}" if where else why, remedy)))
