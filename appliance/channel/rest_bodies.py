@@ -42,7 +42,8 @@ GivenNanoMoment = Annotated[
 ]
 
 
-GivenValue = bool | int | float | Annotated[str, msgspec.Meta(max_length=256)]
+_Number = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # the channel takes no larger ones
+GivenValue = bool | _Number | float | Annotated[str, msgspec.Meta(max_length=256)]
 GivenOfMonitor = Annotated[dict[MonitorName, GivenValue], msgspec.Meta(min_length=1, max_length=100)]
 
 

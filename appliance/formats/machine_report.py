@@ -164,7 +164,7 @@ class LastingStates:
 
 
 class MonitorsOff(LastingStates):
-    """The monitors that were not in force. A load and a start list them all, so a removed monitor is off no longer."""
+    """The monitors that were not in force. One that a load or a start does not list was removed, so its state ends."""
 
     def __init__(self, period: Period) -> None:
         super().__init__(OFF, period)

@@ -77,7 +77,7 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """The answers about an address, which are kept because a policy never changes."""
+    """The policy's answers about an address; they are computed once."""
 
     atoms: frozenset[Atom]
     known: bool

@@ -83,7 +83,7 @@ class Reporter:
             self._unrecorded += 1
 
     def refused(self, key: str, asked: tuple[str, str], host: str, caller_id: str, reason: str) -> None:
-        """Report the first such refusal at once, and count repetitions until the next `tick`."""
+        """Report a refusal at once, and count equal ones until the next `tick`."""
         kind, resource = asked
         refusal = (key, kind, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
         if refusal in self._refused:

@@ -89,7 +89,7 @@ class _GoingOn:
 
 
 class Repetitions:
-    """The actions of monitors that go on."""
+    """Counts repeated actions of monitors, which have one audit record for a time."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[str, ...], _GoingOn] = {}

@@ -61,7 +61,7 @@ class CoverageJob(msgspec.Struct, frozen=True, tag=True):
 
 
 class Coverage(msgspec.Struct, frozen=True, tag=True):
-    """The counts, in the order of `exercised.items_of`."""
+    """How often each item of `exercised.items_of` was covered, in that order."""
 
     counts: list[int]
 

@@ -27,7 +27,7 @@ def merged_rows(
 
 
 class HighestValues(msgspec.Struct):
-    """The highest number of each window."""
+    """The largest value in each window of time, by the window's number."""
 
     of: dict[int, float] = {}
 

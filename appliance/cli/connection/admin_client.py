@@ -102,9 +102,12 @@ class AdminSocket:
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
-    """Return the request's bytes. Raises `NotRunningError` for text that is not valid UTF-8."""
+    """Return the request's bytes. Raises `NotRunningError` for text that is not valid UTF-8, and for huge numbers."""
     try:
+        msgspec.msgpack.encode(request)  # JSON would also take numbers of more than 64 bits
         return msgspec.json.encode(request)
+    except OverflowError:
+        raise NotRunningError("a number of this command has more than 64 bits: give a smaller one") from None
     except UnicodeEncodeError as error:
         word = error.object[max(0, error.start - 20) : error.end + 20]
         shown = word.encode("utf-8", "backslashreplace").decode()

@@ -10,7 +10,7 @@ from appliance.channel.rest_operation import parameter, rest
 
 SHORTEST_LEASE, LONGEST_LEASE = 1.0, 3600.0
 _PROBLEMS = {404: "No call has this number any longer.", 422: "The approval cannot last so long."}
-Number = Annotated[int, parameter("number of the held call", ge=1, examples=[48213])]
+Number = Annotated[int, parameter("number of the held call", ge=1, le=10**15, examples=[48213])]
 
 
 class LeaseSeconds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -41,7 +41,7 @@ class TopicSource(Protocol):
         """Subscribe to a topic until its type is known. Raise `RosError`."""
 
     def heard_type(self, topic: str) -> KnownType | None:
-        """Return the type that counts on a topic to which the door subscribes."""
+        """Return the type of a topic to which the door subscribes; None if it is not known."""
 
 
 class _Asked(NamedTuple):

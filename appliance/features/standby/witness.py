@@ -315,8 +315,7 @@ def write_synced(path: str, content: bytes) -> None:
 class RegularCheck:
     """Checks something regularly in a thread, so that neither a slow disk nor a slow program delays an answer.
 
-    `check` raises `OSError` or `WitnessError`, and `failure` is the text about that.
-
+    `check` raises `OSError` or `WitnessError`; then `failure` is the beginning of the reported text.
     """
 
     def __init__(self, failure: str, check: Callable[[], Any], clock: Callable[[], float]) -> None:

@@ -164,7 +164,7 @@ class _List:
         return taken
 
     def sent(self, taken: "_Taken", *, arrived: bool) -> bool:
-        """Return whether another list follows."""
+        """Note whether a list arrived; return whether a newer one must be sent."""
         if not arrived:
             self._untold = _united(self._untold, taken.removes)
             return False

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from typer.core import TyperArgument
 
 from appliance.base.os_errors import with_remedy
@@ -49,6 +50,27 @@ def test_wrong_input_gets_an_error_with_a_next_step(
     assert not RAW.search(done.stdout + done.stderr), said
     assert REMEDY.search(" ".join(said.replace("│", " ").split())), said
     assert list(tmp_path.iterdir()) == []
+
+
+NUMBERED = [
+    (name, parameter)
+    for name in sorted(VERBS.keys() - ACTING - {"up"})
+    for parameter in VERBS[name].params
+    if (parameter.display_type(typer.Context(VERBS[name])) or "").startswith("<int")
+]
+
+
+@pytest.mark.parametrize(("name", "parameter"), NUMBERED)
+def test_a_huge_number_is_refused(name: str, parameter: Any) -> None:
+    given = wrong_call(name)
+    huge = "9" * 30
+    if isinstance(parameter, TyperArgument):
+        given = [huge if word == "no such thing" else word for word in given]
+    else:
+        given += [max(parameter.opts, key=len), huge]
+    done = rosrv(*given)
+    assert done.returncode in (1, 2)
+    assert not RAW.search(done.stdout + done.stderr), done.stderr
 
 
 TIMED = [

@@ -47,6 +47,44 @@ def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, A
     assert found == [(405, methods) for methods in told]
 
 
+def _unbounded(
+    schema: dict[str, Any], schemas: dict[str, Any], where: str, seen: frozenset[str] = frozenset()
+) -> list[str]:
+    """Return the places of whole numbers without a maximum."""
+    name = schema.get("$ref", "").rpartition("/")[2]
+    if name:
+        return [] if name in seen else _unbounded(schemas[name], schemas, where, seen | {name})
+    found = (
+        [where]
+        if schema.get("type") == "integer"
+        and not {"maximum", "exclusiveMaximum", "enum", "const"} & {*schema}
+        else []
+    )
+    parts = [(where, one) for key in ("anyOf", "oneOf", "allOf") for one in schema.get(key, ())]
+    parts += [(f"{where}.{key}", one) for key, one in schema.get("properties", {}).items()]
+    parts += [
+        (f"{where}[]", schema[key])
+        for key in ("items", "additionalProperties")
+        if isinstance(schema.get(key), dict)
+    ]
+    return found + [place for inner, one in parts for place in _unbounded(one, schemas, inner, seen)]
+
+
+def test_a_whole_number_of_a_client_has_a_maximum(contract: dict[str, Any]) -> None:
+    """Numbers of more than 64 bits cannot be sent to control, so without a maximum they were a defect (500)."""
+    schemas, found, seen = contract["components"]["schemas"], [], 0
+    for path, methods in contract["paths"].items():
+        for method, operation in methods.items():
+            sent = {one["name"]: one["schema"] for one in operation.get("parameters", ())}
+            content = operation.get("requestBody", {}).get("content", {})
+            sent |= {kind: body["schema"] for kind, body in content.items() if "schema" in body}
+            seen += len(sent)
+            for name, schema in sent.items():
+                found += _unbounded(schema, schemas, f"{method.upper()} {path} {name}")
+    assert seen > 100
+    assert found == []
+
+
 @pytest.mark.complete
 def test_times_have_units(contract: dict[str, Any]) -> None:
     without, seen = [], 0
