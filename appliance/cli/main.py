@@ -12,8 +12,7 @@ from typing import Annotated
 import typer
 
 from appliance import __version__
-from appliance.base.os_errors import with_remedy
-from appliance.base.user_errors import UserError
+from appliance.base.user_errors import UserError, with_remedy
 from appliance.cli.first_contact import first_contact
 from appliance.cli.lazy import application
 from appliance.cli.verb_table import Group, Verb, Verbs, joined

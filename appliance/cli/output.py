@@ -18,8 +18,8 @@ import typer
 from appliance.api.front.moments import in_full
 from appliance.base import actors
 from appliance.base.atomic_files import NotLastingError, write_where_told
-from appliance.base.os_errors import with_remedy
 from appliance.base.timestamps import local_minute
+from appliance.base.user_errors import with_remedy
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
 

@@ -12,8 +12,8 @@ from appliance.audit.log.record_format import printable
 from appliance.audit.log.signatures import KeyUnreadableError
 from appliance.audit.proof.copies import CopiesUnreadableError
 from appliance.audit.search.query import FilterError
-from appliance.base.os_errors import with_remedy
 from appliance.base.timestamps import TimestampError
+from appliance.base.user_errors import with_remedy
 from appliance.cli.connection.admin_client import NotRunningError
 
 CANNOT_READ = 2

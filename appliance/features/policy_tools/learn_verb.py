@@ -11,7 +11,7 @@ import typer
 from appliance.audit.search.filter_options import Since
 from appliance.base.counted import counted
 from appliance.base.input_files import names_of_hosts
-from appliance.base.os_errors import with_remedy
+from appliance.base.user_errors import with_remedy
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json

@@ -14,8 +14,8 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
 from appliance.base.counted import counted
-from appliance.base.os_errors import with_remedy
 from appliance.base.timestamps import local_text
+from appliance.base.user_errors import with_remedy
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance, speaks

@@ -1,4 +1,4 @@
-"""What every verb answers to wrong input: no traceback, and a next step."""
+"""The answers of every verb to wrong input: no traceback, and a next step."""
 
 import ast
 import re
@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.core import TyperArgument
 
-from appliance.base.os_errors import with_remedy
+from appliance.base.user_errors import with_remedy
 from tests.support.command import commands, rosrv
 
 ROOT = Path(__file__).parents[3]
