@@ -31,8 +31,10 @@ def test_a_users_error_is_one_line(
     [
         (PermissionError(errno.EACCES, "Permission denied", "/var/lib/rosrv/x"),
          "rosrv: /var/lib/rosrv/x: Permission denied; run this as root\n"),
-        (OSError(errno.ENOSPC, "No space left on device", "/a b"), "rosrv: /a b: No space left on device\n"),
-        (OSError(errno.ENOSPC, "No space left on device"), "rosrv: output: No space left on device\n"),
+        (OSError(errno.ENOSPC, "No space left on device", "/a b"),
+         "rosrv: /a b: No space left on device; free some space, or name another disk\n"),
+        (OSError(errno.ENOSPC, "No space left on device"),
+         "rosrv: output: No space left on device; free some space, or name another disk\n"),
     ],
 )  # fmt: skip
 def test_a_lack_of_rights_or_space_is_not_called_a_defect(

@@ -311,7 +311,7 @@ async def test_a_type_of_an_unknown_topic_is_refused(manager: Manager, orders: G
 
 
 async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> None:
-    with pytest.raises(UnknownThingError, match="there are: fence"):
+    with pytest.raises(UnknownThingError, match="the guards are: fence"):
         await orders.set(guard_requests.GuardSet("other", {"margin": "1"}), "eve")
 
 

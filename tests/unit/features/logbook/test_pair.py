@@ -92,7 +92,7 @@ def test_a_takeover_ends_who_drove(states: dict[str, str], second: float, host: 
 
 
 @pytest.mark.parametrize(
-    ("other", "reason"), [("a", "the same log as that of --state"), ("none", "no such directory")]
+    ("other", "reason"), [("a", "the same log as that of --state"), ("none", "is not a state directory")]
 )
 def test_a_wrong_other_is_refused(states: dict[str, str], other: str, reason: str) -> None:
     found = states.get(other, "/nowhere")
