@@ -35,6 +35,7 @@ def test_a_fence_is_drawn_changed_and_enforced(
         appliance.recorded("--category", "publish", resource="/odom")  # from now on it can be watched
         expect(page.get_by_role("img", name="Map of fence")).to_be_visible()
         expect(page.get_by_text("The guard has the robot at 1.5, 0, 0.5 m from the edge.")).to_be_visible()
+        reader.keep_picture("a_fence")
         page.get_by_role("button", name="Watch").click()
         expect(row).to_contain_text("distance to the edge 0.5 at least 0.2 m")
         assert reader.axe() == []
@@ -42,6 +43,7 @@ def test_a_fence_is_drawn_changed_and_enforced(
         known = page.get_by_role("dialog")
         expect(known.get_by_role("row", name="atX")).to_contain_text("1.5")
         expect(known.get_by_role("row", name="last foreign")).to_contain_text("none yet")
+        reader.keep_picture("what_a_fence_knows")
         assert reader.axe() == []
         known.get_by_role("button", name="Close").click()
         assert [one["detail"]["who"] for one in appliance.recorded("--event", "monitor looked into")] == [

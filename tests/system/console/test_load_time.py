@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 from playwright.sync_api import Browser, expect
 
 from appliance.api.console.console_bundle import join_modules
@@ -25,7 +27,9 @@ MODULES = {
 }  # fmt: skip
 
 
-def test_a_first_visit_is_small(browser: Browser, appliance: Appliance) -> None:
+def test_a_first_visit_is_small(
+    browser: Browser, appliance: Appliance, record_property: Callable[[str, object], None]
+) -> None:
     with Reader(browser, str(appliance.ready["api"])) as reader:
         network = reader.context.new_cdp_session(reader.page)
         received: list[int] = []
@@ -40,6 +44,7 @@ def test_a_first_visit_is_small(browser: Browser, appliance: Appliance) -> None:
         page.keyboard.press("Enter")
         expect(page.get_by_role("heading", level=1, name="Now")).to_be_visible()
         reader.settle()
+        record_property("bytes", sum(received))
         assert sum(received) < MOST_BYTES
 
 

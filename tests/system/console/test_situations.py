@@ -121,12 +121,12 @@ def test_a_quiet_robot_says_so(windows: list[Reader]) -> None:
 
 def test_a_denied_call(appliance: Appliance, windows: list[Reader]) -> None:
     assert "not among the hosts" in advertise(appliance, TABLET, "/guarded")
-    see(windows, lambda page: fact(page, "Denied"), re.compile(r"tablet.*publish /guarded, \d+ s ago"))
+    see(windows, lambda page: fact(page, "Denied"), re.compile(r"tablet.*publish /guarded, .* ago"))
 
 
 def test_the_holder_and_a_hand_over(appliance: Appliance, windows: list[Reader]) -> None:
     appliance.rosrv("drive", "take", "base", "--host", TABLET)
-    see(windows, lambda page: fact(page, "Drives"), re.compile(r"tablet.*drives base for \d+ s"))
+    see(windows, lambda page: fact(page, "Drives"), re.compile(r"tablet.*drives base for .* s"))
     appliance.rosrv("drive", "ask", "base", "--host", "127.0.0.1")
     see(windows, lambda page: fact(page, "Drives"), re.compile(r"tablet.*waits.*127\.0\.0\.1"))
     appliance.rosrv("drive", "give", "base", "--to", "127.0.0.1")
