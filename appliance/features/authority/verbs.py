@@ -91,8 +91,8 @@ def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
 def _show(appliance: Appliance, one: GroupState) -> None:
     shown = appliance.host_in_words
     if one.ranks:
-        since = "" if one.held_seconds is None else f", for {one.held_seconds:g} s"
-        say_row([f"{one.group}: {one.standing}: {one.why}{since}"])
+        since = "" if one.held_seconds is None else f" for {one.held_seconds:g} s"
+        say_row([f"{one.group}: {one.standing}{since}: {one.why}"])
         say_row([f"  rank: {' > '.join(one.ranks)}"])
         return
     held = (
