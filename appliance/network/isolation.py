@@ -64,6 +64,7 @@ class IsolationSettings:
     directory: Path = Path("/run/rosrv")  # for the record and the lock; shared by all appliances of a host
     takes_over: Callable[[], bool] = lambda: False  # whether a ROS master of the robot may listen on `master`
     holds: Callable[[], bool] = lambda: False  # whether nodes must not reach that master, even after a crash
+    wants: Callable[[], bool] = lambda: False  # whether the graph of that master is to be taken over
     left_alone: Callable[[], tuple[str, ...]] = tuple  # control groups of the robot's own masters
 
     def __post_init__(self) -> None:
@@ -262,6 +263,10 @@ class Isolation:
         """Refuse the robot's own master while there are no rules, if a crash or a failure left its graph taken over."""
         if self.settings.master is not None and self.settings.holds():
             close_port(self._host, self.settings.link, self.settings.master)
+
+    @property
+    def awaits_graph(self) -> bool:
+        return self.settings.master is not None and not self._serves_nodes and self.settings.wants()
 
     def withdraw_master(self) -> None:
         """End what `forward_master` began: the port is again that of the robot's own master."""

@@ -1,6 +1,8 @@
 """Put, lift and arm the boot hold around a run of the appliance. A hold that fails is logged, and ends nothing."""
 
+import asyncio
 import math
+from collections.abc import Callable
 
 import structlog
 
@@ -12,6 +14,7 @@ from appliance.network.close_ports import local_port_range
 from appliance.network.namespaces import Namespace, NetworkError
 
 _LOOK_SECONDS = 5.0
+_KEEP_SECONDS = 0.5
 
 log = structlog.get_logger()
 
@@ -24,6 +27,7 @@ class HoldAround:
         self._ports: HeldPorts | None = None
         self._looked_at = -math.inf
         self._removed = 0
+        self._served: str | None = None
         if (
             used
             and settings.isolation != "none"
@@ -53,12 +57,24 @@ class HoldAround:
             if not self._hold.is_intact():
                 self.put()
 
+    async def until(self, is_open: Callable[[], bool]) -> str:
+        """Keep the hold until other machines reach the appliance, and not the robot's own master; see `served`."""
+        while not is_open():
+            self.keep()
+            await asyncio.sleep(_KEEP_SECONDS)
+        return self.served()
+
     def served(self) -> str:
-        """Lift and arm the hold.
+        """Lift and arm the hold, once.
 
         Return an alarm if it is not lifted, if another program had removed its rules, or if the robot's own programs
         started without the appliance.
         """
+        if self._served is None:
+            self._served = self._lifted()
+        return self._served
+
+    def _lifted(self) -> str:
         if not self._hold.is_present:
             return ""
         lapsed, trouble = False, ""

@@ -87,6 +87,10 @@ class NoIsolation:
     def inside(self) -> Iterator[None]:
         yield
 
+    def awaits_graph(self) -> bool:
+        """Return whether the robot's own master still has its port, and its graph is to be taken over."""
+        return False
+
     def build(self) -> None:
         """Build the isolation. Raises `StartError`, after removing everything that was built."""
 
@@ -409,6 +413,7 @@ class NetnsIsolation(ContainerIsolation):
                 datagrams=datagrams,
                 takes_over=work.takes_over,
                 holds=work.holds,
+                wants=work.wants,
                 left_alone=work.left_alone,
             ),
         )
@@ -442,6 +447,9 @@ class NetnsIsolation(ContainerIsolation):
             super().control_ready(inner_port, own_port)
             if not self._isolation.settings.takes_over():  # else control orders it, with the graph taken over
                 self._isolation.forward_master()
+
+    def awaits_graph(self) -> bool:
+        return self._isolation.awaits_graph
 
     def build(self) -> None:
         try:

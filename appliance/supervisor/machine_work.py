@@ -19,6 +19,9 @@ class MachineWork(Protocol):
     def holds(self) -> bool:
         """Return whether nodes must reach the appliance only, even while it starts again after a crash."""
 
+    def wants(self) -> bool:
+        """Return whether the graph of the robot's own master is to be taken over, or not yet given back."""
+
     def left_alone(self) -> tuple[str, ...]:
         """Return the control groups of the robot's own masters."""
 
@@ -36,6 +39,9 @@ class NoMachineWork:
         return False
 
     def holds(self) -> bool:
+        return False
+
+    def wants(self) -> bool:
         return False
 
     def left_alone(self) -> tuple[str, ...]:

@@ -248,10 +248,8 @@ def _listener(settings: Settings) -> socket.socket | None:
     return listener
 
 
-async def _keep(hold: HoldAround, supervisor: Supervisor) -> None:
-    while not supervisor.is_ready:
-        hold.keep()
-        await asyncio.sleep(1.0)
+async def _keep(hold: HoldAround, supervisor: Supervisor, isolation: NoIsolation) -> None:
+    isolation.lapse = await hold.until(lambda: supervisor.is_ready and not isolation.awaits_graph())
 
 
 def _supervise(
@@ -276,7 +274,8 @@ def _supervise(
 
     def say_ready(said: ControlReady) -> None:
         ready(said, settings)
-        isolation.lapse = hold.served()
+        if not isolation.awaits_graph():
+            isolation.lapse = hold.served()
         manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
 
     def say_standing_by() -> None:
@@ -310,7 +309,7 @@ def _supervise(
             work=work,
         )
         async with manager.watched():
-            keeping = asyncio.create_task(_keep(hold, supervisor))
+            keeping = asyncio.create_task(_keep(hold, supervisor, isolation))
             try:
                 await supervisor.run()
             finally:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.booted_debian import BootedDebian, booted_debian
+from tests.support.vendors_robot import adopted, fetch_like, is_adopted, record_of, runs, write_robot
 from tests.support.waiting import eventually
 
 pytestmark = pytest.mark.timeout(7200)  # the system is fetched and the package is built
@@ -19,46 +20,12 @@ ORDERS = {
     "the robot first": {"rosrv": "[Service]\nExecStartPre=/bin/sleep 8\n"},
     "the appliance first": {"roscore": "[Unit]\nAfter=rosrv.service\n"},
 }
-ENVIRONMENT = "Environment=HOME=/root ROS_MASTER_URI=http://localhost:11311 PYTHONUNBUFFERED=1"
-ROSCORE = f"[Service]\nExecStart=/usr/bin/roscore\n{ENVIRONMENT}\n[Install]\nWantedBy=multi-user.target\n"
-DRIVE = "/usr/bin/rostopic pub --rate 20 /speed std_msgs/Float64 0.5 __name:=drive"
-HEAR = "/bin/sh -c 'rostopic echo /speed __name:=hear > /run/heard'"
-ROBOT = (
-    "[Unit]\nRequires=roscore.service\nPartOf=roscore.service\nAfter=roscore.service\n[Service]\n"
-    f"ExecStartPre=/bin/sh -c 'until rostopic list; do sleep 1; done'\nExecStart=/bin/sh -c '{DRIVE} & exec \"$@\"' sh"
-    f" {HEAR}\n{ENVIRONMENT}\n[Install]\nWantedBy=multi-user.target\n"
-)
-
-
-def nodes(debian: BootedDebian) -> set[str]:
-    return set(debian.shell("ROS_MASTER_URI=http://localhost:11311 rosnode list").split())
-
-
-def hears(debian: BootedDebian) -> None:
-    before = debian.shell("wc -c < /run/heard")
-    eventually(lambda: debian.shell("wc -c < /run/heard") != before, debian.story)
-
-
-def runs(debian: BootedDebian) -> None:
-    eventually(lambda: {"/drive", "/hear"} <= nodes(debian), debian.story)
-    hears(debian)
-
-
-def adopted(debian: BootedDebian) -> None:
-    def phase() -> bool:
-        said = debian.shell("rosrv adopt --status --json")
-        return said.startswith("{") and json.loads(said)["phase"] == "taken"
-
-    eventually(phase, debian.story)
-    runs(debian)
 
 
 @pytest.mark.parametrize("suite", ["bookworm", "trixie"])
 def test_a_vendors_robot_is_adopted_and_given_back(suite: str, package: Path, tmp_path: Path) -> None:
     with booted_debian(tmp_path, suite, package) as debian:
-        units = debian.root / "etc/systemd/system"
-        (units / "roscore.service").write_text(ROSCORE)
-        (units / "robot.service").write_text(ROBOT)
+        write_robot(debian, fetch_like())
         debian.boot()
         debian.run("systemctl", "stop", "rosrv")
         debian.run("systemctl", "enable", "--now", "roscore", "robot")
@@ -82,7 +49,9 @@ def test_a_vendors_robot_is_adopted_and_given_back(suite: str, package: Path, tm
         adopted(debian)
         removal = debian.run("dpkg", "--remove", "rosrv")
         runs(debian)
-        assert not list(units.glob("*/50-rosrv-adopt.conf")), f"{removal}\n{debian.story()}"
+        assert not list((debian.root / "etc/systemd/system").glob("*/50-rosrv-adopt.conf")), (
+            f"{removal}\n{debian.story()}"
+        )
         assert "rosrv" not in debian.run("nft", "list", "tables")
 
 
@@ -130,10 +99,9 @@ def the_power_fails_in_the_middle(debian: BootedDebian) -> None:
 
 def settled(debian: BootedDebian) -> None:
     def is_as_wanted() -> bool:
-        wanted = json.loads((debian.root / "var/lib/rosrv/adopt.json").read_text())["wanted"]
-        said = debian.shell("rosrv adopt --status --json")
+        wanted = json.loads(record_of(debian).read_text())["wanted"]
         if wanted:
-            return said.startswith("{") and json.loads(said)["phase"] == "taken"
+            return is_adopted(debian)
         return "nothing is adopted" in debian.shell("rosrv adopt --status") or debian.said().startswith(
             "waits: "
         )

@@ -22,7 +22,7 @@ _PACKAGES = (
     *("ca-certificates", "procps", "python3", "systemd-sysv"),
     *("python3-roslaunch", "python3-rosnode", "python3-rospy", "python3-rostopic", "python3-std-msgs"),
 )
-_BOOT_SECONDS = 300.0
+_BOOT_SECONDS, _END_SECONDS = 300.0, 180.0
 _COMMAND_SECONDS = 600.0
 _INSTALL = """
 set -eu
@@ -91,10 +91,9 @@ class BootedDebian:
             return
         self._nspawn.send_signal(signal.SIGTERM)  # systemd-nspawn powers the container off
         try:
-            self._nspawn.wait(timeout=60)
-        except subprocess.TimeoutExpired:
-            self._nspawn.kill()
-            self._nspawn.wait()
+            self._nspawn.wait(timeout=_END_SECONDS)
+        except subprocess.TimeoutExpired:  # without its leader it ends, and the next boot has the root for itself
+            self.cut_power()
         self._nspawn = None
 
     def cut_power(self) -> None:

@@ -71,9 +71,12 @@ class AdoptWork:
 
     def takes_over(self) -> bool:
         """Return whether an adoption is wanted or not yet undone; then for the rest of this supervisor's life."""
-        record = load_record(self._state)
-        self._took_over = self._took_over or record.wanted or record.phase is not Phase.FREE
+        self._took_over = self._took_over or self.wants()
         return self._took_over
+
+    def wants(self) -> bool:
+        record = load_record(self._state)
+        return record.wanted or record.phase is not Phase.FREE
 
     def holds(self) -> bool:
         """Return whether nodes must not reach their own master, even while the appliance starts again."""

@@ -1,3 +1,4 @@
+import asyncio
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -71,6 +72,23 @@ def test_the_service_holds_until_it_serves_and_at_its_end(
     assert run.served() == ""
     run.put()
     assert hold.calls == ["put", "lift", armed, "put"]
+
+
+@pytest.mark.anyio
+async def test_other_machines_wait_until_the_robots_graph_is_taken_over() -> None:
+    hold, taken = RecordedHold(), asyncio.Event()
+    run = around(hold)
+    run.put()
+    keeping = asyncio.create_task(run.until(taken.is_set))
+    await asyncio.sleep(600)
+    assert hold.calls == ["put"]
+    hold.flushed = True
+    await asyncio.sleep(10)
+    assert hold.calls == ["put", "put"], "the hold is restored meanwhile"
+    taken.set()
+    assert "another program removed the boot hold" in await keeping
+    assert run.served() == await keeping
+    assert hold.calls == ["put", "put", "lift", (11311, "veth-rosrv", None)]
 
 
 @pytest.mark.parametrize(

@@ -183,3 +183,17 @@ def test_a_foreign_master_is_foreign_until_the_graph_is_given_back() -> None:
     assert "user mallory) is not the recorded master" in facts.foreign_master
     free = msgspec.structs.replace(facts, record=msgspec.structs.replace(facts.record, phase=Phase.FREE))
     assert free.foreign_master == ""
+
+
+def test_other_machines_wait_for_a_graph_until_it_is_released(machine: Machine) -> None:
+    work = AdoptWork(machine.state)
+    for phase, wanted, waits in (
+        (Phase.FREE, True, True),
+        (Phase.TAKEN, False, True),
+        (Phase.FREE, False, False),
+    ):
+        machine.begin(phase, wanted=wanted)
+        assert work.takes_over(), "it stays for the life of this supervisor"
+        assert work.wants() is waits
+        settings = IsolationSettings(ports=(PortRange.one(20_000),), master=11311, wants=work.wants)
+        assert Isolation(Namespace.own(), settings).awaits_graph is waits
