@@ -117,6 +117,10 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     dropin.mkdir(parents=True)
     shutil.copyfile(HERE / "strongswan.service.conf", dropin / "rosrv.conf")
     shutil.copyfile(HERE / "debian/rosrv-hold.service", dropin.parent / "rosrv-hold.service")
+    at_python_update = root / "usr/share/python3/runtime.d/rosrv.rtupdate"
+    at_python_update.parent.mkdir(parents=True)
+    shutil.copyfile(HERE / "debian/rosrv.rtupdate", at_python_update)
+    at_python_update.chmod(0o755)
     date = formatdate(moment)
     write_pages(root / "usr/share/man/man1", " ".join(date.split()[1:4]))
     _documentation(root / "usr/share/doc/rosrv")

@@ -92,8 +92,8 @@ class BootedDebian:
         self._nspawn.send_signal(signal.SIGTERM)  # systemd-nspawn powers the container off
         try:
             self._nspawn.wait(timeout=_END_SECONDS)
-        except subprocess.TimeoutExpired:  # without its leader it ends, and the next boot has the root for itself
-            self.cut_power()
+        except subprocess.TimeoutExpired:
+            self.cut_power()  # else its processes run on, beside those of the next boot
         self._nspawn = None
 
     def cut_power(self) -> None:
