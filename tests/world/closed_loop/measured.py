@@ -14,8 +14,8 @@ from tests.world.closed_loop.messages import (
     TWIST_STAMPED,
     Legs,
     odometry,
+    straight,
 )
-from tests.world.closed_loop.streams import straight
 from tests.world.closed_loop.world import NEVER, SLACK, World
 
 KINDS = {

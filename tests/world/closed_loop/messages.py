@@ -124,3 +124,11 @@ def values(kind: str, at: float, numbers: Sequence[float]) -> bytes:
         header(at) + struct.pack("<4d", 0, 0, 0, 1) + covariance + struct.pack("<3d", *numbers[:3]) + covariance
         + struct.pack("<3d", *numbers[3:6]) + covariance
     )  # fmt: skip
+
+
+VELOCITIES = (TWIST, TWIST, TWIST, TWIST_STAMPED, ACKERMANN, ACKERMANN_STAMPED)
+"""The types of commands, `Twist` in half of the worlds."""
+
+
+def straight(speed: float, turning: float = 0.0) -> Legs:
+    return (speed, 0.0, 0.0, 0.0, 0.0, turning)

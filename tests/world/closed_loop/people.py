@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from tests.world.closed_loop.messages import STILL, Legs, boolean
-from tests.world.closed_loop.streams import VELOCITIES, straight
+from tests.world.closed_loop.messages import STILL, VELOCITIES, Legs, boolean, straight
 from tests.world.closed_loop.world import NEVER, SLACK, World
 
 TICK = 20

@@ -1,6 +1,6 @@
 """A world in virtual time: a guard, the nodes around it, the commands that reach the base, and the laws that hold.
 
-The worlds of `motion.py` and `streams.py` say what happens in it; each is one seed.
+`worlds.py` names the world of each preset, which says what happens in it; each is one seed.
 
 The laws are those of the guards' page and of the clauses that it names, not of the presets' texts:
 

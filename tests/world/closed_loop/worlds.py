@@ -7,20 +7,14 @@ from dataclasses import dataclass, field
 
 from tests.support.features.guards.running_guard import Change, unchanged
 from tests.world.closed_loop.arms import JointsWorld
+from tests.world.closed_loop.deadman import DeadmanWorld
+from tests.world.closed_loop.estop import EstopWorld
+from tests.world.closed_loop.evidence import AgreeWorld, ArmWorld, SensorWorld
+from tests.world.closed_loop.limits import RateWorld, SaneWorld, SpeedWorld
 from tests.world.closed_loop.measured import OverspeedWorld, StandstillWorld
 from tests.world.closed_loop.motion import FenceWorld, SeparationWorld
 from tests.world.closed_loop.pairs import SIDES, WITHOUT, paired
 from tests.world.closed_loop.people import EnableWorld, ModeWorld
-from tests.world.closed_loop.streams import (
-    AgreeWorld,
-    ArmWorld,
-    DeadmanWorld,
-    EstopWorld,
-    RateWorld,
-    SaneWorld,
-    SensorWorld,
-    SpeedWorld,
-)
 from tests.world.closed_loop.world import LAWS, Report, World
 from tests.world.closed_loop.zones import ZoneWorld
 

@@ -9,9 +9,8 @@ import numpy as np
 from tests.support.features.guards.running_guard import Value
 from tests.world.closed_loop import geometry
 from tests.world.closed_loop.bases import DIFFERENTIAL, OMNIDIRECTIONAL, STEERED
-from tests.world.closed_loop.messages import SCAN, STILL, Legs, boolean
+from tests.world.closed_loop.messages import SCAN, STILL, Legs, boolean, straight
 from tests.world.closed_loop.motion import WHOLE, Person, SeparationWorld
-from tests.world.closed_loop.streams import straight
 from tests.world.closed_loop.world import NEVER, SLACK, void
 
 MUTED = 2.0
