@@ -13,6 +13,14 @@ import rospy
 from report import init_node, report
 from std_srvs.srv import SetBool
 
+# rospy passes on the first failure to write into a kept connection as it is.
+FAILURES = (
+    rospy.ServiceException,
+    rospy.ROSException,
+    rospy.exceptions.TransportException,
+    rosgraph.MasterException,
+)
+
 
 def main():
     arguments = argparse.ArgumentParser()
@@ -35,7 +43,7 @@ def main():
         try:
             call(True)
             good[0] += 1
-        except (rospy.ServiceException, rospy.ROSException, rosgraph.MasterException) as error:
+        except FAILURES as error:
             bad[0] += 1
             report("failed", reason=f"{type(error).__name__}: {error}")
             call.close()
