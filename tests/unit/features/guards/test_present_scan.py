@@ -51,6 +51,18 @@ def test_the_preset_itself_says_what_a_scan_permits(distance: float, person: flo
     assert found == pytest.approx(formula(distance, person), abs=0.03)
 
 
+def test_a_scan_in_the_other_direction_permits_the_same() -> None:
+    angles = [math.pi - 2 * math.pi / RAYS * place for place in range(RAYS)]
+    ranges = [1 / math.cos(angle) if math.cos(angle) > 0.05 else 25.0 for angle in angles]
+    turned, standing = (
+        permitted("separation", {"person": "0"}, recorded(message(
+            SCAN, angle_min=math.pi, angle_increment=step, range_min=0.05, range_max=30.0, ranges=ranges,
+        )))
+        for step in (-2 * math.pi / RAYS, 0.0)
+    )  # fmt: skip
+    assert turned == pytest.approx(formula(1.0, 0), abs=0.03) and standing == 0
+
+
 def test_a_scan_without_rays_permits_no_motion() -> None:
     data = message(SCAN, angle_min=-3.0, angle_max=3.0, angle_increment=0.1, range_max=9.0, ranges=[])
     assert permitted("separation", {}, recorded(data)) == 0
