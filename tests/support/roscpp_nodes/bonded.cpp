@@ -9,6 +9,7 @@ int main(int argc, char** argv) {
   if (argc < 3) return 2;
   ros::NodeHandle node;
   bond::Bond bond(argv[1], argv[2], [] { report("broken"); }, [] { report("formed"); });
+  bond.setConnectTimeout(120.0);  // the other end may start slowly
   bond.start();
   report_ready();
   ros::spin();

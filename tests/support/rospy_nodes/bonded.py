@@ -4,11 +4,14 @@ import rospy
 from bondpy import bondpy
 from report import init_node, report
 
+CONNECT_SECONDS = 120.0  # the other end may start slowly
+
 
 def main():
     topic, name = rospy.myargv()[1:]
     init_node("bonded")
     bond = bondpy.Bond(topic, name, on_broken=lambda: report("broken"), on_formed=lambda: report("formed"))
+    bond.connect_timeout = CONNECT_SECONDS
     bond.start()
     report("ready", name=rospy.get_name())
     rospy.spin()

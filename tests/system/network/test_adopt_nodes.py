@@ -6,10 +6,8 @@ import itertools
 import json
 import os
 import shutil
-import signal
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,9 +18,8 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import POLICY, URI, Robot, rosrv, until_taken
 from tests.support.appliance import Appliance
-from tests.support.command import ROSRV
 from tests.support.nodes import Client, RosSession, has_ros, nodelet_library, numbers
-from tests.support.processes import LIMIT, Process
+from tests.support.processes import Process
 from tests.support.requirements import need_program, needs
 from tests.support.rosmaster import PlainMaster, call_on
 from tests.support.waiting import eventually
@@ -422,50 +419,3 @@ def twice(listener: Process) -> bool:
     """Return whether a subscriber gets each message twice, now that nothing changes any more."""
     found = numbers(listener.wait_for_count(20, since=listener.mark(), event="received"))
     return len(found) - len(set(found)) > len(found) // 4
-
-
-# --- kills ---
-
-KILLS = (
-    *(("adopt", step, "taken") for step in ("register", "connect", "cut")),
-    *(("release", step, "free") for step in ("silence", "withdraw", "tell")),
-)
-
-
-@pytest.mark.parametrize("zoo", ["bonds"], indirect=True)
-def test_kills_of_control_in_the_middle_break_no_bond(zoo: Zoo, appliance: Appliance) -> None:
-    """The relay, the rules and the supervisor stay, and the next control goes on as ordered."""
-    graph, lives = zoo.graph(), zoo.lives()
-    appliance.start()
-    for order, step, end in KILLS:
-        if state_of(zoo, appliance) == end:
-            rosrv(zoo, appliance, "release" if order == "adopt" else "adopt")
-        pid, before = appliance.pids("control")[0], steps(appliance, step)
-        with zoo.host.popen(
-            [ROSRV, order, "--state", str(appliance.state)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        ) as ordered:
-            eventually(lambda: steps(appliance, step) > before, appliance.story)  # noqa: B023  called at once
-            os.kill(pid, signal.SIGKILL)
-            ordered.wait(4 * LIMIT)
-        eventually(lambda: state_of(zoo, appliance) == end, appliance.story)  # noqa: B023  called at once
-        zoo.goes_on()
-        assert zoo.graph() == graph, (order, step)
-    assert zoo.lives() == lives
-    print(zoo.figures())  # noqa: T201  shown by pytest -s
-
-
-def steps(appliance: Appliance, step: str) -> int:
-    assert appliance.process is not None
-    return sum(f'"step": "{step}", "event": "adoption"' in line for line in [*appliance.process.errors])
-
-
-def state_of(zoo: Zoo, appliance: Appliance) -> str:
-    """Return the phase, once nothing is under way; empty before that."""
-    answer = rosrv(zoo, appliance, "adopt", "--status", "--json", check=False)
-    with suppress(ValueError):
-        found = json.loads(answer)
-        if found["wanted"] == (found["phase"] == "taken") and found["phase"] in {"taken", "free"}:
-            return str(found["phase"])
-    return ""
