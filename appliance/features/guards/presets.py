@@ -187,11 +187,7 @@ class Guard:
 
 
 def unknown_guard(name: str, guards: Collection[str]) -> str:
-    known = (
-        f"the guards are: {', '.join(guards)}"
-        if guards
-        else "none is loaded: rosrv guard suggest proposes some"
-    )
+    known = f"the guards are: {', '.join(guards)}" if guards else "none is loaded: see rosrv guard suggest"
     return f"no guard is named {name[:80]}{meant(name, guards)}; {known}"
 
 

@@ -343,7 +343,8 @@ class SeparationWorld(DrivenWorld):
                 found = np.full_like(found, np.nan)
                 found[self.random.randrange(len(found))] = np.inf
             case "no range":
-                low, high, found = 0.0, 0.0, np.full_like(found, 0.0)
+                low, high = 0.0, self.random.choice((0.0, math.inf))
+                found = np.full_like(found, high)
             case "empty":
                 found = found[:0]
             case "no step":
