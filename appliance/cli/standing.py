@@ -24,7 +24,6 @@ from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import usage_error
-from appliance.configuration.settings import load_resolved
 from appliance.network.interfaces import addresses_by_interface
 from appliance.network.namespaces import Namespace
 from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph, MasterReader, MasterReadError
@@ -143,6 +142,8 @@ def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
 
 def _master_of(state: Path) -> tuple[str, str]:
     """Return the URI of RVMaster, and an address of this machine that the robot's nodes reach."""
+    from appliance.configuration.settings import load_resolved  # noqa: PLC0415  pydantic, in each verb with --when-standing
+
     try:
         settings = load_resolved(state / "run" / "config.json")
     except (OSError, ValueError) as error:
