@@ -547,7 +547,7 @@ class AdoptOperation:
 
         Before, it gets this list beside the appliance's, and keeps its connections until the new ones stand. A node
         that does not connect gets its list again: roscpp gives a publisher up after one failed call. A host that does
-        not answer delays only its own nodes, and the whole only for some seconds.
+        not answer delays only its own nodes, and the whole by less than 9 seconds.
         """
         lists = lists_of(graph)
         rows = [
@@ -564,10 +564,11 @@ class AdoptOperation:
             await send_lists(self.call, both, _BESIDES_SECONDS)
             await until_connected(self.call, rows_of(lists, rows))
         last = {(node, topic): lists.get(topic, []) for node, topic in rows}
-        failed = await send_lists(self.call, last, LAST_WORD_SECONDS)
+        until = clock.now() + LAST_WORD_SECONDS
+        failed = await send_lists(self.call, last, _LISTS_SECONDS)
         for _ in range(_REMINDERS):
             missing = await until_connected(self.call, rows_of(lists, rows))
-            if not missing:
+            if not missing or clock.now() >= until:
                 break
             await send_lists(self.call, {row: last[row] for row in missing}, _BESIDES_SECONDS)
         return failed
