@@ -132,6 +132,7 @@ CALLS = {
     "monitors": of(), "monitor": of(name="censor"), "monitor_history": of(name="censor"),
     "monitor_picture": of(name="censor"), "set_monitor": of(name="censor"),
     "load_monitors": of(confirm_within=300), "confirm_monitors": of(),
+    "monitor_values": of(name="censor"),
     "monitor_revisions": of(), "monitor_revision": of(revision=2), "switch_monitor": of(name="censor"),
     "switch_monitors": of(), "replace_monitor": of(name="censor"), "remove_monitor": of(name="censor"),
     "roll_back_monitors": of(), "remove_monitors": of(name=["censor"]), "reload_monitors": of(),

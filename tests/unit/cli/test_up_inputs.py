@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.cli.up_inputs import read_node_ports
+from appliance.cli.up_inputs import read_inputs, read_node_ports
 from appliance.configuration.settings import Settings
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.store.state_file import RevisionRow, StateStore
@@ -72,8 +72,8 @@ def test_a_first_start_needs_a_valid_policy(settings: Settings) -> None:
     with pytest.raises(StartError, match=r"policy\.ini\.tests\.yaml:2:"):
         read_node_ports(settings)
     settings.policy.unlink()
-    with pytest.raises(StartError, match="nothing was started"):
-        read_node_ports(settings)
+    with pytest.raises(StartError, match=r"cannot be read.*nothing was started"):
+        read_inputs(settings)
 
 
 def test_an_unknown_state_is_left_to_rvmaster(settings: Settings) -> None:

@@ -49,6 +49,7 @@ AT_ONCE = {
     "monitor try": _READS,
     "guard try": _READS,
     "topic look": _READS,
+    "monitor values": _READS,
     "sso list": _READS,
     "token list": _READS,
     "host kit": _READS,

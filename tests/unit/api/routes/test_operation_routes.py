@@ -30,7 +30,7 @@ from tests.support.rest_world import ROLES, RestWorld, idle_application
 from tests.support.rows import require_rows
 
 FILES = {"a.rv": "text"}
-FIELDS = {"id": "a" * 20, "revision": 3, "topic": "/scan"}
+FIELDS = {"id": "a" * 20, "revision": 3, "topic": "/scan", "name": "zone"}
 REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/policy", "[Nodes]\n"),
     ("POST", "/v1/policy?confirm_within=2.5", {"text": "[Nodes]\n", "note": "ticket"}),
@@ -68,7 +68,6 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("PATCH", "/v1/monitors", {"names": ["a", "b"], "enabled": True}),
     ("PATCH", "/v1/monitors", {"names": ["a"], "held": False}),
     ("PATCH", "/v1/monitors/a/given", {"values": {"vMax": 0.3}}),
-    ("GET", "/v1/monitors/a/values", None),
     ("POST", "/v1/guards", {"preset": "speed", "topics": {"command": "/cmd_vel"}}),
     ("POST", "/v1/guards?confirm_within=9&hold=1", {"preset": "fence", "topics": {"command": "/a", "by": "/odom"},
                                                     "values": {"margin": "1"}, "name": "yard", "shadow": True}),

@@ -164,7 +164,7 @@ def test_a_file_without_checkpoints_is_an_error(tmp_path: Path, text: str) -> No
     file.write_text(text)
     with pytest.raises(CopiesUnreadableError, match="kept: no checkpoint"):
         read_copies(file)
-    with pytest.raises(CopiesUnreadableError, match="nowhere: No such file"):
+    with pytest.raises(CopiesUnreadableError, match="nowhere cannot be read: No such file"):
         read_copies(tmp_path / "nowhere")
 
 

@@ -422,7 +422,7 @@ def test_a_key_of_another_kind_is_an_error(tmp_path: Path, curve: str) -> None:
 
 
 def test_a_missing_key_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(KeyUnreadableError, match=r"gone\.pem: No such file or directory$"):
+    with pytest.raises(KeyUnreadableError, match=r"gone\.pem cannot be read: No such file or directory$"):
         read_public_key(tmp_path / "gone.pem")
 
 

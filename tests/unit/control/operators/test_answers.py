@@ -37,6 +37,7 @@ OPEN = {
     ("MachineWorkWanted", "terms"),
     ("MachineWorkDone", "found"),
     ("MessageSeen", "fields"),  # a message of any type
+    ("MonitorReadout", "values"),  # variables of any type
 }
 OPEN_OF_FEATURES = {("TopicMessage", "fields")}
 

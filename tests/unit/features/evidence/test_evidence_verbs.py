@@ -33,4 +33,4 @@ def test_a_bundle_gets_its_name_when_complete(
     if not breaks:
         assert (place.read_bytes(), stat.S_IMODE(place.stat().st_mode)) == (b"halfwhole", 0o600)
         again = rosrv(*order)
-        assert (again.returncode, again.stderr) == (2, f"rosrv: {place}: File exists\n")
+        assert (again.returncode, again.stderr) == (2, f"rosrv: {place}: File exists; name a new file\n")

@@ -22,7 +22,8 @@ class Log:
         self.searches = 0
         self.machine = VirtualClock()
 
-    def audit(self) -> "Log":
+    @property
+    def way(self) -> "Log":
         return self
 
     def last(self) -> int:
@@ -44,6 +45,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
     monkeypatch.setattr(selftest_running, "time", SimpleNamespace(sleep=log.machine.advance))
     monkeypatch.setattr(selftest_running, "secrets", SimpleNamespace(token_hex=lambda _bytes: "00c0ffee"))
     monkeypatch.setattr(selftest_running, "call", lambda *_arguments: None)
+    monkeypatch.setattr(selftest_running, "audit_of", lambda way: way)
     with using(log.machine):
         yield log
 

@@ -30,6 +30,7 @@ TWINS = {
     "supervisor/roles.py:require_programs": {"programs"},
     "features/standby/pairing.py:pairing_in": {"pair"},
     "features/recorder/rings.py:__init__": "reviewed: the free memory differs at each start",
+    "cli/up_inputs.py:read_inputs": {"policy"},
     "cli/up_inputs.py:read_node_ports": {"policy"},
     "cli/up_inputs.py:_require_specifications": {"monitors"},
     "cli/up.py:_keep_token": {"state", "space"},
