@@ -397,6 +397,23 @@ def test_a_base_retreats_from_a_near_wall_in_any_direction(away: float) -> None:
     assert guard.drive(back, at)[:3] == (0, 0, 0)
 
 
+def test_the_old_way_counts_until_a_fast_base_has_turned() -> None:
+    """At 1.5 m/s the base drifts on for metres, between both ways, where a post stands beside each of them."""
+    guard = Guarded("separation", person=0, braking=0.5)
+    post = [2.0 if abs(angle - 0.58) < 0.05 else math.inf for angle in rays()]
+    at = seen(guard, post)
+    for direction, passes in ((0.0, True), (1.16, False)):
+        legs = twist(1.5 * math.cos(direction), 1.5 * math.sin(direction))
+        for _ in range(3):
+            guard.drive(legs, at)
+            at = seen(guard, post, at + 100, 1)
+        assert (math.hypot(*guard.drive(legs, at)[:2]) == pytest.approx(1.5)) is passes
+    for _ in range(40):
+        at = seen(guard, post, at + 100, 1)
+        got = guard.drive(legs, at)
+    assert math.hypot(*got[:2]) == pytest.approx(1.5)
+
+
 def test_a_corridor_of_one_and_a_half_metres_can_be_driven() -> None:
     guard = Guarded("separation")
     corridor = [min(a, b) for a, b in zip(wall(0.75, math.pi / 2), wall(0.75, -math.pi / 2), strict=True)]
@@ -439,7 +456,7 @@ def test_directions_without_rays_count_as_near(start: float, step: float, count:
     assert guard.drive(twist(1.0), 900)[0] == 0
 
 
-@pytest.mark.parametrize("far", [0.0, -1.0, math.nan])
+@pytest.mark.parametrize("far", [0.0, -1.0, math.nan, math.inf])
 def test_nothing_in_a_range_of_nothing_is_not_free(far: float) -> None:
     guard = Guarded("separation")
     guard.tell("by", message("sensor_msgs/LaserScan", angle_min=-math.pi, angle_increment=math.pi / 36, range_min=0.1,

@@ -253,7 +253,14 @@ def test_a_scan_that_does_not_see_the_zone_stops(ranges: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [scan(FREE, far=0.0), scan(FREE, far=0.5), scan(FREE, start=math.nan), scan(FREE, step=0.0)]
+    "data",
+    [
+        scan(FREE, far=0.0),
+        scan(FREE, far=0.5),
+        scan([math.inf] * len(FREE), far=math.inf),
+        scan(FREE, start=math.nan),
+        scan(FREE, step=0.0),
+    ],
 )
 def test_a_scan_with_a_wrong_head_stops(data: bytes) -> None:
     guard = clear_zone()
