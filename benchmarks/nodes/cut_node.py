@@ -16,7 +16,7 @@ import time
 import rospy
 from geometry_msgs.msg import Twist
 
-PERIOD, COMMANDS, PATIENCE = 0.02, 5, 5.0
+PERIOD, COMMANDS, PATIENCE = 0.02, 20, 5.0  # the guard lets a motion pass after 0.2 s of commands
 ARRIVED = struct.Struct("dd")
 NAMES = [word for word in sys.argv if word.startswith("__")]
 
@@ -41,15 +41,14 @@ def next_of(arrivals, speed):
 
 def cut(publisher, arrivals, number, silent, pause):
     command = Twist()
-    command.linear.x = 1.0 + number
     for place in range(COMMANDS):
         if place:
             pause.wait(PERIOD)
+        command.linear.x = 1.0 + number + place / 128
         last = time.monotonic()
         publisher.publish(command)
-    for _command in range(COMMANDS):
-        if next_of(arrivals, command.linear.x) is None:
-            return None
+    if next_of(arrivals, command.linear.x) is None:
+        return None
     stopped = next_of(arrivals, 0.0)
     return None if stopped is None else (stopped - last - silent) * 1e3
 
