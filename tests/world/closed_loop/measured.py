@@ -258,7 +258,7 @@ class StandstillWorld(MeasuredWorld):
                 self.broken("L6", "a motion passes of a base that has not stood since it escaped")
             if (why := self.unknown(SLACK)) and self.now > self.fresh_from:
                 self.broken(self.law(), f"a motion passes, and {why}")
-        if self.unknown():
+        if self.unknown() and not self.guard.holds:  # a guard that holds does not see the command
             self.waits = True
         if not self.moves(wanted) and self.stands and not self.unknown() and not self.guard.holds:
             self.waits = False
