@@ -48,8 +48,10 @@ class EvidenceWorld(World):
         self.drive(straight(self.steady) if self.random.random() > 0.03 else STILL)
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
-        if got is not None and self.moves(got) and (why := self.fit()):
-            self.broken(self.law(), f"a motion passes: {why}")
+        if got is not None and self.moves(got):
+            if why := self.fit():
+                self.broken(self.law(), f"a motion passes: {why}")
+            self.unfit_from = NEVER  # it was fit between two looks
         if self.fit_since != NEVER and self.now > self.fit_since and self.moves(wanted):
             self.sent += 1
             self.got += got == wanted
