@@ -210,7 +210,7 @@ def run_limited(
 
 
 def measure(name: str) -> tuple[list[str], str]:
-    """Run a program of `MEASUREMENTS`; return its findings, and why there are none."""
+    """Run a program of `MEASUREMENTS`. Return its findings, or the reason why it has none."""
     status = run_limited([sys.executable, "-m", *MEASUREMENTS[name]], _log_of(name), _STAGE_SECONDS)
     if status is None:
         return [], _late()

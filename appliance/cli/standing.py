@@ -126,7 +126,7 @@ class StandingJudge:
 
 
 def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
-    """Wait until the robot of this machine's appliance stands, and print how that is known; exit with 1 otherwise."""
+    """Wait until this machine's robot stands still, and print the evidence. Exit with status 1 if it does not."""
     if not isinstance(appliance.way, AdminSocket):
         raise usage_error(
             "--when-standing listens to the robot's topics: run it on the appliance's machine", verb

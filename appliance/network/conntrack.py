@@ -16,7 +16,7 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 def forget(namespace: Namespace, ports: Iterable[int]) -> int:
     """Delete the entries of the namespace's own addresses; return their number. Raises `NetworkError`."""
-    pyroute2 = netlink.library()
+    pyroute2 = netlink.loaded()
     own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
     try:
         return namespace.run(
@@ -27,7 +27,7 @@ def forget(namespace: Namespace, ports: Iterable[int]) -> int:
 
 
 def _forget(family: int, port: int, own: set[str]) -> int:
-    pyroute2 = netlink.library()
+    pyroute2 = netlink.loaded()
     tuples = pyroute2.netlink.nfnetlink.nfctsocket.NFCTAttrTuple
     wanted = tuples(family=family, proto=socket.IPPROTO_UDP, dport=port)
     deleted = 0

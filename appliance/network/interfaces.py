@@ -233,7 +233,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    pyroute2 = netlink.library()
+    pyroute2 = netlink.loaded()
 
     def inside() -> T:
         with pyroute2.IPRoute() as route:

@@ -3,7 +3,7 @@
 from types import ModuleType
 
 
-def library() -> ModuleType:
+def loaded() -> ModuleType:
     import pyroute2  # noqa: PLC0415  see the head
 
     module: ModuleType = pyroute2

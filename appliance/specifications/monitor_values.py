@@ -58,7 +58,7 @@ class MonitorValues:
         return MonitorReadout(monitor, kept.seen.values or {}, ages, age, why)
 
     async def _ask(self, monitor: str) -> str:
-        """Ask the relay, or wait for the answer to a reader who has; return why there is none."""
+        """Ask the relay, or join a query that waits for its answer. Return why there is no answer, or an empty text."""
         if monitor not in self._asked:
             self._number += 1
             if not self._tell(monitor, ValuesWanted(self._number, monitor)):

@@ -108,7 +108,7 @@ def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Sc
     try:
         with recorded(appliance, _SINCE, None, types) as spans:
             return last_messages(spans, types, MOST_SCANS), ""
-    except typer.Exit:  # the recorder is off, does not record the topic, or cannot be read, and this was said
+    except typer.Exit:  # no recording of the topic; the reason has been printed
         return {}, "the flight recorder has no scan"
 
 

@@ -398,7 +398,7 @@ def test_a_base_retreats_from_a_near_wall_in_any_direction(away: float) -> None:
 
 
 def test_the_old_way_counts_until_a_fast_base_has_turned() -> None:
-    """At 1.5 m/s the base drifts on for metres, between both ways, where a post stands beside each of them."""
+    """A base at 1.5 m/s drifts for metres between the two ways. A post there is beside each of them."""
     guard = Guarded("separation", person=0, braking=0.5)
     post = [2.0 if abs(angle - 0.58) < 0.05 else math.inf for angle in rays()]
     at = seen(guard, post)
