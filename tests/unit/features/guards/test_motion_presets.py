@@ -103,6 +103,20 @@ def test_a_deadman_stops_within_its_time_and_a_tick(gap: int) -> None:
     assert first <= 20 + gap + 300 + 10 and second == first + 100
 
 
+@pytest.mark.parametrize("gap", [300, 301, 309])
+def test_a_node_that_returns_before_the_tick_has_been_silent(gap: int) -> None:
+    """Also while another node drives the base."""
+    guard = Guarded("deadman")
+    last = 520
+    for at in range(20, last + gap, 20):
+        guard.drive(twist(0.5), at, "/a")
+        if at <= last:
+            guard.drive(twist(0.4), at, "/b")
+    guard.got.clear()
+    guard.drive(twist(0.4), last + gap, "/b")
+    assert any(data == STILL for _at, data in guard.got) == (gap > 300)
+
+
 def limited(wanted: list[float], last: list[float], most: float, growth: float) -> list[float]:
     norm = math.sqrt(sum(leg * leg for leg in wanted))
     along = sum(a * b for a, b in zip(wanted, last, strict=True)) / norm if norm > 0 else 0.0
