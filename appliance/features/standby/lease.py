@@ -217,14 +217,9 @@ class ApplianceLease:
         """Return the due messages. `waiting_since` is the time of the oldest change that waits for the standby."""
         if now < self._next_round:
             return self._remove(now, waiting_since)
-        self._next_round = now + RENEW_SECONDS
         if self.held is None:
-            if now >= self._promised_until and self.ready:
-                self._next_round = now + CLAIM_SECONDS
-                return (self._to_witness("claim", now),)
-            if now < self._promised_until:
-                self._next_round = min(self._next_round, self._promised_until)
-            return (self._to_witness("look", now),)
+            return (self._claim_or_look(now),)
+        self._next_round = now + RENEW_SECONDS
         if self._switching_until is not None:
             if now < self._switching_until:
                 expired = self._released or now - self._witnessed_at > EXPIRY
@@ -241,6 +236,14 @@ class ApplianceLease:
                 due.append(self._to_witness("add", now))
                 self._last_add = self._sequence
         return due
+
+    def _claim_or_look(self, now: float) -> WitnessRequest:
+        """Return the request of an appliance that holds no epoch: a claim if it may be active, and has not promised."""
+        if now < self._promised_until:
+            self._next_round = min(now + RENEW_SECONDS, self._promised_until)
+            return self._to_witness("look", now)
+        self._next_round = now + (CLAIM_SECONDS if self.ready else RENEW_SECONDS)
+        return self._to_witness("claim" if self.ready else "look", now)
 
     def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
         self.refusal, self._trouble = "", answer.trouble
@@ -320,9 +323,9 @@ class ApplianceLease:
                     and promised.number <= number
                     and epoch == self.epoch
                 ):
-                    self._promised_until = self._next_round = now
+                    self._promised_until = now
                     self._promised_to = None
-                    return self.tick(now, waiting_since=None, caught_up=False)
+                    return (self._claim_or_look(now),)
         return ()
 
     def switch_over(self, now: float) -> Outgoing:

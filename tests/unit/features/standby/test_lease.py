@@ -268,6 +268,8 @@ def test_it_waits_for_the_standby_before_it_is_added() -> None:
     old = lease.request("renew")
     lease.answered(old, in_sync=ALONE)
     assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.later(0.3).operations(caught_up=False) == ["renew"]
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
     assert lease.later(0.3).operations(caught_up=True) == ["renew", "add"]
     lease.answered(old, in_sync=ALONE)
     assert not lease.lease.may_answer(lease.now, acknowledged=False)

@@ -241,6 +241,34 @@ def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.Mo
         asyncio.run(story())
 
 
+def test_a_report_under_an_earlier_permission_adds_no_standby(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The standby had all data before the removal; control answers without it as soon as it hears of the removal."""
+    machine = VirtualClock()
+    caught_up = ("back", "all to lease")
+
+    async def story() -> None:
+        await run(pair, ["connect", "change", *caught_up, *["settle"] * 8, "change"])
+        assert pair.in_sync() == {"a", "b"} and pair.answered == 1
+        for step in ("report", "all to lease", *["time"] * 3, *caught_up):
+            pair.step(step)
+        await pair.turn()
+        for step in ("witness", "answer") * 8:
+            pair.step(step)
+        assert pair.in_sync() == {"a"}, "the removal was on its way"
+        for step in ("time", *("witness", "answer") * 8):
+            pair.step(step)
+        assert pair.in_sync() == {"a"}
+        for step in ["settle", *caught_up] * 3:
+            pair.step(step)
+            await pair.turn()
+        assert pair.in_sync() == {"a", "b"}
+
+    with clock.using(machine), contextlib.closing(Pair(tmp_path, monkeypatch, machine)) as pair:
+        asyncio.run(story())
+
+
 def test_a_standby_has_the_time_that_a_large_value_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
