@@ -3,6 +3,7 @@
 @settings(max_examples=examples(400))
 """
 
+import datetime
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
@@ -27,3 +28,13 @@ def covering(rows: Iterable[tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
         if ALL or not seen.issuperset(enumerate(row)):
             seen.update(enumerate(row))
             yield row
+
+
+def seeds_of_night(number: int) -> range:
+    """Return seeds that no other day has, so that each night tries new cases.
+
+    `TESTS_DAY=2026-11-28` repeats those of a day. The seeds of the gate are fixed, and below those of any night.
+    """
+    day = os.environ.get("TESTS_DAY") or datetime.datetime.now(datetime.UTC).date().isoformat()
+    first = datetime.date.fromisoformat(day).toordinal() * number
+    return range(first, first + number)

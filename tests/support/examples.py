@@ -3,6 +3,6 @@
 With `CI=true` Hypothesis derives the seed from the test; otherwise each run has a new seed.
 """
 
-from rosmop.tests.examples import ALL, covering, examples, sample
+from rosmop.tests.examples import ALL, covering, examples, sample, seeds_of_night
 
-__all__ = ["ALL", "covering", "examples", "sample"]
+__all__ = ["ALL", "covering", "examples", "sample", "seeds_of_night"]

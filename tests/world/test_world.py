@@ -1,28 +1,43 @@
 import pytest
 
-from tests.support.examples import ALL
+from tests.support.examples import seeds_of_night
 from tests.world.mutants import MUTANTS, NOT_SEEN, PAIR_MUTANTS, first_broken
 from tests.world.pair import PairWorld
 from tests.world.world import World, run
 
-_SEEDS, _PAIR_SEEDS = (3000, 500) if ALL else (100, 10)
+_AT_GATE, _PAIRS_AT_GATE = 100, 10
+_AT_NIGHT, _PAIRS_AT_NIGHT = 1500, 250
 _IN_ONE_CASE = 10
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("first", range(0, _SEEDS, _IN_ONE_CASE))
+@pytest.mark.parametrize("first", range(0, _AT_GATE, _IN_ONE_CASE))
 def test_no_history_of_an_appliance_breaks_a_promise(first: int) -> None:
-    _run(first, World, "")
+    _run(range(first, first + _IN_ONE_CASE), World, "")
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("first", range(0, _PAIR_SEEDS, _IN_ONE_CASE))
+@pytest.mark.parametrize("first", range(0, _PAIRS_AT_GATE, _IN_ONE_CASE))
 def test_no_history_of_two_appliances_breaks_a_promise(first: int) -> None:
-    _run(first, PairWorld, "--pair ")
+    _run(range(first, first + _IN_ONE_CASE), PairWorld, "--pair ")
 
 
-def _run(first: int, kind: type[World], option: str) -> None:
-    for seed in range(first, first + _IN_ONE_CASE):
+@pytest.mark.nightly
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("case", range(_AT_NIGHT // _IN_ONE_CASE))
+def test_no_history_of_a_night_breaks_a_promise(case: int) -> None:
+    _run(seeds_of_night(_AT_NIGHT)[case * _IN_ONE_CASE :][:_IN_ONE_CASE], World, "")
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("case", range(_PAIRS_AT_NIGHT // _IN_ONE_CASE))
+def test_no_history_of_two_appliances_of_a_night_breaks_a_promise(case: int) -> None:
+    _run(seeds_of_night(_PAIRS_AT_NIGHT)[case * _IN_ONE_CASE :][:_IN_ONE_CASE], PairWorld, "--pair ")
+
+
+def _run(seeds: range, kind: type[World], option: str) -> None:
+    for seed in seeds:
         try:
             run(seed, kind=kind)
         except AssertionError as error:

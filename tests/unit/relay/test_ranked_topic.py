@@ -14,6 +14,7 @@ from appliance.relay.ranked_topic import (
     RankDriver,
     RankedTopic,
 )
+from tests.support.examples import seeds_of_night
 
 FREE = 0.3
 STEP = 0.01
@@ -378,18 +379,25 @@ class Schedule:
             relay.expire(now)
 
 
-@pytest.mark.parametrize(
-    "number", [60, pytest.param(100_000, marks=[pytest.mark.nightly, pytest.mark.timeout(3600)])]
-)
-def test_schedules(number: int) -> None:
+def test_schedules() -> None:
     """Never two are heard, rank 0 passes at once, nothing older than a hand-back, nothing after a loss."""
+    run_schedules(range(60))
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(3600)
+def test_schedules_of_a_night() -> None:
+    run_schedules(seeds_of_night(10_000))
+
+
+def run_schedules(seeds: range) -> None:
     passed = handed_over = 0
-    for seed in range(number):
+    for seed in seeds:
         try:
             oracle = Schedule(seed).run(12.0)
         except AssertionError as error:
             error.add_note(f"in the schedule {seed}")
             raise
         passed, handed_over = passed + oracle.passed, handed_over + oracle.handed_over
-    assert passed > 50 * number
-    assert handed_over > 2 * number
+    assert passed > 50 * len(seeds)
+    assert handed_over > 2 * len(seeds)

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import pytest
 
+from tests.support.examples import seeds_of_night
 from tests.unit.features.guards import evidence_oracles, limit_oracles, oracles, place_oracles
 
 AT_GATE = 15
-AT_NIGHT = 10_000
+AT_NIGHT = 2000
 ORACLES: tuple[Callable[[int], None], ...] = (
     oracles.watchdog, oracles.enabling_device, oracles.stop_button, oracles.two_hands, oracles.operating_mode,
     limit_oracles.speed_by_norm, limit_oracles.acceleration, limit_oracles.jerk, limit_oracles.finite_values,
@@ -27,8 +28,12 @@ def test_a_guard_does_what_its_page_says(oracle: Callable[[int], None]) -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("oracle", ORACLES)
 def test_a_guard_does_what_its_page_says_at_night(oracle: Callable[[int], None]) -> None:
-    for seed in range(1000, 1000 + AT_NIGHT):
-        oracle(seed)
+    for seed in seeds_of_night(AT_NIGHT):
+        try:
+            oracle(seed)
+        except AssertionError as error:
+            error.add_note(f"in the trace {seed}")
+            raise
 
 
 def test_a_guard_of_another_number_is_found() -> None:
