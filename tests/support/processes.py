@@ -115,9 +115,11 @@ class Process:
 
         return said(self.wait_for(lambda event: text in said(event), timeout=timeout, since=since))
 
-    def wait_for_error(self, text: str, *, timeout: float = LIMIT) -> None:
+    def wait_for_error(self, text: str, *, count: int = 1, timeout: float = LIMIT) -> None:
         with self._changed:
-            there = self._changed.wait_for(lambda: any(text in line for line in self.errors), timeout)
+            there = self._changed.wait_for(
+                lambda: sum(text in line for line in self.errors) >= count, timeout
+            )
         assert there, f"it did not print {text!r} within {timeout:.0f} s\n{self.story()}"
 
     def wait_for_count(

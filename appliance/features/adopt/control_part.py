@@ -18,7 +18,7 @@ from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus, ReleaseOrder
-from appliance.features.adopt.takeover import AdoptError, AdoptOperation
+from appliance.features.adopt.takeover import AdoptError, AdoptOperation, LeftThere
 from appliance.master.calls.call import Caller
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.graph.registry import Life
@@ -46,6 +46,7 @@ class AdoptMemory(msgspec.Struct):
     nodes: list[str] = []
     denied: list[tuple[Entry, str]] = []
     missing: dict[str, str] = {}
+    parameters: set[str] = set()
 
 
 async def begin(core: Core) -> ControlPart:
@@ -107,7 +108,6 @@ class AdoptPart:
         self._facts: MachineFacts | None = None
         self._obstacle = ""
         self._settled = False
-        self._missing: dict[str, str] = {}
 
     # --- at the start, and while the appliance runs ---
 
@@ -147,7 +147,6 @@ class AdoptPart:
 
     def _taken(self, report: TakeOverReport) -> None:
         self._settled = True
-        self._missing = report.missing
         self._save()
         log.info("the robot's graph is adopted", nodes=report.nodes, seconds=report.seconds)
 
@@ -157,7 +156,7 @@ class AdoptPart:
         return report
 
     def _given(self) -> None:
-        self._settled, self._missing = False, {}
+        self._settled = False
         self._save()
 
     async def before_end(self) -> None:
@@ -220,7 +219,7 @@ class AdoptPart:
             nodes=len(self._graph.nodes()),
             not_started=sum(node.life is Life.LIVE for node in unasked),
             denied={" ".join(entry): why for entry, why in sorted(self._graph.denied.items())},
-            missing=self._missing,
+            missing=self._operation.left.nodes,
         )
 
     # --- what the operation uses ---
@@ -249,7 +248,7 @@ class AdoptPart:
     def _remember(self) -> None:
         """Restore what an earlier control knew, now that the registry is restored."""
         memory = _memory(self._core.store)
-        self._missing = memory.missing
+        self._operation.left = LeftThere(memory.missing, memory.parameters)
         self._graph.denied.update(memory.denied)
         registry = self._registrar.registry
         self._graph.subscribers.unasked.update(filter(None, map(registry.by_key, memory.nodes)))
@@ -258,7 +257,8 @@ class AdoptPart:
         memory = AdoptMemory(
             sorted(node.key for node in self._graph.subscribers.unasked),
             list(self._graph.denied.items()),
-            self._missing,
+            self._operation.left.nodes,
+            self._operation.left.parameters,
         )
         self._core.store.save_setting(_SETTING, msgspec.json.encode(memory).decode())
 
@@ -272,16 +272,16 @@ class ParameterOrders:
     def tree(self) -> Mapping[str, Value]:
         return self._calls.mirror.tree
 
-    async def take(self, values: Mapping[str, Value]) -> list[str]:
+    async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
         host = address_of(self._link())
         caller = Caller(Peer(host, str(host), str(host)), "/rosrv", clock.now_ns())
         writes = [ParameterWrite(caller, f"/{name}", value) for name, value in values.items()]
         outcomes = await self._calls.write(writes)
-        return [
-            f"parameter {write.key}: {outcome}"
-            for write, outcome in zip(writes, outcomes, strict=True)
+        return {
+            name: str(outcome)
+            for name, outcome in zip(values, outcomes, strict=True)
             if isinstance(outcome, Exception)
-        ]
+        }
 
 
 def _memory(store: StateStore) -> AdoptMemory:

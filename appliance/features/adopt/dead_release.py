@@ -164,7 +164,7 @@ class _StoredParameters:
     def tree(self) -> Mapping[str, Value]:
         return self._tree
 
-    async def take(self, _values: Mapping[str, Value]) -> list[str]:
+    async def take(self, _values: Mapping[str, Value]) -> dict[str, str]:
         raise AdoptError("no appliance runs")
 
 

@@ -67,6 +67,7 @@ class AdoptedGraph:
     async def register(self, entry: Entry, place: NodePlace, graph: MasterGraph) -> bool:
         """Register for a node; return whether that was allowed. A registration that exists is left as it is."""
         if self.has(entry, place):
+            self._note_unasked(entry, place)  # a kill may have come before that was stored
             return True
         kind, resource, name = entry
         detail: Value = (
@@ -77,15 +78,18 @@ class AdoptedGraph:
             self.denied[entry] = printable(str(answer[1]))
             return False
         self.denied.pop(entry, None)
-        node = self.node_at(name, place)
-        if node is not None:
-            self.subscribers.unasked.add(node)
+        self._note_unasked(entry, place)
         self.trail.happened(
             "adopted",
             f"{name} was registered for {resource} by an operator's order",
             host=str(place.host), caller_id=name, category=kind, resource=resource,
         )  # fmt: skip
         return True
+
+    def _note_unasked(self, entry: Entry, place: NodePlace) -> None:
+        node = self.node_at(entry[2], place)
+        if node is not None:
+            self.subscribers.unasked.add(node)
 
     async def unregister(self, entry: Entry, place: NodePlace, graph: MasterGraph) -> None:
         kind, resource, name = entry

@@ -33,24 +33,25 @@ def lists_of(graph: MasterGraph) -> dict[str, list[str]]:
     return lists
 
 
-async def send_lists(call: NodeCaller, lists: Mapping[Subscription, list[str]], seconds: float) -> list[str]:
-    """Send each list; return the names of the nodes that did not take it in that time.
+async def send_lists(call: NodeCaller, seconds: float, *lists: Mapping[Subscription, list[str]]) -> list[str]:
+    """Send each subscriber its lists in this order; return the names of the nodes that did not take them in that time.
 
     A host that does not answer delays only its own nodes.
     """
     failed: set[str] = set()
     turns: dict[Address, asyncio.Semaphore] = {}
 
-    async def tell(node: Incarnation, topic: str, uris: list[str]) -> None:
+    async def tell(node: Incarnation, topic: str) -> None:
         async with turns.setdefault(node.host, asyncio.Semaphore(_AT_ONCE_OF_HOST)):
-            if node.name in failed:
-                return
-            try:
-                await call(node.call_uri, "publisherUpdate", topic, [*uris])
-            except CallFailedError:
-                failed.add(node.name)
+            for one in lists:
+                if node.name in failed:
+                    return
+                try:
+                    await call(node.call_uri, "publisherUpdate", topic, [*one[node, topic]])
+                except CallFailedError:
+                    failed.add(node.name)
 
-    calls = {asyncio.create_task(tell(node, topic, uris)): node.name for (node, topic), uris in lists.items()}
+    calls = {asyncio.create_task(tell(*row)): row[0].name for row in (lists[0] if lists else ())}
     late: set[asyncio.Task[None]] = set()
     if calls:
         _done, late = await asyncio.wait(calls, timeout=seconds)

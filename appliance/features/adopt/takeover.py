@@ -9,15 +9,22 @@ starts in the meantime registers at the master that it still finds.
 1. Publishers are registered before services, and services before subscribers.
 2. The rules come after the first registrations; before, calls of the robot would find an empty graph.
 3. Only ports of registered nodes are cut, and only ports on which the node's own process listens.
+4. The phase says that a graph is being taken before the first registration: from then on RVMaster may tell nodes its
+   own lists, above all a control that starts again, so only giving back ends it.
 
 Giving back: silence, a master, registrations, forward no more, registrations once more, tell subscribers, cut, forget.
 Another master than the recorded one gets nothing: nodes keep their topics by RVMaster's own lists.
 
-4. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
-5. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
+5. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
+6. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
    the earlier URI of a name.
-6. From the end of the forwarding on, nodes start at their own master. A name that came there since is neither ended nor
-   registered again, unless RVMaster's node of that name still answers.
+7. From the end of the forwarding on, nodes start at their own master. A name that came there since is neither ended nor
+   registered again, unless RVMaster's node of that name still answers. The same holds for a graph that was not yet
+   taken over completely.
+
+After each cut, subscribers get their list once more. roscpp keeps a connection that it was making when a list came,
+even if the list lacks its publisher. Once that connection is cut and refused, it is dead, but a later list with this
+publisher changes nothing; only a list without it removes it.
 """
 
 import asyncio
@@ -44,6 +51,7 @@ from appliance.features.adopt.places import (
     parsed,
 )
 from appliance.features.adopt.subscriber_lists import (
+    Subscription,
     lists_of,
     rows_of,
     send_lists,
@@ -83,6 +91,9 @@ _UNREGISTER = {
 }  # fmt: skip
 
 
+HeldNode = tuple[Incarnation, set[Entry]]
+
+
 class AdoptError(Exception):
     """The graph cannot be taken over, or given back; the message says why."""
 
@@ -98,11 +109,30 @@ class ParameterSide(Protocol):
 
     def tree(self) -> Mapping[str, Value]: ...
 
-    async def take(self, values: Mapping[str, Value]) -> list[str]:
-        """Set parameters; return the names of those that a limit left out."""
+    async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
+        """Set parameters; return the names of those that a limit left out, with the reason."""
 
 
 async def _nothing(_step: str) -> None: ...
+
+
+@dataclass
+class LastWord:
+    """The last list of each subscriber, and the names of the nodes that did not take one."""
+
+    lists: dict[Subscription, list[str]] = field(default_factory=dict)
+    failed: list[str] = field(default_factory=list)
+
+    def of_nodes_that_answer(self) -> dict[Subscription, list[str]]:
+        return {row: uris for row, uris in self.lists.items() if row[0].name not in self.failed}
+
+
+@dataclass
+class LeftThere:
+    """Nodes, by name with the reason, and names of parameters that stay with the robot's own master only."""
+
+    nodes: dict[str, str] = field(default_factory=dict)
+    parameters: set[str] = field(default_factory=set)
 
 
 @dataclass
@@ -122,7 +152,7 @@ class AdoptOperation:
     call: NodeCaller = call_node
     forwards: bool = True
     passed: Callable[[str], Awaitable[None]] = _nothing
-    _missing: dict[str, str] = field(default_factory=dict, init=False)
+    left: LeftThere = field(default_factory=LeftThere)
     _who: str = field(default="", init=False)
 
     async def facts(self, nodes: Iterable[NodeUri] = ()) -> MachineFacts:
@@ -189,28 +219,25 @@ class AdoptOperation:
         warm = facts.record.phase is Phase.TAKEN
         graph, places, cut, readings, parameters_left = MasterGraph(), Places(), 0, 0, list[str]()
         reads = facts.master is not None and not warm
+        if warm:
+            places = self._known_places()
+        else:
+            if reads:
+                graph, places, parameters_left = await self._read_first(facts)
+            await self.machine("phase", phase=Phase.TAKING)
         if reads:
-            graph, places = await self._read(facts)
-            await self.passed("read")
-            if facts.record.phase is Phase.FREE:
-                parameters_left = await self._take_parameters(facts)
-                await self.passed("parameters")
             await self._register(graph, places, MasterGraph())
             await self.passed("register")
-        if not reads and warm:
-            places = self._known_places()
         cuts = await self._cuts(graph, places)
-        if not warm:
-            await self.machine("phase", phase=Phase.TAKING)
         await self.machine("forward")
         await self.passed("forward")
         while True:
             if reads and not readings:
                 await self._connect(graph, places)
-            self.graph.tell(places.found)
-            await self._until_told()
+            await self._tell(places)
             await self.passed("tell")
             cut += sum(msgspec.convert(await self.machine("cut", **cuts), dict[str, int]).values())
+            await self._tell(places)
             await self.passed("cut")
             readings += 1
             if not reads:
@@ -227,11 +254,20 @@ class AdoptOperation:
             if readings >= _READINGS:
                 raise AdoptError(f"the graph still changes after {readings} readings")
         await self.machine("phase", phase=Phase.TAKEN)
-        report = self._report(places, cut, readings, [*graph.left_out, *parameters_left], clock.now() - began)
+        report = self._report(cut, readings, [*graph.left_out, *parameters_left], clock.now() - began)
         if reads:
             self._record(report)
         await self.passed("taken")
         return report
+
+    async def _read_first(self, facts: MachineFacts) -> tuple[MasterGraph, Places, list[str]]:
+        graph, places = await self._read(facts)
+        await self.passed("read")
+        if facts.record.phase is not Phase.FREE:  # a kill came after RVMaster had the parameters
+            return graph, places, []
+        left = await self._take_parameters(facts)
+        await self.passed("parameters")
+        return graph, places, left
 
     async def _read(self, facts: MachineFacts) -> tuple[MasterGraph, Places]:
         try:
@@ -241,7 +277,7 @@ class AdoptOperation:
         nodes = {name: uri for name, uri in graph.nodes.items() if not self.graph.is_own(name)}
         uris, _invalid = parsed(nodes)
         places = await find_places(nodes, await self.facts(uris.values()), self.call)
-        self._missing = places.missing
+        self.left.nodes = places.missing
         return graph, places
 
     def _known_places(self) -> Places:
@@ -258,7 +294,9 @@ class AdoptOperation:
             raise AdoptError(f"the robot's parameters cannot be read: {error}") from None
         if self.graph.nodes():  # a node of RVMaster may have read its run_id
             values = {name: value for name, value in values.items() if name != _KEPT_PARAMETER}
-        return await self.parameters.take(values)
+        left = await self.parameters.take(values)
+        self.left.parameters = set(left)
+        return [f"parameter /{name}: {why}" for name, why in left.items()]
 
     async def _register(self, graph: MasterGraph, places: Places, before: MasterGraph) -> None:
         for number, entry in enumerate(graph.in_order()):
@@ -271,6 +309,10 @@ class AdoptOperation:
             place = places.found.get(entry[2])
             if entry not in graph.entries and place is not None:
                 await self.graph.unregister(entry, place, before)
+
+    async def _tell(self, places: Places) -> None:
+        self.graph.tell(places.found)
+        await self._until_told()
 
     async def _until_told(self) -> None:
         until = clock.now() + _LISTS_SECONDS
@@ -342,16 +384,14 @@ class AdoptOperation:
         tail = uri.rstrip("/").rpartition(":")[2]
         return int(tail) if tail.isascii() and tail.isdecimal() and int(tail) < 65_536 else 0
 
-    def _report(
-        self, places: Places, cut: int, readings: int, left_out: list[str], seconds: float
-    ) -> TakeOverReport:
+    def _report(self, cut: int, readings: int, left_out: list[str], seconds: float) -> TakeOverReport:
         nodes = [node for node in self.graph.nodes() if node.registrations]
         return TakeOverReport(
             nodes=len(nodes),
             hosts=sorted({str(node.host) for node in nodes}),
             registrations=sum(len(node.registrations) for node in nodes),
             denied={" ".join(entry): why for entry, why in sorted(self.graph.denied.items())},
-            missing=dict(sorted(places.missing.items())),
+            missing=dict(sorted(self.left.nodes.items())),
             cut=cut,
             readings=readings,
             left_out=left_out,
@@ -379,8 +419,8 @@ class AdoptOperation:
     async def _give(self) -> GiveBackReport:
         began, facts = clock.now(), await self.facts()
         self.silence()
-        if facts.record.phase is Phase.GIVEN:  # a kill came before the nodes were forgotten
-            return await self._forget(GiveBackReport(master=str(facts.master or "")), began)
+        if facts.record.phase is Phase.GIVEN:
+            return await self._give_rest(facts, began)
         try:
             await self.passed("silence")
             started = bool((await self.machine("stand in")).get("started"))
@@ -390,9 +430,9 @@ class AdoptOperation:
                 return await self._give_topics(facts.foreign_master, began)
             reader = self.reader(facts)
             withdrawn = facts.record.phase is Phase.GIVING  # by a give that a kill ended
-            known = None if self.forwards and not withdrawn else MasterGraph()
-            given, ended, known = await self._give_registrations(reader, known)
-            parameters = 0 if withdrawn else await self._give_parameters(reader)
+            known = None if self.forwards and facts.record.phase is Phase.TAKEN else MasterGraph()
+            given, ended, after = await self._give_registrations(reader, known)
+            parameters = 0 if withdrawn else await self._give_parameters(reader, complete=known is None)
             await self.passed("give")
         except (AdoptError, MasterReadError) as error:
             self.speak()
@@ -400,39 +440,54 @@ class AdoptOperation:
         nodes = self._nodes()
         await self.machine("withdraw")
         await self.passed("withdraw")
-        more = await self._give_registrations(reader, known)  # of calls that were under way
+        # of calls that were under way
+        more = await self._give_registrations(reader, after if known is None else known)
         await self.passed("give again")
-        failed = await self._last_word(await reader.read(), nodes)
+        last = await self._last_word(await reader.read(), nodes)
         await self.passed("tell")
         report = GiveBackReport(
             nodes=len(nodes), given=given + more[0], ended=ended + more[1], parameters=parameters,
-            master=str(facts.master or ""), started=started, failed=failed, seconds=round(clock.now() - began, 2),
+            master=str(facts.master or ""), started=started, failed=last.failed, seconds=round(clock.now() - began, 2),
         )  # fmt: skip
-        return await self._forget(report, began)
+        return await self._forget(report, began, last)
 
-    def _nodes(self) -> list[tuple[Incarnation, set[Entry]]]:
+    async def _give_rest(self, facts: MachineFacts, began: float) -> GiveBackReport:
+        """Go on where a kill came before the nodes were forgotten: the next control has told them its own lists."""
+        nodes, last = self._nodes(), LastWord()
+        if nodes:
+            own = facts.master is not None and not facts.foreign_master
+            graph = await self.reader(facts).read() if own else _graph_of(nodes)
+            last = await self._last_word(graph, nodes)
+        report = GiveBackReport(nodes=len(nodes), master=str(facts.master or ""), failed=last.failed)
+        return await self._forget(report, began, last)
+
+    def _nodes(self) -> list[HeldNode]:
         held = list(self.graph.held())
         return [(node, {entry for entry, holder in held if holder is node}) for node in self.graph.nodes()]
 
     async def _give_topics(self, foreign: str, began: float) -> GiveBackReport:
         """Connect the nodes with one another again. The master there may be hostile, so it gets nothing."""
         nodes = self._nodes()
-        held = {entry: node.api_text for node, entries in nodes for entry in entries}
-        graph = MasterGraph(frozenset(held), nodes={entry[2]: uri for entry, uri in held.items()})
+        graph = _graph_of(nodes)
         await self.machine("withdraw")
         await self.passed("withdraw")
-        failed = await self._last_word(graph, nodes)
+        last = await self._last_word(graph, nodes)
         await self.passed("tell")
-        report = GiveBackReport(nodes=len(nodes), failed=failed, withheld=len(held), withheld_from=foreign)
-        return await self._forget(report, began)
+        withheld = len(graph.entries)
+        report = GiveBackReport(
+            nodes=len(nodes), failed=last.failed, withheld=withheld, withheld_from=foreign
+        )
+        return await self._forget(report, began, last)
 
-    async def _forget(self, report: GiveBackReport, began: float) -> GiveBackReport:
+    async def _forget(self, report: GiveBackReport, began: float, last: LastWord) -> GiveBackReport:
         """Forget the nodes. The phase keeps a repetition from ending what the robot's own master has by now."""
         await self.machine("phase", phase=Phase.GIVEN)
         await self.passed("given")
         await self.machine("leave")
+        await send_lists(self.call, _BESIDES_SECONDS, last.of_nodes_that_answer())
         self.graph.forget()
         self.graph.denied.clear()
+        self.left = LeftThere()
         await self.passed("forget")
         await self.machine("phase", phase=Phase.FREE)
         report = msgspec.structs.replace(report, seconds=round(clock.now() - began, 2))
@@ -522,12 +577,13 @@ class AdoptOperation:
 
     def _is_gone(self, entry: Entry, there: MasterGraph, held: Mapping[Entry, Incarnation]) -> bool:
         name = entry[2]
-        if self.graph.is_own(name) or entry in self.graph.denied or name in self._missing:
+        if self.graph.is_own(name) or entry in self.graph.denied or name in self.left.nodes:
             return False
         node = held.get(entry)
         return node is None or there.nodes.get(name) != node.api_text
 
-    async def _give_parameters(self, reader: MasterReader) -> int:
+    async def _give_parameters(self, reader: MasterReader, *, complete: bool) -> int:
+        """Set what differs. Only if RVMaster had all parameters (`complete`), what it lacks was deleted there."""
         there, mine = await reader.parameters(), self.parameters.tree()
         calls: list[MasterCall] = [
             ("setParam", MASTER_NAME, (f"/{name}", value))
@@ -537,17 +593,18 @@ class AdoptOperation:
         calls += [
             ("deleteParam", MASTER_NAME, (f"/{name}",))
             for name in there
-            if self.forwards and name not in {*mine, *_OWN_PARAMETERS}
+            if complete and name not in {*mine, *_OWN_PARAMETERS, *self.left.parameters}
         ]
         await reader.ask_all(calls)
         return len(calls)
 
-    async def _last_word(self, graph: MasterGraph, nodes: list[tuple[Incarnation, set[Entry]]]) -> list[str]:
-        """Send each subscriber its list in this graph; return the nodes that did not take it.
+    async def _last_word(self, graph: MasterGraph, nodes: list[HeldNode]) -> LastWord:
+        """Send each subscriber its list in this graph.
 
-        Before, it gets this list beside the appliance's, and keeps its connections until the new ones stand. A node
-        that does not connect gets its list again: roscpp gives a publisher up after one failed call. A host that does
-        not answer delays only its own nodes, and the whole by less than 9 seconds.
+        Before, it gets the list of the appliance, which removes dead connections, then both lists in one, and keeps its
+        connections until the new ones stand. A node that does not connect gets its list again: roscpp gives a publisher
+        up after one failed call. A host that does not answer delays only its own nodes, and the whole by less than 9
+        seconds.
         """
         lists = lists_of(graph)
         rows = [
@@ -556,22 +613,26 @@ class AdoptOperation:
             for kind, topic, _name in sorted(entries)
             if kind == SUBSCRIPTION
         ]
-        if self.forwards:
-            both = {
-                (node, topic): [*dict.fromkeys((*lists.get(topic, []), *self.graph.given(node, topic)))]
-                for node, topic in rows
-            }
-            await send_lists(self.call, both, _BESIDES_SECONDS)
-            await until_connected(self.call, rows_of(lists, rows))
-        last = {(node, topic): lists.get(topic, []) for node, topic in rows}
+        last = LastWord({(node, topic): lists.get(topic, []) for node, topic in rows})
+        present = {
+            (node, topic): [*self.graph.given(node, topic)] if self.forwards else [] for node, topic in rows
+        }
+        both = {row: [*dict.fromkeys((*last.lists[row], *present[row]))] for row in rows}
+        await send_lists(self.call, _BESIDES_SECONDS, present, both)
+        await until_connected(self.call, rows_of(lists, rows))
         until = clock.now() + LAST_WORD_SECONDS
-        failed = await send_lists(self.call, last, _LISTS_SECONDS)
+        last.failed = await send_lists(self.call, _LISTS_SECONDS, last.lists)
         for _ in range(_REMINDERS):
             missing = await until_connected(self.call, rows_of(lists, rows))
             if not missing or clock.now() >= until:
                 break
-            await send_lists(self.call, {row: last[row] for row in missing}, _BESIDES_SECONDS)
-        return failed
+            await send_lists(self.call, _BESIDES_SECONDS, {row: last.lists[row] for row in missing})
+        return last
+
+
+def _graph_of(nodes: list[HeldNode]) -> MasterGraph:
+    held = {entry: node.api_text for node, entries in nodes for entry in entries}
+    return MasterGraph(frozenset(held), nodes={entry[2]: uri for entry, uri in held.items()})
 
 
 def _is_new(entry: Entry, node: Incarnation, there: MasterGraph) -> bool:

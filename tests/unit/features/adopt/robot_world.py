@@ -1,10 +1,13 @@
 """A robot of scripted nodes with a scripted master, beside RVMaster's own parts: no socket, no clock.
 
 A `KilledError` ends an operation after a step, as a kill of control does: the registry stays, because control stores
-it; all that the operation knew is lost.
+it; all that the operation knew is lost, and the next control sends each subscriber its own list first.
+
+Subscribers are those of roscpp, see `RobotNode.take_list`.
 """
 
 import asyncio
+import copy
 import ipaddress
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +18,8 @@ import msgspec
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
-from appliance.features.adopt.takeover import AdoptError, AdoptOperation
+from appliance.features.adopt.takeover import AdoptError, AdoptOperation, LeftThere
+from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
 from appliance.rpc.master_reader import Entry, MasterCall, MasterGraph, MasterReadError
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -47,7 +51,37 @@ class RobotNode:
     """All lists that came by calls of the operation."""
     fails: int = 0
     """Lists after which the node does not connect, because its call to a publisher fails."""
-    connected: dict[str, list[str]] = field(default_factory=dict)
+    slow: bool = False
+    """It is still connecting when the next list comes."""
+    links: dict[str, dict[str, bool]] = field(default_factory=dict)
+    """By topic and publisher, whether the connection stands."""
+    begun: list[tuple[str, str]] = field(default_factory=list)
+    """The connections that it makes later."""
+
+    @property
+    def connected(self) -> dict[str, list[str]]:
+        return {
+            topic: [uri for uri, stands in links.items() if stands] for topic, links in self.links.items()
+        }
+
+    def take_list(self, topic: str, uris: list[str]) -> None:
+        """Connect as roscpp does: it neither drops a connection that it is making, nor repeats one that has ended."""
+        links = self.links.setdefault(topic, {})
+        for uri in links.keys() - {*uris}:
+            del links[uri]
+        added = [
+            uri for uri in uris if uri not in links and uri != self.uri and (topic, uri) not in self.begun
+        ]
+        if self.fails and added:
+            self.fails -= 1
+        else:
+            self.begun += [(topic, uri) for uri in added]
+
+    def connect(self, reaches: Callable[[str], bool]) -> None:
+        for topic, uri in self.begun:
+            if reaches(uri):
+                self.links.setdefault(topic, {})[uri] = True
+        self.begun.clear()
 
     def entries(self) -> set[Entry]:
         return {
@@ -135,6 +169,12 @@ class RobotWorld:
         self.limit = self.silent_host = ""
         self.left = False
         self.remote: list[tuple[str, int]] = []
+        self.refused: set[int] = set()  # ports that were cut
+        self.kept_left, self.kept_unasked = (
+            LeftThere(),
+            set[Incarnation](),
+        )  # what control stores after each step
+        self.orders_until_kill = 0
         self.begin()
 
     def begin(self) -> None:
@@ -154,8 +194,12 @@ class RobotWorld:
         )
         self.operation = AdoptOperation(
             self._machine, lambda _facts: master, self.graph, world,
-            waiting=lambda: 0, silence=self._silence, speak=self._speak, call=self._call, passed=self._passed,
+            waiting=self._waiting, silence=self._silence, speak=self._speak, call=self._call, passed=self._passed,
         )  # fmt: skip
+        self.operation.left = copy.deepcopy(self.kept_left)
+        parts.subscribers.unasked.clear()
+        parts.subscribers.unasked.update(self.kept_unasked)
+        parts.subscribers.remind_all()
 
     # --- the robot ---
 
@@ -163,7 +207,16 @@ class RobotWorld:
         node = self.robot[name] = RobotNode(name, uri or f"http://base:{port}/", port, **roles)
         self.resolved.setdefault("base", ["127.0.1.1"])
         self.register(node)
+        if not self.forwarded:
+            self.tell_as_own_master()
         return node
+
+    def tell_as_own_master(self) -> None:
+        for node in self.robot.values():
+            for topic in node.subscribes:
+                self.give_list(
+                    node, topic, [one.uri for one in self.robot.values() if topic in one.publishes]
+                )
 
     def register(self, node: RobotNode) -> None:
         self.master.entries |= node.entries()
@@ -181,19 +234,22 @@ class RobotWorld:
     def tree(self) -> Mapping[str, Value]:
         return self.parts.parameters.tree
 
-    async def take(self, values: Mapping[str, Value]) -> list[str]:
+    async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
         for name, value in values.items():
             if name != self.limit:
                 await self.parts.ask("setParam", "/rosrv", f"/{name}", value, host=LINK)
-        return [f"parameter /{self.limit}: too large"] if self.limit in values else []
+        return {self.limit: "too large"} if self.limit in values else {}
 
     async def _order(self, host: Address, method: str, /, *params: Value) -> list[Value]:
         self.began.append(method)
         try:
             answer: Any = await self.parts.ask(method, *params, host=str(host))
-            return list(answer)
         except EncodingError as error:  # only the test's own body has a notation
             return [-1, str(error), 0]
+        self.orders_until_kill -= 1
+        if self.orders_until_kill == 0:
+            raise KilledError
+        return list(answer)
 
     async def _machine(self, work: str, /, **terms: Any) -> dict[str, Any]:
         match work:
@@ -206,10 +262,14 @@ class RobotWorld:
             case "forward":
                 self.forwarded = True
             case "cut":
+                self.refused |= set(terms["ports"])
+                self._end(lambda uri: self._port(uri) in self.refused)
                 self.cuts.append(set(terms["ports"]))
                 self.remote = terms["remote"]
                 return {"master": 1, "nodes": len(terms["ports"])}
             case "stand in":
+                if not self.operation.forwards:
+                    self.refused.clear()
                 if self.holder is None:
                     self.holder = RobotMaster(8, "/usr/bin/rosmaster", "robot", "rosrv-left-master.service")
                     self.record = msgspec.structs.replace(self.record, stand_in=8)
@@ -219,7 +279,9 @@ class RobotWorld:
             case "withdraw":
                 self.record = msgspec.structs.replace(self.record, phase=Phase.GIVING)
                 self.forwarded = False
+                self.refused.clear()
             case "leave":
+                self._end(lambda uri: not self._port(uri))
                 self.left = True
             case _:
                 raise AdoptError(work)
@@ -241,21 +303,51 @@ class RobotWorld:
         if method == "requestTopic":
             return [1, "", ["TCPROS", "base", uri.port + 1000]]
         if method == "publisherUpdate":
-            node.lists[str(params[0])] = _texts(params[1])
             node.earlier.append((str(params[0]), _texts(params[1])))
-            if node.fails:
-                node.fails -= 1
-            else:
-                node.connected[str(params[0])] = _texts(params[1])
+            self.give_list(node, str(params[0]), _texts(params[1]))
         if method == "getBusInfo":
-            rows = [(topic, one) for topic, uris in node.connected.items() for one in uris]
+            rows = [
+                (topic, one) for topic, links in node.links.items() for one in links
+            ]  # also those that ended
             return [1, "", [[0, one, "i", "TCPROS", topic, True] for topic, one in rows]]
         return [1, "", node.port]
+
+    def give_list(self, node: RobotNode, topic: str, uris: list[str]) -> None:
+        node.lists[topic] = uris
+        node.take_list(topic, uris)
+        if not node.slow:
+            node.connect(self._reaches)
+
+    def _port(self, uri: str) -> int:
+        """Return the port of topics of the robot's node with this URI; 0 if that is the appliance's."""
+        return next((node.port + 1000 for node in self.robot.values() if node.uri == uri), 0)
+
+    def _reaches(self, uri: str) -> bool:
+        return self._port(uri) not in self.refused
+
+    def connect_all(self) -> None:
+        for node in self.robot.values():
+            node.connect(self._reaches)
+
+    def _end(self, ends: Callable[[str], bool]) -> None:
+        """End connections to publishers; what was begun before stands first."""
+        before, self.refused = self.refused, set()
+        self.connect_all()
+        self.refused = before
+        for node in self.robot.values():
+            for links in node.links.values():
+                links.update(dict.fromkeys(filter(ends, links), False))
+
+    def _waiting(self) -> int:
+        self._hear()
+        return 0
 
     async def _passed(self, step: str) -> None:
         await self.parts.settle()
         self._hear()
         self.steps.append(step)
+        self.kept_left = copy.deepcopy(self.operation.left)
+        self.kept_unasked = {*self.parts.subscribers.unasked}
         self.after.pop(step, lambda: None)()
         if step == self.killed_after:
             self.killed_after = ""
@@ -273,8 +365,8 @@ class RobotWorld:
         for seen in self.parts.seen:
             if isinstance(seen, Told) and seen.call.method == "publisherUpdate" and not self.silent:
                 node = self.robot.get(seen.node.name)
-                if node is not None and node.alive:
-                    node.lists[str(seen.call.parameters[0])] = _texts(seen.call.parameters[1])
+                if node is not None and node.alive and node.uri == seen.node.api_text:
+                    self.give_list(node, str(seen.call.parameters[0]), _texts(seen.call.parameters[1]))
         self.parts.seen.clear()
 
     async def until_settled(self) -> None:
