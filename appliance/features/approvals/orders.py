@@ -155,6 +155,8 @@ class ApprovalOrders:
         """Approve a held call, or give an approval a new time."""
         entry = self._entry(request.number)
         seconds = request.seconds
+        if request.waits and entry.state is not ApprovalState.WAITS:
+            raise SenselessError(f"approval {entry.number} is already {entry.state} by {entry.who}")
         if seconds is None and entry.lease and entry.call.category is Category.CALL:
             raise SenselessError(
                 f"approval {entry.number} is for some time: give its new time with --for, or run:"

@@ -9,7 +9,10 @@ from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_operation import parameter, rest
 
 SHORTEST_LEASE, LONGEST_LEASE = 1.0, 3600.0
-_PROBLEMS = {404: "No call has this number any longer.", 422: "The approval cannot last so long."}
+_PROBLEMS = {
+    404: "No call has this number any longer.",
+    422: "The approval cannot last so long, or another operator has answered the call.",
+}
 Number = Annotated[int, parameter("number of the held call", ge=1, le=10**15, examples=[48213])]
 
 
@@ -20,6 +23,9 @@ class LeaseSeconds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[float, msgspec.Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)] | None,
         doc("for all calls of the same host and name in this time, with any arguments"),
     ] = None
+    waits: Annotated[
+        bool, doc("approve only a call that still waits, so that no answer of another operator is replaced")
+    ] = False
 
 
 class Approval(msgspec.Struct, frozen=True):
@@ -67,6 +73,7 @@ class ApproveCall(WaitingRequest[Approval], frozen=True, tag="approve"):
 
     number: Number
     seconds: float | None = None
+    waits: bool = False
 
 
 @rest("operator", "POST", "/v1/approvals/{number}/refuse", name="approval_refuse", problems=_PROBLEMS)

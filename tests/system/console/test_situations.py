@@ -216,6 +216,14 @@ SLOTS = """async () => {
   const later = pruned(slots, 5000, false);
   found.push(awake(pruned(slots, 5000, true), 1200), awake(later, 5000), awake(later, 5500));
   found.push(awake(placed(slots, [call(1)], 700, 700), 1199)[0]);
+  const ending = (number, left_seconds) => ({ ...call(number), left_seconds });
+  const order = (slots) => slots.map((slot) => slot.number);
+  let many = placed([], [ending(1, 90), ending(2, 30), ending(3, 60)], 0, 0);
+  found.push(order(many));
+  many = placed(many, [ending(1, 89), ending(2, 120), ending(3, 59)], 1000, 1000); // 2 was repeated
+  found.push(order(pruned(many, 2000, true)));
+  many = pruned(many, 2000, false);
+  found.push(order(many), awake(many, 2499), awake(many, 2500));
   return found;
 }"""
 
@@ -230,7 +238,35 @@ def test_buttons_wake_half_a_second_after_they_appear_or_move(windows: list[Read
         [[2, False], [3, False]],
         [[2, True], [3, True]],
         [1, False],  # it waits again, with its number
+        [2, 3, 1],  # the first to end is the first
+        [2, 3, 1],  # in use: nothing moves
+        [3, 1, 2],  # a repeated call does not hide those that end earlier
+        [[3, False], [1, False], [2, False]],
+        [[3, True], [1, True], [2, True]],
     ]
+
+
+MOVED_UNDER_A_CLICK = """() => {
+  document.querySelector("h1").style.marginBottom = "90px";
+  document.querySelector("tr[data-approval] button").click();
+}"""
+
+
+def test_the_buttons_of_the_table_sleep_after_it_moves(appliance: Appliance, windows: list[Reader]) -> None:
+    """A click at the moment at which something above the table grows decides nothing."""
+    page = windows[0].go("robot")
+    advertise(appliance, AGENT, "/goal")
+    button = page.locator("tr[data-approval] button").first
+    expect(button).to_have_text("For 30 s")
+    expect(button).not_to_have_attribute("aria-disabled", "true")
+    page.evaluate(MOVED_UNDER_A_CLICK)
+    expect(button).to_have_attribute("aria-disabled", "true")
+    assert approvals(appliance, "lease") == []
+    expect(button).not_to_have_attribute("aria-disabled", "true")
+    button.click()
+    expect(windows[0].toast("lease")).to_be_visible()
+    [row] = approvals(appliance, "lease")
+    appliance.rosrv("approval", "refuse", str(row["number"]))
 
 
 def test_the_sound_is_off_until_it_is_switched_on_in_this_browser(windows: list[Reader]) -> None:

@@ -63,7 +63,7 @@ function Call(/** @type {{slot: import("./slots.js").Slot, now: number}} */ { sl
   return html`<div class=${`waiting-call${ended ? " ended" : ""}`} data-approval=${number}>
     <div class="waiting-what"><${Host} value=${call.host} /> <span class="muted">wants to</span> ${wants(call)}</div>
     <div class="waiting-left nowrap" data-left>${ended || html`<b>${lasting(seconds)}</b> left`}</div>
-    <div class="row waiting-buttons">${call.category === "call" && html`<${Button} small role="operator" tone="primary" ...${off} onClick=${() => decide(number, "approve", {})}>Approve once</${Button}>`}
-      ${LEASES.map((lease) => html`<${Button} key=${lease} small role="operator" ...${off} onClick=${() => decide(number, "approve", { seconds: lease })}>For ${lasting(lease)}</${Button}>`)}
+    <div class="row waiting-buttons">${call.category === "call" && html`<${Button} small role="operator" tone="primary" ...${off} onClick=${() => decide(number, "approve")}>Approve once</${Button}>`}
+      ${LEASES.map((lease) => html`<${Button} key=${lease} small role="operator" ...${off} onClick=${() => decide(number, "approve", lease)}>For ${lasting(lease)}</${Button}>`)}
       <${Button} small role="operator" ...${off} onClick=${() => decide(number, "refuse")}>Refuse</${Button}></div></div>`;
 }

@@ -72,8 +72,9 @@ export function useHeldCalls() {
   }, [newest]);
 }
 
-/** Approve or refuse a held call, and say so. @param {number} number @param {"approve" | "refuse"} verb @param {any} [json] */
-export async function decide(number, verb, json) {
+/** Approve a call that still waits, or refuse one or end an approval, and say so. @param {number} number @param {"approve" | "refuse"} verb @param {number} [seconds] */
+export async function decide(number, verb, seconds) {
+  const json = verb === "approve" ? { seconds, waits: true } : undefined;
   try {
     const { body } = await ask("POST", `/v1/approvals/${number}/${verb}`, { json, match: "*" });
     done(`Approval ${body.number}: ${body.state}`, `${body.host} ${body.resource}`);

@@ -483,3 +483,15 @@ async def test_a_refusal_pauses_for_two_minutes_however_often_the_call_is_repeat
 
 def test_doors_know_the_words_of_a_held_call(site: Site) -> None:
     assert "held for approval" in site.publish("/x")
+
+
+async def test_no_operator_replaces_the_answer_of_another_unseen(site: Site) -> None:
+    await site.call(b"one")
+    [one] = await site.held()
+    await site.orders.refuse(RefuseCall(one.number), "ann")
+    with pytest.raises(SenselessError, match="already refused by ann"):
+        await site.orders.approve(ApproveCall(one.number, 30.0, waits=True), "bob")
+    assert [row.state for row in await site.held()] == ["refused"]
+    await site.orders.approve(ApproveCall(one.number, 30.0), "bob")
+    with pytest.raises(SenselessError, match="already approved by bob"):
+        await site.orders.approve(ApproveCall(one.number, 300.0, waits=True), "ann")
