@@ -154,7 +154,7 @@ def lock(page: Page, base: Process) -> None:
     expect(own.get_by_role("alert")).to_contain_text("the robot was stopped")
     eventually(lambda: stopped(base), "the lock stops the robot")
     page.keyboard.up("ArrowUp")
-    own.get_by_role("button", name="Give it up").click()
+    own.get_by_role("button", name="Free it").click()
     own.get_by_label("Camera", exact=True).select_option("")
 
 

@@ -13,7 +13,7 @@ import { done, failed } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
 import { isSilent, isStuck, useGroups } from "./situation.js";
 
-const SAID = { take: "Take", give: "Give", ask: "Ask" };
+const VERBS = { assign: "Assign", free: "Free", ask: "Ask" }; // as those of `rosrv drive`
 
 export function Drive() {
   const { value, error, again, rows } = useGroups();
@@ -25,31 +25,24 @@ export function Drive() {
 }
 
 function Group(/** @type {{group: any, again: () => void}} */ { group, again }) {
-  const [open, setOpen] = useState(/** @type {keyof typeof SAID | ""} */ (""));
-  const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${wordOf(verb, group)}…</${Button}>`;
+  const [open, setOpen] = useState(/** @type {keyof typeof VERBS | ""} */ (""));
+  const button = (/** @type {keyof typeof VERBS} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${VERBS[verb]}…</${Button}>`;
   return html`<tr data-group=${group.group}>
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
     <td data-label=${group.ranks.length ? "Driver" : "Holder"}><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> ${group.held_seconds !== null && html`<span class="nowrap">for ${lasting(group.held_seconds)}</span>: `}<${Sentence} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
     ${group.ranks.length ? html`<td></td>` : html`<td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>`}
-    <td><div class="row row-end">${group.ranks.length ? button("give", { disabled: !isStuck(group), why: "No lower rank waits for a person" }) : html`${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
+    <td><div class="row row-end">${group.ranks.length ? button("free", { disabled: !isStuck(group), why: "No lower rank waits for a person" }) : html`${button("assign", { tone: group.holder ? "" : "primary" })}${button("free", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
 }
 
-/** The verb on a button: a group with a rank is freed, without a host. @param {keyof typeof SAID} verb @param {any} group */
-function wordOf(verb, group) {
-  return group.ranks.length ? "Free" : SAID[verb];
-}
-
-const WORDS = { take: "assign", give: "free", ask: "ask" };
-
-function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => void, close: () => void}} */ { verb, group, again, close }) {
-  const [host, setHost] = useState(verb === "give" ? (group.waiting[0] ?? "") : "");
+function HandOver(/** @type {{verb: keyof typeof VERBS, group: any, again: () => void, close: () => void}} */ { verb, group, again, close }) {
+  const [host, setHost] = useState(verb === "free" ? (group.waiting[0] ?? "") : "");
   const hosts = useHosts();
   const id = useId();
-  const give = verb === "give";
+  const free = verb === "free";
   const go = async () => {
     try {
-      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${WORDS[verb]}`, { json: give ? { to: host } : { host }, match: "*" });
+      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: free ? { to: host } : { host }, match: "*" });
       done(body.ranks.length ? `${body.group} is ${body.standing}` : body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
       close();
     } catch (failure) {
@@ -58,15 +51,15 @@ function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => 
     again();
   };
   const text = {
-    take: "The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.",
-    give: group.ranks.length ? "The group is handed back: the next node that moves drives." : "The holder's authority ends. The group goes to this host, or without one to the first that waits.",
+    assign: "The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.",
+    free: group.ranks.length ? "The group is handed back: the next node that moves drives." : "The holder loses the group. It goes to this host, or without one to the first that waits.",
     ask: "The host waits for the group. It gets the group once that is free, if the policy lets it take the group.",
   }[verb];
   const submit = (/** @type {Event} */ event) => {
     event.preventDefault();
-    if (host || give) go();
+    if (host || free) go();
   };
-  return html`<${Dialog} title=${`${wordOf(verb, group)} ${group.group}`} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="primary" disabled=${!host && !give} why="Name a host" onClick=${go}>${wordOf(verb, group)}</${Button}>`}>
+  return html`<${Dialog} title=${`${VERBS[verb]} ${group.group}`} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="primary" disabled=${!host && !free} why="Name a host" onClick=${go}>${VERBS[verb]}</${Button}>`}>
     <p>${text}</p>${!group.ranks.length && html`<form onSubmit=${submit}><${Field} label="Host" mono value=${host} set=${setHost} list=${id} hint="an address, or the name of a host" /></form>`}
     <datalist id=${id}>${hosts.map((one) => html`<option key=${one} value=${one}></option>`)}</datalist></${Dialog}>`;
 }

@@ -26,7 +26,7 @@ export function Pad(/** @type {import("./picture.js").Given & {name: string, add
   const { group, groups, guards, error, again } = useMotion(parts, topic);
   const listed = bases.some((one) => one.name === topic);
   const fastest = SPEEDS.find(([word]) => word === speed) ?? SPEEDS[0];
-  const held = !group || group.holder === address;
+  const held = !group || group.ranks.length > 0 || group.holder === address; // by rank, who moves drives
   const looking = Boolean(topic) && !guards && !error;
   const why = !topic ? "Name a topic" : looking ? "Looking who drives" : error ? "It is not known who drives" : held ? "" : `Take ${group.group} first`;
   return html`<section class="stack-tight" aria-label="Pad"><h3>Pad</h3>
@@ -50,9 +50,10 @@ function Authority(/** @type {{parts: any, group: any, held: boolean, name: stri
     }
     await again();
   };
+  if (group.ranks.length) return html`<div class="small"><${parts.Given} value=${group.group} most=${64} />: <${parts.Given} value=${group.standing} /><div class="muted"><${parts.Given} value=${group.why} most=${200} /></div></div>`;
   const holder = group.holder ? html`<${parts.Given} value=${group.holder} mono /> holds` : "No host holds";
   return html`<div class="row small"><span>${held ? "You hold" : holder} <strong><${parts.Given} value=${group.group} most=${64} /></strong>.</span>
-    ${held ? html`<${parts.Button} small role="operator" onClick=${() => order("give", { to: "" })}>Give it up</${parts.Button}>` : html`<${parts.Button} small role="operator" tone="primary" onClick=${() => order("take", { host: `door:${name}` })}>Take it</${parts.Button}>`}</div>`;
+    ${held ? html`<${parts.Button} small role="operator" onClick=${() => order("free", { to: "" })}>Free it</${parts.Button}>` : html`<${parts.Button} small role="operator" tone="primary" onClick=${() => order("assign", { host: `door:${name}` })}>Take it</${parts.Button}>`}</div>`;
 }
 
 /** Who may drive on a topic, and the guards in force on it, every two seconds. */
