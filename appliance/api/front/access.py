@@ -50,6 +50,10 @@ class Bearer:
     asked: ClientRequest | None = None
     gone: "asyncio.Future[None] | None" = field(default=None, compare=False)
 
+    @property
+    def left_seconds(self) -> float:
+        return round(max(0.0, self.expires - clock.wall()), 1)
+
 
 class TokenAuthenticator:
     """Checks tokens, and at most `failures_per_minute` wrong ones of each peer.

@@ -42,11 +42,12 @@ class Hour(msgspec.Struct, frozen=True):
 
 
 class Holder(msgspec.Struct, frozen=True):
-    """The token's name and role; `expires` is seconds since the epoch."""
+    """The token's name, role and end."""
 
     name: str
     role: Annotated[TokenRole, doc("role of the token")]
     expires: Moment
+    left_seconds: Annotated[float, doc("until it ends; a browser's clock may differ from the appliance's")]
 
 
 class _Now(msgspec.Struct, frozen=True):
@@ -62,7 +63,7 @@ def routes(services: Services) -> Routes:
     @router.get("/whoami")
     async def whoami(bearer: Viewer) -> Holder:
         """Return the name, the role and the expiry of the caller's token."""
-        return Holder(bearer.name, bearer.role, bearer.expires)
+        return Holder(bearer.name, bearer.role, bearer.expires, bearer.left_seconds)
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])
     async def last_hour(

@@ -3,17 +3,19 @@
  * growing pause, continuing after the last event.
  */
 
+import { mark, since } from "./elapsed.js";
 import { Problem } from "./problem.js";
 import { send } from "./rest.js";
 import { session } from "./session.js";
 
-const SILENCE = 40_000; // milliseconds; the appliance sends at least a comment every 15 s
+const SILENCE = 20_000; // milliseconds; the appliance sends at least a comment every 15 s
+const CHECKED = 1000; // milliseconds between two looks at the silence: a timer alone stands still while the computer sleeps
 const FIRST_PAUSE = 1000;
 const LONGEST_PAUSE = 30_000;
 
 /**
  * @typedef {{state: "connecting" | "live" | "lost", reason: string | null, again: number | null}} Standing
- * `again`: the time of the next attempt (milliseconds since the epoch).
+ * `again`: the time of the next attempt (milliseconds of the monotonic clock).
  */
 
 /**
@@ -61,7 +63,7 @@ export function follow(path, heard, stands, last = null) {
       if (stopped) return;
       const wait = Math.max(least, pause * (0.75 + Math.random() * 0.5));
       pause = Math.min(pause * 2, LONGEST_PAUSE);
-      stands({ state: "lost", reason, again: Date.now() + wait });
+      stands({ state: "lost", reason, again: performance.now() + wait });
       await new Promise((resolve) => {
         const timer = setTimeout(resolve, wait);
         wake = () => (clearTimeout(timer), resolve(undefined));
@@ -86,19 +88,19 @@ async function read(
 ) {
   const reader = body.pipeThrough(/** @type {any} */ (new TextDecoderStream())).getReader();
   let rest = "";
-  let watchdog = 0;
+  let last = mark();
+  const watchdog = setInterval(() => since(last) > SILENCE && controller.abort(), CHECKED);
   try {
     for (;;) {
-      clearTimeout(watchdog);
-      watchdog = setTimeout(() => controller.abort(), SILENCE);
       const { done, value } = await reader.read();
+      last = mark();
       if (done) return;
       const blocks = (rest + value.replaceAll("\r\n", "\n")).split("\n\n");
       rest = blocks.pop() ?? "";
       for (const block of blocks) tell(block, heard);
     }
   } finally {
-    clearTimeout(watchdog);
+    clearInterval(watchdog);
   }
 }
 

@@ -62,12 +62,11 @@ export function lasting(seconds) {
   return said.length ? said.join(" ") : "0 s";
 }
 
-/** The current time in milliseconds, updated at this interval. @param {number} every */
-export function useNow(every = 1000) {
-  const [now, set] = useState(Date.now());
+/** Draw again once a second. */
+export function useSeconds() {
+  const [, set] = useState(0);
   useEffect(() => {
-    const timer = setInterval(() => set(Date.now()), every);
+    const timer = setInterval(() => set((count) => count + 1), 1000);
     return () => clearInterval(timer);
-  }, [every]);
-  return now;
+  }, []);
 }

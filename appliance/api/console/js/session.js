@@ -8,6 +8,7 @@
  * nothing. Unsaved work is kept for the same token; another token discards it.
  */
 
+import { mark, since } from "./elapsed.js";
 import { Problem } from "./problem.js";
 import { createStore } from "./store.js";
 
@@ -17,12 +18,13 @@ export const PERSON = "sso:";
 const LAST_USE = "rosrv.used"; // time of the last use: a browser may unload a tab and reload it hours later
 const RANK = { viewer: 1, investigator: 1, operator: 2, admin: 3 };
 const USES = ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"];
+const LOOKED = 5000; // milliseconds between two looks at the time without use: a timer stands still while the computer sleeps
 const LONGEST = 2 ** 31 - 1; // longest delay of a browser's timer, in milliseconds
 /** Time without use after which the page is locked, in milliseconds. */
 export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
- * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number}} Session
+ * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", left_seconds: number}} Session `left_seconds`: until it ends, when it was opened
  * `current` is null while signed out; `ended` is the reason why the last session ended, under `heading`. `checking`: the token of an
  * earlier page is being checked; `waiting` is the problem that delays the check. While the page is locked, `locked` is
  * the locked session. `number` counts sessions; unlocking does not start a new session.
@@ -39,7 +41,7 @@ export const session = createStore({
 
 let ending = 0;
 let locking = 0;
-let used = 0; // time of the last use, in milliseconds since the epoch
+let used = mark(); // the last use
 
 /** Return a setting of the site, which the appliance wrote into the page's `meta` element. @param {string} name */
 export function stated(name) {
@@ -63,7 +65,7 @@ export function open(opened, keep) {
   const { number } = session.get();
   session.set({ current: opened, ended: null, heading: "Signed out", checking: false, waiting: null, locked: null, number: same ? number : number + 1 });
   clearTimeout(ending);
-  const left = opened.expires * 1000 - Date.now();
+  const left = opened.left_seconds * 1000; // not from `expires`: the clock of this browser may differ
   if (left < LONGEST) ending = setTimeout(() => end(opened.name.startsWith(PERSON) ? "The session has expired. Sign in again." : "The token has expired. Create another: rosrv token add."), left);
   use();
   watch();
@@ -120,15 +122,15 @@ export function may(role) {
 // A timer may be late (a suspended computer): input after the deadline does not extend the session.
 for (const kind of USES) {
   addEventListener(kind, () => {
-    if (session.get().current && Date.now() - used >= UNUSED) lock();
-    else if (Date.now() - used >= 1000) use();
+    if (session.get().current && since(used) >= UNUSED) lock();
+    else if (since(used) >= 1000) use();
   }, { capture: true, passive: true });
 }
 
 function use() {
-  used = Date.now();
+  used = mark();
   try {
-    if (sessionStorage.getItem(KEY)) sessionStorage.setItem(LAST_USE, String(used));
+    if (sessionStorage.getItem(KEY)) sessionStorage.setItem(LAST_USE, String(used.wall));
   } catch {
     // the token will not survive a reload
   }
@@ -137,8 +139,8 @@ function use() {
 /** Start the timer that locks the page after `UNUSED` milliseconds without use. */
 function watch() {
   clearTimeout(locking);
-  const left = used + UNUSED - Date.now();
-  if (left > 0) locking = setTimeout(watch, Math.min(left, LONGEST));
+  const left = UNUSED - since(used);
+  if (left > 0) locking = setTimeout(watch, Math.min(left, LOOKED));
   else lock();
 }
 

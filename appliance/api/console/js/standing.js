@@ -1,18 +1,26 @@
 /** Shows whether the page is live: a word beside the navigation, and a banner if it is not. */
 
 import { html } from "./html.js";
-import { live, retry } from "./live.js";
-import { useNow } from "./moments.js";
+import { ageOf, live, retry } from "./live.js";
+import { lasting, useSeconds } from "./moments.js";
 import { Given } from "./parts/given.js";
 import { Icon } from "./parts/icon.js";
 import { useStore } from "./store.js";
+
+/** The age of what is shown, once a second. */
+export function useAge() {
+  useSeconds();
+  return ageOf(live.get());
+}
 
 export function Pulse() {
   const standing = useStore(live, (one) => one.standing);
   const away = useStore(live, (one) => one.away);
   const heard = useStore(live, (one) => one.heard !== null);
+  const { old } = useAge();
   const [kind, word] =
     standing.state === "live" && away ? ["wait", "RVMaster away"]
+    : standing.state === "live" && old ? ["wait", "No news"]
     : standing.state === "live" && heard ? ["live", "Live"]
     : standing.state === "lost" ? ["lost", "Not live"]
     : ["wait", "Connecting"];
@@ -21,12 +29,14 @@ export function Pulse() {
 
 export function NotLive() {
   const { standing, away, heard } = useStore(live);
-  const now = useNow();
-  const since = heard ? `, as of ${Math.max(0, Math.round((now - heard) / 1000))} s ago` : "";
+  const { age, old } = useAge();
+  const since = heard ? `, as of ${lasting(age)} ago` : "";
   if (standing.state === "live" && away)
     return html`<div class="banner" role="status"><${Icon} name="warn" /><span><strong>RVMaster does not answer${since}.</strong> <${Given} value=${away} most=${300} /></span></div>`;
+  if (standing.state === "live" && old)
+    return html`<div class="banner" role="status"><${Icon} name="warn" /><span><strong>No news from the appliance for ${lasting(age)}.</strong> What is shown may be over.</span></div>`;
   if (standing.state === "live" || !standing.reason) return null;
-  const wait = standing.again ? Math.max(0, Math.ceil((standing.again - now) / 1000)) : 0;
+  const wait = standing.again ? Math.max(0, Math.ceil((standing.again - performance.now()) / 1000)) : 0;
   return html`<div class="banner" role="status"><${Icon} name="warn" />
     <span><strong>Not live${since}.</strong> <${Given} value=${standing.reason} most=${300} /> ${wait ? `Next try in ${wait} s.` : "Trying now."}</span>
     <button class="button small" onClick=${retry}>Try now</button></div>`;

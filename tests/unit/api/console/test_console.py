@@ -139,6 +139,24 @@ def test_a_view_is_loaded_when_it_is_opened(client: Client) -> None:
     )
 
 
+# Why these may read the browser's wall clock: no time of the appliance is compared with it.
+WALL_CLOCK = {
+    "elapsed.js": "measures how long something takes, beside the monotonic clock",
+    "live.js": "before the time of the appliance is known",
+    "session.js": "the last use of this tab, which only this browser stores",
+    "denied_hosts.js": "the pause between two requests",
+    "rates.js": "the axis of charts whose points this browser timed",
+    "plot.js": "the axis of a chart without points",
+}
+
+
+def test_times_of_the_appliance_are_not_compared_with_the_clock_of_a_browser() -> None:
+    reading = {
+        file.name for file in SOURCES if re.search(r"Date\.now\(\)|new Date\(\)\.get", file.read_text())
+    }
+    assert reading == set(WALL_CLOCK)
+
+
 @pytest.mark.parametrize(
     "path",
     [

@@ -2,7 +2,7 @@
 
 import { useDeniedCounts } from "../audit/denied_hosts.js";
 import { html, useEffect, useMemo, useRef, useState } from "../html.js";
-import { live } from "../live.js";
+import { applianceTime, live } from "../live.js";
 import { notable } from "../notable.js";
 import { counted } from "../numbers.js";
 import { Check } from "../parts/field.js";
@@ -123,7 +123,7 @@ function useSpots(/** @type {any} */ shown, /** @type {any} */ closed, /** @type
 }
 
 function recentOf(/** @type {any[]} */ denials) {
-  const since = Date.now() - RECENT_HOURS * 3_600_000;
+  const since = ((applianceTime() ?? 0) - RECENT_HOURS * 3600) * 1000;
   return denials.filter((one) => Date.parse(one.time) > since);
 }
 

@@ -1,7 +1,7 @@
 /** Block a host during an incident, and the list of blocked hosts. */
 
 import { html, useEffect, useState } from "../html.js";
-import { applianceTime } from "../live.js";
+import { applianceNow } from "../live.js";
 import { Moment } from "../moments.js";
 import { counted } from "../numbers.js";
 import { Button } from "../parts/button.js";
@@ -60,7 +60,7 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
 async function takeBack({ address, name, replaced }) {
   if (!replaced) await ask("DELETE", `/v1/blocks/${encodeURIComponent(address)}`, { match: "*" });
   else {
-    const left = replaced.until === null ? null : Math.max(1, replaced.until - (applianceTime() ?? Date.now() / 1000));
+    const left = replaced.until === null ? null : Math.max(1, replaced.until - applianceNow());
     await ask("POST", "/v1/blocks", { match: "*", json: { address, for_seconds: left, note: replaced.note, force: true } });
   }
   done(replaced ? `${name || address} has its earlier block` : `${name || address} is no longer blocked`);
@@ -89,7 +89,7 @@ function ended(counts) {
 export function Blocked({ mark }) {
   const { value, again } = useResource((signal) => get("/v1/blocks", {}, signal), [mark]);
   useEffect(() => {
-    const ends = (value?.blocks ?? []).flatMap((/** @type {any} */ one) => (one.until === null ? [] : [one.until * 1000 - Date.now()]));
+    const ends = (value?.blocks ?? []).flatMap((/** @type {any} */ one) => (one.until === null ? [] : [(one.until - applianceNow()) * 1000]));
     if (!ends.length) return undefined;
     const timer = setTimeout(again, Math.max(1000, Math.min(...ends, 2 ** 31 - 1)));
     return () => clearTimeout(timer);

@@ -2,9 +2,10 @@
 
 import { html } from "../html.js";
 import { live } from "../live.js";
-import { inOwnZone, lasting, Moment, useNow } from "../moments.js";
+import { inOwnZone, lasting, Moment } from "../moments.js";
 import { notable } from "../notable.js";
 import { count, counted, growth, lately } from "../numbers.js";
+import { useApplianceTime } from "../parts/ago.js";
 import { Badge } from "../parts/badge.js";
 import { FeatureParts } from "../parts/features.js";
 import { By, Given } from "../parts/given.js";
@@ -24,7 +25,7 @@ export function Now() {
   const status = useStore(live, (one) => one.status);
   const alarms = useStore(live, (one) => one.alarms);
   const incidents = useStore(notable, (one) => one.incidents);
-  const now = useNow(5000);
+  const now = useApplianceTime();
   useKeys((key) => {
     const step = { j: 1, k: -1 }[key];
     if (!step) return false;
@@ -34,7 +35,7 @@ export function Now() {
     return true;
   });
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
-  return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${lasting(now / 1000 - status.since)}</span></div>
+  return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${now === null ? "…" : lasting(now - status.since)}</span></div>
     <${Situation} /><${Alarms} alarms=${alarms} incidents=${incidents} />
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">

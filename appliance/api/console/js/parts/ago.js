@@ -2,11 +2,11 @@
 
 import { html } from "../html.js";
 import { applianceTime } from "../live.js";
-import { dateOf, lasting, useNow } from "../moments.js";
+import { dateOf, lasting, useSeconds } from "../moments.js";
 
 /** The appliance's present time in seconds, once a second; null before it is known. */
 export function useApplianceTime() {
-  useNow();
+  useSeconds();
   return applianceTime();
 }
 

@@ -10,6 +10,8 @@ const V4 = /^(\d{1,3})\.(\d{1,3})\.(\d{1,3})\.(\d{1,3})$/;
 
 const IN_TEXT = /(?<![(\d./:])\d{1,3}(?:\.\d{1,3}){3}(?![\d/:]|\.\d)/g; // neither a network, nor with a port, nor behind its name
 
+const AGAIN = 5000; // milliseconds after a failure
+
 const labels = createStore(/** @type {{network: string, name: string}[]} */ ([]));
 
 /** Fetch the names again after each change of the policy or of the enrolled hosts. */
@@ -18,8 +20,12 @@ export function useNames() {
   useEffect(() => {
     if (!mark) return undefined;
     const controller = new AbortController();
-    get("/v1/policy/hosts", {}, controller.signal).then((found) => labels.set(found.labels), () => {}); // without names, addresses are shown
-    return () => controller.abort();
+    let timer = 0;
+    const fetchThem = () => get("/v1/policy/hosts", {}, controller.signal).then((found) => labels.set(found.labels), () => {
+      if (!controller.signal.aborted) timer = setTimeout(fetchThem, AGAIN); // until then, addresses are shown
+    });
+    fetchThem();
+    return () => (controller.abort(), clearTimeout(timer));
   }, [mark]);
 }
 

@@ -35,19 +35,20 @@ export function useLook(topics) {
     })).then(() => signal.aborted || setUntil(0));
     return () => controller.abort();
   }, [about, until]);
-  return { looking: until > 0, turn: () => setUntil(until ? 0 : Date.now() + SECONDS * 1000), seen, error };
+  return { looking: until > 0, turn: () => setUntil(until ? 0 : performance.now() + SECONDS * 1000), seen, error };
 }
 
 /** @param {string} topic @param {number} until @param {AbortSignal} signal @param {(more: any[]) => void} heard */
 async function follow(topic, until, signal, heard) {
-  for (let latched = true; Date.now() < until && !signal.aborted; latched = false) {
+  for (let latched = true; performance.now() < until && !signal.aborted; latched = false) {
     const [body] = /** @type {any[]} */ (await Promise.all([get("/v1/messages", { topic, latched, ...EACH }, signal), pause(PAUSE)]));
     heard(body.messages.map((/** @type {any} */ one, /** @type {number} */ at) => ({ ...one, first: at === 0 })));
   }
 }
 
 function recent(/** @type {any[]} */ messages) {
-  return messages.filter((one) => one.time / 1e9 > Date.now() / 1000 - 2 * SECONDS).slice(-MOST);
+  const newest = Math.max(...messages.map((one) => one.time)) / 1e9;
+  return messages.filter((one) => one.time / 1e9 > newest - 2 * SECONDS).slice(-MOST);
 }
 
 const pause = (/** @type {number} */ milliseconds) => new Promise((done) => setTimeout(done, milliseconds));

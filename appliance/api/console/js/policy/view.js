@@ -2,8 +2,9 @@
 
 import { html, useEffect, useState } from "../html.js";
 import { live as appliance } from "../live.js";
-import { lasting, Moment, useNow } from "../moments.js";
+import { lasting, Moment } from "../moments.js";
 import { counted } from "../numbers.js";
+import { useApplianceTime } from "../parts/ago.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Difference } from "../parts/difference.js";
@@ -87,7 +88,7 @@ function older(/** @type {URLSearchParams} */ query, /** @type {any} */ live) {
 }
 
 function Standing(/** @type {{live: any, stale: boolean, showDiff: () => void}} */ { live, stale, showDiff }) {
-  const now = useNow();
+  const now = useApplianceTime();
   const act = (/** @type {string} */ what, /** @type {any} */ json, /** @type {string} */ said) => async () => {
     try {
       done(said, `Revision ${(await change(what, json)).revision} is in force.`);
@@ -96,7 +97,7 @@ function Standing(/** @type {{live: any, stale: boolean, showDiff: () => void}} 
     }
   };
   return html`<div class="standing">
-    ${live.confirm_by && html`<${Notice} tone="warn" title=${`Revision ${live.revision} rolls back in ${lasting(live.confirm_by - now / 1000)} unless confirmed`}>
+    ${live.confirm_by && html`<${Notice} tone="warn" title=${`Revision ${live.revision} rolls back ${now === null ? "soon" : `in ${lasting(live.confirm_by - now)}`} unless confirmed`}>
       <div class="row"><${Button} small role="operator" tone="primary" onClick=${act("confirm", undefined, "The policy is kept")}>Keep it</${Button}><${Button} small role="operator" onClick=${act("rollback", {}, "The previous policy is back in force")}>Roll back now</${Button}></div></${Notice}>`}
     ${live.differs_from_file && html`<${Notice} title="The policy in force differs from the file"><div class="row"><span><${Given} value=${live.policy_file} mono most=${120} /> is not read again until you reload it.</span><${Button} small role="operator" onClick=${act("reload", undefined, "The file was read again")}><${Icon} name="again" size=${14} />Reload from the file</${Button}></div></${Notice}>`}
     ${live.warnings.length > 0 && html`<details class="notice warn"><summary>${live.warnings.length} ${live.warnings.length === 1 ? "warning" : "warnings"} about the policy in force</summary><ul class="plain-list">${live.warnings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${400} /></li>`)}</ul></details>`}
