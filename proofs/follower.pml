@@ -1,6 +1,6 @@
 /*
  * A follower: another computer of the robot, whose firewall follows the lease of two appliances (features/standby/
- * witness.py, WitnessFollower). proofs/lease.pml is about the witness and the appliances; here the witness is only what a
+ * witness/follower.py). proofs/lease.pml is about the witness and the appliances; here the witness is only what a
  * follower needs of it.
  *
  * The rules:
@@ -74,11 +74,11 @@ byte since = 0;         /* ticks since the start */
 bool fresh;             /* whether an answer came in this tick */
 #endif
 
-/* = appliance/features/standby/witness.py WitnessFollower._wanted */
+/* = appliance/features/standby/witness/follower.py WitnessFollower._wanted */
 #define WANTED (valid > 0 -> newest : NOBODY)
 #define IS_NAME (writing == 1 || writing == 2)
 
-/* = appliance/features/standby/witness.py WitnessFollower._left */
+/* = appliance/features/standby/witness/follower.py WitnessFollower._left */
 #ifdef MUTANT_NOT_ABANDONED
 #define ABANDON false
 #else
@@ -89,7 +89,7 @@ bool fresh;             /* whether an answer came in this tick */
 #endif
 #endif
 
-/* = appliance/features/standby/witness.py WitnessFollower.pause */
+/* = appliance/features/standby/witness/follower.py WitnessFollower.pause */
 #ifdef MUTANT_NEVER_SHUTS
 #define BEGIN (writing == NOBODY && admitted != WANTED && WANTED != NOBODY)
 #else
@@ -112,7 +112,7 @@ bool fresh;             /* whether an answer came in this tick */
 
 #define DUE (ABANDON || BEGIN || (writing != NOBODY && wrote == WRITE) || SOON)
 
-/* = appliance/features/standby/witness.py WitnessFollower.request */
+/* = appliance/features/standby/witness/follower.py WitnessFollower.request */
 inline send(which) {
   state[which] = ASKED;
   second = (which == 0 && state[1] != FREE)
@@ -131,7 +131,7 @@ inline drop(which) {
   state[which] = FREE; named[which] = NOBODY; ticks[which] = 0; passed[which] = false; second = false
 }
 
-/* = appliance/features/standby/witness.py WitnessFollower.receive */
+/* = appliance/features/standby/witness/follower.py WitnessFollower.receive */
 inline receive(which) {
   newest = named[which]; valid = ticks[which];
 #ifdef SERVED
@@ -150,7 +150,7 @@ inline receive(which) {
   drop(which)
 }
 
-/* = appliance/features/standby/witness.py WitnessFollower.enforce */
+/* = appliance/features/standby/witness/follower.py WitnessFollower.enforce */
 inline commit() {
   if
   :: IS_NAME ->

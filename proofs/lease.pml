@@ -313,7 +313,7 @@ inline answer_denied(x) {
 }
 
 /* R1: on disk.
- = appliance/features/standby/witness.py Witness._claim */
+ = appliance/features/standby/witness/lease_rules.py Witness._claim */
 inline grant(x) {
 #ifndef MUTANT_SAME_EPOCH
     epoch++;
@@ -323,7 +323,7 @@ inline grant(x) {
 }
 
 /* R1: in the firewall.
- = appliance/features/standby/witness.py Witness._enforce */
+ = appliance/features/standby/witness/lease_rules.py Witness._enforce */
 inline admit_holder() {
     granting = false;
 #ifdef MUTANT_NOT_FENCED
@@ -339,7 +339,7 @@ inline admit_holder() {
 #define MAY_REMOVE(x) (holder == x)
 #endif
 /* It admits the holder again, if the robot has rebooted.
- = appliance/features/standby/witness.py Witness._renew */
+ = appliance/features/standby/witness/lease_rules.py Witness._renew */
 inline renew(x) {
     running = true;
 #ifndef MUTANT_RENEWED_SHUT
@@ -347,7 +347,7 @@ inline renew(x) {
 #endif
 }
 
-/* = appliance/features/standby/witness.py Witness.handle */
+/* = appliance/features/standby/witness/lease_rules.py Witness.handle */
 proctype Witness() POSSIBLE {
     byte x;
 end:

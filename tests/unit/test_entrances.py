@@ -80,7 +80,7 @@ def test_shown_secrets_are_compared_in_one_module() -> None:
         "appliance/signing/bearer_secrets.py",
         "appliance/store/access_tokens.py",  # a salted, slow hash, for tokens without keys
         "appliance/control/rest/rest_proof.py",  # the code of a challenge, which is not stored
-        "appliance/features/standby/witness.py",  # the code of a datagram
+        "appliance/features/standby/witness/protocol.py",  # the code of a datagram
         "fleet/rosrv_fleet/tokens.py",  # the hash in hexadecimal, in a file
     }
 

@@ -325,7 +325,10 @@ WALL_CLOCK = {
 """Files that may read the wall clock, by purpose. Add a file only if it has one of these purposes."""
 DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
-    "appliance/features/standby/witness.py": "is copied to a machine without the appliance",
+    "appliance/features/standby/witness/enforcement.py": "runs on a machine without the appliance",
+    "appliance/features/standby/witness/firewall.py": "runs on a machine without the appliance",
+    "appliance/features/standby/witness/following.py": "runs on a machine without the appliance",
+    "appliance/features/standby/witness/serving.py": "runs on a machine without the appliance",
 }
 _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
     f"{clock}{unit}" for clock in ("monotonic", "perf_counter", "clock_gettime") for unit in ("", "_ns")

@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from appliance.control import process as control_process
-from appliance.features.standby import witness
 from appliance.features.standby.lease import ApplianceLease
 from appliance.features.standby.lease_watch import LeaseWatch
 from appliance.features.standby.passive import PassiveControl
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_sender import ReplicationSender
+from appliance.features.standby.witness import lease_rules
+from appliance.features.standby.witness.firewall import LeaseFirewall
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.relay_control import RelayControl
@@ -124,8 +125,8 @@ PAIR_MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "a promise not to claim is not kept": (
         ApplianceLease, "is_active", lambda lease, now: lease.held is not None and now < lease.valid_until,
     ),
-    "the robot's firewall stays as it is": (witness.LeaseFirewall, "admit", _nothing),
-    "the witness grants before the expiry": (witness, "EXPIRY", 0.1),
+    "the robot's firewall stays as it is": (LeaseFirewall, "admit", _nothing),
+    "the witness grants before the expiry": (lease_rules, "EXPIRY", 0.1),
 }  # fmt: skip
 
 

@@ -14,8 +14,8 @@ from typing import Any
 
 from appliance.channel import admin
 from appliance.features.standby import requests as standby_requests
-from appliance.features.standby import witness
 from appliance.features.standby.membership import PORT, Membership
+from appliance.features.standby.witness.settings import AppliancePeer, WitnessSettings
 from tests.world import robot
 from tests.world.appliance import MASTER_PORT, Appliance
 from tests.world.loop import BrokenPromiseError
@@ -36,14 +36,11 @@ class PairWorld(World):
 
     def _make_appliances(self, folder: Path) -> list[Appliance]:
         self._epoch = 0
-        settings = witness.WitnessSettings(
+        settings = WitnessSettings(
             (WITNESS, robot.PORT),
             APPLIANCE,
             (str(MASTER_PORT),),
-            {
-                name: witness.AppliancePeer(address, bytes.fromhex(_KEYS[name]))
-                for name, address in ADDRESSES.items()
-            },
+            {name: AppliancePeer(address, bytes.fromhex(_KEYS[name])) for name, address in ADDRESSES.items()},
             "/lease",
             {},
             "",

@@ -4,7 +4,12 @@ import re
 from typing import TYPE_CHECKING
 
 from appliance.base import clock
-from appliance.features.standby import witness
+from appliance.features.standby.witness.firewall import LeaseFirewall
+from appliance.features.standby.witness.lease_file import LeaseRecord
+from appliance.features.standby.witness.lease_rules import Witness
+from appliance.features.standby.witness.protocol import LONGEST, Left
+from appliance.features.standby.witness.request_gate import WitnessGate
+from appliance.features.standby.witness.settings import WitnessSettings
 from tests.world.loop import Machine, Process
 from tests.world.network import Address
 from tests.world.streams import DatagramSocket, Streams
@@ -16,13 +21,13 @@ PORT = 7411
 
 
 class Robot:
-    def __init__(self, world: "PairWorld", machine: Machine, settings: witness.WitnessSettings) -> None:
+    def __init__(self, world: "PairWorld", machine: Machine, settings: WitnessSettings) -> None:
         self._world = world
         self._machine = machine
         self._settings = settings
-        self._record = witness.LeaseRecord(1, "", tuple(sorted(settings.appliances)), "")
+        self._record = LeaseRecord(1, "", tuple(sorted(settings.appliances)), "")
         self._rules = ""
-        self._firewall = witness.LeaseFirewall(settings, "nft", self._nft)
+        self._firewall = LeaseFirewall(settings, "nft", self._nft)
         self._firewall.admit("")
         self.process: Process
         self.start()
@@ -36,7 +41,7 @@ class Robot:
         self.start()
 
     def _serve(self, streams: Streams) -> None:
-        keeper = witness.Witness(
+        keeper = Witness(
             record=self._record,
             save=self._save,
             admit=self._firewall.admit,
@@ -44,22 +49,22 @@ class Robot:
             clock=clock.since_boot,
         )
         nonce = f"{self._world.random.getrandbits(64):x}"
-        gate = witness.WitnessGate(keeper, self._settings.appliances, nonce)
+        gate = WitnessGate(keeper, self._settings.appliances, nonce)
         sock = DatagramSocket(streams)
         sock.bind(("", PORT))
 
         def answer() -> None:
-            datagram, source = sock.recvfrom(witness.LONGEST + 1)
+            datagram, source = sock.recvfrom(LONGEST + 1)
             given = gate.answer(datagram, source[0])
             if given is not None:
                 sock.sendto(given, source)
 
         sock.readable = answer
 
-    def _save(self, record: witness.LeaseRecord) -> None:
+    def _save(self, record: LeaseRecord) -> None:
         self._record = record
 
-    def _nft(self, command: list[str], text: str, _left: witness.Left) -> str:
+    def _nft(self, command: list[str], text: str, _left: Left) -> str:
         if command[1] == "-f":
             self._rules = text
         return self._rules

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 from appliance.features.standby.link_certificates import make_link_certificate
 from appliance.features.standby.membership import Membership
-from appliance.features.standby.witness import settings_of
+from appliance.features.standby.witness.one_file import witness_program
+from appliance.features.standby.witness.settings import settings_of
 
 WITNESS_PORT = 7411
 _STATE = "/var/lib/rosrv-witness"
@@ -115,7 +116,7 @@ def _files(plan: PairPlan, body: dict[str, Any]) -> tuple[KitFile, ...]:
     }
     package = files("appliance.features.standby")
     found = [
-        KitFile("witness.py", package.joinpath("witness.py").read_text("utf-8"), 0o755),
+        KitFile("witness.py", witness_program(), 0o755),
         KitFile("witness.json", json.dumps(body, indent=2) + "\n", 0o600),
     ]
     for name in (service, _SHUT, "install.sh", "remove.sh"):

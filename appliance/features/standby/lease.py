@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from appliance.features.standby.witness import EXPIRY
+from appliance.features.standby.witness.protocol import EXPIRY
 
 RENEW_SECONDS = 0.3
 CLAIM_SECONDS = 0.1  # between two claims, while no appliance is admitted

@@ -11,7 +11,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.control.errors import UnavailableError
 from appliance.features.standby import lease_link
-from appliance.features.standby.witness import EXPIRY
+from appliance.features.standby.witness.protocol import EXPIRY
 
 _HAND_OVER_SECONDS = 5.0
 _SERVES_SECONDS = 0.5

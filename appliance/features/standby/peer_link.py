@@ -7,7 +7,7 @@ is new only if it has a greater epoch, or the same nonce and a greater number.
 import msgspec
 
 from appliance.features.standby.lease import ClaimPromise, PeerMessage, PromiseRequest, TakeOver
-from appliance.features.standby.witness import HIGHEST, name_in, seal, unseal
+from appliance.features.standby.witness.protocol import HIGHEST, name_in, seal, unseal
 
 PURPOSES: dict[type[PeerMessage], bytes] = {
     PromiseRequest: b"rosrv promise request 1\0",

@@ -33,7 +33,8 @@ from appliance.features.standby.lease import (
 from appliance.features.standby.membership import Membership, load_membership
 from appliance.features.standby.peer_link import PeerChannel
 from appliance.features.standby.service_watch import ServiceWatch
-from appliance.features.standby.witness import HIGHEST, write_synced
+from appliance.features.standby.witness.lease_file import write_synced
+from appliance.features.standby.witness.protocol import HIGHEST
 from appliance.features.standby.witness_link import WitnessChannel
 
 EPOCH = "epoch"

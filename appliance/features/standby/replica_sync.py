@@ -24,7 +24,7 @@ from appliance.features.standby.replication_frames import (
     Stored,
     reason_of,
 )
-from appliance.features.standby.witness import BOOT_ID
+from appliance.features.standby.witness.lease_file import BOOT_ID
 
 INCOMPLETE = "it has restarted with its machine, and has not followed the active appliance since"
 """The obstacle of a standby that may lack the last changes, because its machine lost its power."""

@@ -32,7 +32,7 @@ from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.summary import UNCHECKED, takeover_obstacles
 from appliance.features.standby.tunnels import StandbyTunnels
-from appliance.features.standby.witness import EXPIRY
+from appliance.features.standby.witness.protocol import EXPIRY
 from appliance.store.writer_thread import Database, StoreError
 
 _GAP_SECONDS = 0.9  # without an answer of the witness; less than the confidence of a follower

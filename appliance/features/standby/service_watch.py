@@ -10,7 +10,7 @@ If the lease is given away soon, all limits are doubled until this appliance ser
 that cannot serve do not keep passing it back and forth.
 """
 
-from appliance.features.standby.witness import EXPIRY
+from appliance.features.standby.witness.protocol import EXPIRY
 
 OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds

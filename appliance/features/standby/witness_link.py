@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.features.standby.lease import WitnessAnswer, WitnessRequest
-from appliance.features.standby.witness import ANSWER, HIGHEST, REQUEST, name_in, seal, unseal
+from appliance.features.standby.witness.protocol import ANSWER, HIGHEST, REQUEST, name_in, seal, unseal
 
 _MOST_PENDING = 32
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby.lease import WitnessRequest
-from appliance.features.standby.witness import REQUEST, seal
+from appliance.features.standby.witness.protocol import REQUEST, seal
 from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Lab
 from tests.support.features.standby.witness_site import (

@@ -21,7 +21,11 @@ from appliance.features.standby.membership import Membership
 from appliance.features.standby.peer_link import PeerChannel
 from appliance.features.standby.process import LeaseProcess
 from appliance.features.standby.service_watch import OBSTACLE_SECONDS
-from appliance.features.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
+from appliance.features.standby.witness.lease_file import LeaseRecord
+from appliance.features.standby.witness.lease_rules import Witness
+from appliance.features.standby.witness.protocol import EXPIRY
+from appliance.features.standby.witness.request_gate import WitnessGate
+from appliance.features.standby.witness.settings import AppliancePeer
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_root
 from tests.support.waiting import eventually

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.standby import witness
+from appliance.features.standby import feature
 from appliance.features.standby.lease import WitnessRequest
 from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Lab
@@ -268,7 +268,7 @@ def test_forged_datagrams_take_no_room_from_a_renewal(site: Site) -> None:
 
 
 def test_the_units_start_the_witness_and_shut_out_both_before_the_network() -> None:
-    folder = Path(witness.__file__).parent
+    folder = Path(feature.__file__).parent
     units = sorted((folder / "kit_files").glob("*.service"))
     command = [need_program("systemd-analyze", "systemd"), "verify", *map(str, units)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -2,7 +2,6 @@ import contextlib
 import json
 import os
 import secrets
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,11 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.features.standby import witness
 from appliance.features.standby.kit import PairPlan, make_kits
 from appliance.features.standby.membership import PORT, Membership, path_of, save_membership
 from appliance.features.standby.replica_sync import MARK
-from appliance.features.standby.witness import LeaseRecord
+from appliance.features.standby.witness.lease_file import LeaseFile, LeaseRecord
+from appliance.features.standby.witness.one_file import witness_program
 from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
@@ -71,9 +70,9 @@ class StandbySite:
         for path, body in ((self.settings, settings), (self._follower_settings, follower)):
             path.write_text(json.dumps(body))
             path.chmod(0o600)
-        shutil.copy(str(witness.__file__), home / "witness.py")
+        (home / "witness.py").write_text(witness_program())
         (home / "boot").write_text(secrets.token_hex(8))
-        self.lease = witness.LeaseFile(settings["state"], ("a", "b"))
+        self.lease = LeaseFile(settings["state"], ("a", "b"))
         self.witness: Process | None = None
         self._follower: Process | None = None
         self.appliances: dict[str, Appliance] = {}

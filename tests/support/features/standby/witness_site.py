@@ -2,7 +2,6 @@ import contextlib
 import json
 import os
 import resource
-import shutil
 import socket
 import struct
 import sys
@@ -12,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.standby import witness
 from appliance.features.standby.lease import Operation, WitnessAnswer, WitnessRequest
-from appliance.features.standby.witness import LeaseFile
+from appliance.features.standby.witness.lease_file import LeaseFile
+from appliance.features.standby.witness.one_file import witness_program
 from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Host, Lab
 from tests.support.processes import LIMIT, Process
@@ -106,7 +105,7 @@ class Site:
         own = {"appliances": {name: {"address": address} for name, address in ADDRESSES.items()}}
         own |= {"follows_as": "arm", "state": str(folder / "epoch")}
         write_settings(self.follower_settings, common | own)
-        shutil.copy(str(witness.__file__), folder / "witness.py")
+        (folder / "witness.py").write_text(witness_program())
         self.lease = LeaseFile(str(folder / "lease"), ("a", "b"))
         self.servers = {name: self._listening(host, MASTER) for name, host in self.hosts.items()}
         self.node = self._listening(self.robot, NODE)

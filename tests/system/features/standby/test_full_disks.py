@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby.membership import load_membership, path_of, save_membership
-from appliance.features.standby.witness import LeaseRecord
+from appliance.features.standby.witness.lease_file import LeaseRecord
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot

@@ -3,7 +3,7 @@
 import json
 import shutil
 
-from appliance.features.standby import witness
+from appliance.features.standby.witness.lease_file import LeaseFile
 from tests.support.features.standby.standby_robot import StandbyRobot
 from tests.support.features.standby.standby_site import ADDRESSES, FIXED, ROBOT, StandbySite
 from tests.support.waiting import eventually
@@ -53,6 +53,6 @@ def install(site: StandbySite) -> None:
     site.stop_witness()
     site.settings.write_text(json.dumps(settings))
     begin = (folder / "install.sh").read_text().partition("witness.py begin ")[2].partition(" ||")[0].split()
-    site.lease = witness.LeaseFile(settings["state"], ("a", "b"))
+    site.lease = LeaseFile(settings["state"], ("a", "b"))
     site.run_witness("begin", *begin)
     site.start_witness()

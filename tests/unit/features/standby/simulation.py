@@ -21,21 +21,26 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from types import ModuleType
 from typing import Any
 
-from appliance.features.standby import lease, witness, witness_link
+from appliance.features.standby import lease, witness_link
+from appliance.features.standby.witness.firewall import LeaseFirewall
+from appliance.features.standby.witness.lease_file import LeaseRecord
+from appliance.features.standby.witness.one_file import witness_program
+from appliance.features.standby.witness.protocol import ANSWER, REQUEST, Left, unseal
+from appliance.features.standby.witness.settings import AppliancePeer, WitnessSettings
 
 NAMES = ("a", "b")
 KEYS = {name: name.encode() * 32 for name in NAMES}
-SETTINGS = witness.WitnessSettings(
+SETTINGS = WitnessSettings(
     ("10.0.0.1", 7411),
     "10.0.0.100",
     ("11311",),
     {
-        "a": witness.AppliancePeer("10.0.0.2", KEYS["a"]),
-        "b": witness.AppliancePeer("10.0.0.3", KEYS["b"]),
+        "a": AppliancePeer("10.0.0.2", KEYS["a"]),
+        "b": AppliancePeer("10.0.0.3", KEYS["b"]),
     },
     "/lease",
     {},
@@ -55,9 +60,20 @@ class _PowerLost(Exception):  # noqa: N818  it is an event
     pass
 
 
+def module_of(text: str, name: str) -> ModuleType:
+    module = ModuleType(name)
+    exec(compile(text, name, "exec"), module.__dict__)  # noqa: S102  the program as it is delivered, and its mutants
+    return module
+
+
+@cache
+def delivered_witness() -> ModuleType:
+    return module_of(witness_program(), "witness")
+
+
 @dataclass(frozen=True)
 class Product:
-    witness: ModuleType = witness
+    witness: ModuleType = field(default_factory=delivered_witness)
     lease: ModuleType = lease
 
 
@@ -258,7 +274,7 @@ class SimulatedAppliance(Host):
 class SimulatedRobot(Host):
     def __init__(self, history: "History") -> None:
         super().__init__(history, "witness")
-        self.disk = witness.LeaseRecord(1, "", NAMES, "")
+        self.disk = LeaseRecord(1, "", NAMES, "")
         self.boot = 0
         self.rules = ""
         self.network_up = False
@@ -268,7 +284,7 @@ class SimulatedRobot(Host):
         self.gate: Any = None
         self.answering = False
         self.spent = 0.0  # seconds that programs of the firewall have taken in the present step
-        self.firewall = witness.LeaseFirewall(SETTINGS, "nft", self._nft)
+        self.firewall = LeaseFirewall(SETTINGS, "nft", self._nft)
 
     def started(self) -> None:
         """Start the witness. After a boot, the boot rule has run before the network is up."""
@@ -352,8 +368,8 @@ class SimulatedRobot(Host):
             self.history.send("witness", sender, answer)
 
     def _trace(self, sender: str, message: bytes, answer: bytes) -> None:
-        request = witness.unseal(witness.REQUEST, KEYS[sender], message)
-        said = witness.unseal(witness.ANSWER, KEYS[sender], answer)
+        request = unseal(REQUEST, KEYS[sender], message)
+        said = unseal(ANSWER, KEYS[sender], answer)
         if request is None or said is None or "stale" in said or request["do"] == "look":
             return
         other = "b" if sender == "a" else "a"
@@ -404,7 +420,7 @@ class SimulatedRobot(Host):
         if fault == "power":
             raise _PowerLost
 
-    def _nft(self, command: list[str], text: str, _left: witness.Left) -> str:
+    def _nft(self, command: list[str], text: str, _left: Left) -> str:
         if command[1] == "-f":
             fails, product = self.firewall_fails, self.history.product.witness
             if fails and self.history.random.random() < 0.5:

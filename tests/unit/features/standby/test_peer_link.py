@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from appliance.features.standby import peer_link
 from appliance.features.standby.lease import ClaimPromise, PeerMessage, PromiseRequest, TakeOver
 from appliance.features.standby.peer_link import PeerChannel
-from appliance.features.standby.witness import HIGHEST, seal
+from appliance.features.standby.witness.protocol import HIGHEST, seal
 
 KEY = b"\xcc" * 32
 ALL: tuple[PeerMessage, ...] = (

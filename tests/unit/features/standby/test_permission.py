@@ -20,7 +20,11 @@ from appliance.features.standby.process import LeaseProcess
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_frames import Stored
 from appliance.features.standby.replication_sender import ReplicationLag
-from appliance.features.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
+from appliance.features.standby.witness.lease_file import LeaseRecord
+from appliance.features.standby.witness.lease_rules import Witness
+from appliance.features.standby.witness.protocol import EXPIRY
+from appliance.features.standby.witness.request_gate import WitnessGate
+from appliance.features.standby.witness.settings import AppliancePeer
 from tests.support.examples import examples
 from tests.support.memory_channel import memory_link
 from tests.support.virtual_clock import VirtualClock

@@ -7,7 +7,7 @@ import pytest
 from appliance.configuration.config_sources import plain, resolve
 from appliance.features.standby.membership import Membership, load_membership, path_of
 from appliance.features.standby.process import EPOCH, stored_epoch
-from appliance.features.standby.witness import read_settings
+from appliance.features.standby.witness.settings import read_settings
 from appliance.supervisor.state_directory import StateDirectory
 from tests.support.command import rosrv
 

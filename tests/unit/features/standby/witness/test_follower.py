@@ -7,30 +7,28 @@ from typing import Any
 
 import pytest
 
-from appliance.features.standby import witness
-from appliance.features.standby.witness import (
+from appliance.features.standby.witness.enforcement import BoundedLog
+from appliance.features.standby.witness.errors import WitnessError
+from appliance.features.standby.witness.firewall_rules import iptables_rules, nft_rules
+from appliance.features.standby.witness.follower import WitnessFollower
+from appliance.features.standby.witness.following import followed_epoch
+from appliance.features.standby.witness.lease_file import LeaseFile, LeaseRecord
+from appliance.features.standby.witness.lease_rules import Witness
+from appliance.features.standby.witness.program import main
+from appliance.features.standby.witness.protocol import (
     ANSWER,
     EXPIRY,
     HIGHEST,
     OPERATIONS,
     REQUEST,
-    AppliancePeer,
-    BoundedLog,
-    LeaseFile,
-    LeaseRecord,
     Left,
-    Witness,
-    WitnessError,
-    WitnessFollower,
-    WitnessGate,
-    iptables_rules,
-    main,
-    nft_rules,
-    read_settings,
     seal,
     unseal,
 )
-from tests.unit.features.standby.mutants import Mutant, product_of
+from appliance.features.standby.witness.request_gate import WitnessGate
+from appliance.features.standby.witness.settings import AppliancePeer, read_settings
+from tests.unit.features.standby.mutants import WITNESS, Mutant, product_of
+from tests.unit.features.standby.simulation import delivered_witness
 
 BOTH = ("a", "b")
 KEY = b"f" * 32
@@ -328,11 +326,11 @@ def test_a_restarted_follower_goes_on_with_the_witnesss_numbers() -> None:
 def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
     lines: list[str] = []
     log, file = BoundedLog(lines.append, lambda: 0.0), LeaseFile(str(tmp_path / "epoch"), BOTH)
-    assert witness.followed_epoch(file, log) == 0
+    assert followed_epoch(file, log) == 0
     file.write(LeaseRecord(7, "", BOTH, ""))
-    assert witness.followed_epoch(file, log) == 7
+    assert followed_epoch(file, log) == 7
     (tmp_path / "epoch").write_bytes(b"damaged")
-    robot = Robot(epoch=witness.followed_epoch(file, log))
+    robot = Robot(epoch=followed_epoch(file, log))
     assert "systemctl restart rosrv-witness-follow" in lines[0]
     robot.claim("a")
     for _ in range(2):
@@ -348,10 +346,10 @@ class RandomHistory:
     """
 
     def __init__(
-        self, seed: int, *, slow: float = 0.0, faults: bool = True, product: ModuleType = witness
+        self, seed: int, *, slow: float = 0.0, faults: bool = True, product: ModuleType | None = None
     ) -> None:
         self.random = random.Random(seed)  # noqa: S311  a reproducible history
-        self.product = product
+        self.product = product or delivered_witness()
         self.slow, self.faults, self.asking = slow, faults, True
         self.seconds = 0.0
         self.speeds = [self.random.uniform(0.97, 1.03) for _ in range(2)]
@@ -493,8 +491,8 @@ FOLLOWER_MUTANTS = {
 
 
 @pytest.mark.parametrize("mutant", FOLLOWER_MUTANTS)
-def test_a_history_finds_a_wrong_rule_of_the_follower(mutant: str, tmp_path: Path) -> None:
-    product = product_of(Mutant(witness, *FOLLOWER_MUTANTS[mutant], 0), tmp_path).witness
+def test_a_history_finds_a_wrong_rule_of_the_follower(mutant: str) -> None:
+    product = product_of(Mutant(WITNESS, *FOLLOWER_MUTANTS[mutant], 0)).witness
     with pytest.raises(AssertionError):
         for seed in range(20):
             history = RandomHistory(seed, slow=0.5, product=product)
