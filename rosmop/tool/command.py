@@ -33,8 +33,29 @@ from rosmop.tool.renamed_options import RenamedCommand
 from rosmop.tool.summaries import SUMMARIES
 from rosmop.tool.terminal import flowed
 
+_Command = Callable[..., None]
+_EXAMPLES = {
+    "check": "monitors/*.rv",
+    "run": "monitors/safe_triggering.rv --bag drive.bag",
+    "learn": "--bag monday.bag --bag tuesday.bag --output learnt.rv",
+    "coverage": "monitors/*.rv --bag drive.bag --fail-under 80",
+}
 
-def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
+
+def commands_of(program: CommandContext) -> dict[str, _Command]:
+    commands = {
+        "check": _check_of(program),
+        "run": _run_of(program),
+        "learn": _learn_of(program),
+        "coverage": _coverage_of(program),
+    }
+    for name, command in commands.items():
+        more = [flowed(command.__doc__)] if command.__doc__ else []
+        command.__doc__ = "\n\n".join([*more, f"Example: {program.name} {name} {_EXAMPLES[name]}"])
+    return commands
+
+
+def _check_of(program: CommandContext) -> _Command:
     def check(
         files: Files,
         *,
@@ -54,6 +75,10 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         )
         raise typer.Exit(status)
 
+    return check
+
+
+def _run_of(program: CommandContext) -> _Command:
     def run(
         files: Files,
         *,
@@ -72,6 +97,10 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         options = RecordingsOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
         raise typer.Exit(run_command.run(program, files, msg or [], options, output=output, as_json=as_json))
 
+    return run
+
+
+def _learn_of(program: CommandContext) -> _Command:
     def learn(
         *,
         bags: Bags = None,
@@ -93,6 +122,10 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         )
         raise typer.Exit(status)
 
+    return learn
+
+
+def _coverage_of(program: CommandContext) -> _Command:
     def coverage(
         files: Files,
         *,
@@ -114,17 +147,7 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         )
         raise typer.Exit(status)
 
-    commands: dict[str, Callable[..., None]] = {}
-    for name, command, example in (
-        ("check", check, "monitors/*.rv"),
-        ("run", run, "monitors/safe_triggering.rv --bag drive.bag"),
-        ("learn", learn, "--bag monday.bag --bag tuesday.bag --output learnt.rv"),
-        ("coverage", coverage, "monitors/*.rv --bag drive.bag --fail-under 80"),
-    ):
-        more = [flowed(command.__doc__)] if command.__doc__ else []
-        command.__doc__ = "\n\n".join([*more, f"Example: {program.name} {name} {example}"])
-        commands[name] = command
-    return commands
+    return coverage
 
 
 app = typer.Typer(

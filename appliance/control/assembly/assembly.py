@@ -3,21 +3,23 @@
 from dataclasses import dataclass
 from functools import partial
 
-from appliance.channel import messages
+from appliance.configuration.settings import Settings
 from appliance.control.assembly.endpoints import Endpoints, make_endpoints
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
-from appliance.control.assembly.listener_limits import value_limits
+from appliance.control.assembly.master_calls import (
+    make_arrivals,
+    make_lookups,
+    make_node_calls,
+    make_pipeline,
+)
 from appliance.control.assembly.master_core import MasterCore, make_master_core
 from appliance.control.assembly.monitor_states import published_now
 from appliance.master import rosout
-from appliance.master.calls.arrivals import Arrivals, ServeNode
+from appliance.master.calls.arrivals import ServeNode
 from appliance.master.calls.call import Table, served
-from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.call_table import master_table
-from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
-from appliance.master.calls.multicall import Multicall
-from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
+from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.publisher import OwnPublisher
@@ -25,8 +27,8 @@ from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.reminders import RelayMoves, Reminders
 from appliance.master.rosmaster import own_parameters
-from appliance.rpc.fair_queue import LargeWrites, bulk_turns
 from appliance.specifications.specification_manager import SpecificationManager
+from appliance.telemetry.audit_trail import AuditTrail
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,6 @@ class Parts:
 def assemble(base: Foundation) -> Parts:
     core = make_master_core(base)
     ends = make_endpoints(base, core)
-    settings = base.settings
     reminders = Reminders(core.registry, ends.subscribers)
     base.role.on_end_of_gap(reminders.begin)
     parameters = ParameterCalls(
@@ -58,68 +59,22 @@ def assemble(base: Foundation) -> Parts:
         core.rights,
         int(base.settings.limits.offload_bytes),
     )
-    pipeline = _make_pipeline(base, core, ends, parameters)
-    node_calls = NodeCalls(
-        core.registry,
-        core.graph,
-        ends.relay,
-        ends.addresses,
-        ends.relay.nodes,
-        ends.liveness,
-        core.gate,
-        base.port(RVMASTER),
-    )
-    serve = partial(pipeline.handler, served(NODE_CALLS.values(), node_calls))
-    arrivals = Arrivals(
-        core.registry,
-        core.graph,
-        ends.sinks.flush,
-        ends.liveness,
-        places=ends.places,
-        faces=ends.faces,
-        addresses=ends.addresses,
-        serve=serve,
-    )
+    pipeline = make_pipeline(base, core, ends, parameters)
+    port = base.port(RVMASTER)
+    serve = partial(pipeline.handler, served(NODE_CALLS.values(), make_node_calls(core, ends, port)))
+    arrivals = make_arrivals(core, ends, serve)
     registration = RegistrationCalls(
         core.registry, core.graph, arrivals, ends.relay, parameters, ends.subscribers
     )
-    publisher = OwnPublisher(
-        core.registry,
-        core.graph,
-        registration,
-        name=settings.publish_as,
-        inner_port=base.port(INNER),
-        wanted=lambda: (
-            {topic: header.type for topic, header in ends.relay.own_topics.items()}
-            | core.monitors().checked.publications
-        ),
-        services=settings.own_services,
-    )
+    publisher = _make_publisher(base.settings, base.port(INNER), core, ends, registration)
     monitors = _make_monitors(base, core, ends, publisher, reminders)
     core.monitors.set(monitors)
-    port = base.port(RVMASTER)
     monitor_calls = MonitorCalls(monitors, core.registry, ends.relay, ends.rosmaster.port, port)
-    lookups = LookupCalls(
-        core.registry,
-        core.graph,
-        ends.relay,
-        ends.addresses,
-        port,
-        stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
-        unseen=settings.publish_as if settings.hide_publisher else None,
-    )
+    lookups = make_lookups(base.settings, base.lifeline, port, core, ends)
     return Parts(
         core=core,
         endpoints=ends,
-        reconciler=Reconciler(
-            ends.rosmaster,
-            ends.entries,
-            core.registry,
-            ends.subscribers,
-            core.parameters,
-            base.trail,
-            own_parameters=own_parameters,
-        ),
+        reconciler=_make_reconciler(core, ends, base.trail),
         reminders=reminders,
         publisher=publisher,
         monitors=monitors,
@@ -127,6 +82,35 @@ def assemble(base: Foundation) -> Parts:
         pipeline=pipeline,
         table=master_table(registration, lookups, parameters, monitor_calls),
         serve=serve,
+    )
+
+
+def _make_publisher(
+    settings: Settings, inner_port: int, core: MasterCore, ends: Endpoints, registration: RegistrationCalls
+) -> OwnPublisher:
+    return OwnPublisher(
+        core.registry,
+        core.graph,
+        registration,
+        name=settings.publish_as,
+        inner_port=inner_port,
+        wanted=lambda: (
+            {topic: header.type for topic, header in ends.relay.own_topics.items()}
+            | core.monitors().checked.publications
+        ),
+        services=settings.own_services,
+    )
+
+
+def _make_reconciler(core: MasterCore, ends: Endpoints, trail: AuditTrail) -> Reconciler:
+    return Reconciler(
+        ends.rosmaster,
+        ends.entries,
+        core.registry,
+        ends.subscribers,
+        core.parameters,
+        trail,
+        own_parameters=own_parameters,
     )
 
 
@@ -157,34 +141,4 @@ def _make_monitors(
         try_out=compiler.try_out,
         parts=compiler.parts,
         live=lambda: published_now(core.registry, core.carried),
-    )
-
-
-def _make_pipeline(
-    base: Foundation, core: MasterCore, ends: Endpoints, parameters: ParameterCalls
-) -> Pipeline:
-    settings, trail, offload = base.settings, base.trail, int(base.settings.limits.offload_bytes)
-    execution = Execution(
-        gate=core.gate,
-        policy=core.policy,
-        trail=trail,
-        registry=core.registry,
-        flush=ends.sinks.flush,
-        liveness=ends.liveness,
-        parameters=parameters,
-        redecide_for=ends.enforcement.redecide_for,
-        hold_call=base.calls.call,
-        large=offload,
-        large_writes=LargeWrites(offload, base.quota_class, base.role.before_answer),
-    )
-    return Pipeline(
-        execution,
-        Multicall(execution, parameters, trail, offload=offload),
-        addresses=ends.addresses,
-        trail=trail,
-        limits=value_limits(settings),
-        offload=offload,
-        bulk=bulk_turns(base.quota_class),
-        processor=base.listener_limits.time,
-        before_answer=base.role.before_answer,
     )

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
 from appliance.channel import messages
+from appliance.configuration.settings import Settings
 from appliance.control.assembly.current import Current
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.assembly.master_core import MasterCore
+from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery, NodeApiClient
@@ -43,64 +45,25 @@ class Endpoints:
 
 
 def make_endpoints(base: Foundation, core: MasterCore) -> Endpoints:
-    settings = base.settings
-    places = NodePorts(
-        settings.listen_address[0],
-        range(0),  # those of the policy, once it is in force
-        keep=base.lifeline.keep,
-        drop=base.lifeline.drop,
-        policy=core.policy,
-        relays=settings.relays,
-    )
-    nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
+    places = _make_node_ports(base.settings, base.lifeline, core)
+    nodes = NodeApiClient(core.registry, timeout=base.settings.limits.node_call_seconds)
     delivery = Delivery(nodes, troubled=core.watchlist.could_not_tell, quota_class=base.quota_class)
     gate = Current[MonitorCallGate]()
     relay = _make_relay(base, core, places, nodes, gate)
-    rosmaster = RosMaster(
-        settings.rosmaster_port,
-        limits=limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes)),
-    )
+    rosmaster = _make_rosmaster(base.settings)
     faces = ProxyEndpoints(
-        core.registry,
-        places,
-        inner_port=base.port(INNER),
-        server=base.listener_limits.server,
+        core.registry, places, inner_port=base.port(INNER), server=base.listener_limits.server
     )
     entries = MasterRegistrations(rosmaster, core.registry, faces.inner_uri)
-    subscribers = Subscribers(
-        core.registry,
-        core.grants,
-        relay,
-        delivery,
-        lambda: core.parameters.tree,
-        may_read_value=core.rights.may_read_value,
-        may_know_value=core.rights.may_know_value,
-    )
+    subscribers = _make_subscribers(core, relay, delivery)
     stored = StoredGraph(core.grants, base.store)
     sinks = Sinks(core.registry, (stored, subscribers, entries, relay, faces))
-    gate.set(
-        MonitorCallGate(
-            core.registry,
-            core.graph,
-            sinks.flush,
-            core.policy,
-            base.trail,
-            relay,
-            settings.publish_as,
-            own_host(base.sockets[RVMASTER].getsockname()[0]),
-        )
-    )
+    gate.set(_make_call_gate(base, core, relay, sinks))
     enforcement = Enforcement(core.revocation, sinks.flush, relay, places)
     base.enforcement.set(enforcement)
     return Endpoints(
         places=places,
-        addresses=AdvertisedAddresses(
-            [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
-            base.lifeline.route_to if settings.isolation == "netns" else None,
-            base.sockets[RVMASTER].getsockname()[0],
-            fixed=base.role.address,
-            tunnels=settings.ipsec.pool,
-        ),
+        addresses=_make_addresses(base),
         relay=relay,
         rosmaster=rosmaster,
         faces=faces,
@@ -109,18 +72,76 @@ def make_endpoints(base: Foundation, core: MasterCore) -> Endpoints:
         entries=entries,
         sinks=sinks,
         enforcement=enforcement,
-        liveness=Liveness(
-            core.registry,
-            core.graph,
-            core.revocation,
-            subscribers,
-            core.watchlist,
-            nodes=nodes,
-            settings=settings.liveness,
-            quota_class=base.quota_class,
-            refusals=_REFUSALS_OF_A_ROBOT if base.role.paired else _REFUSALS,
-            shut_out=base.role.in_doubt,
-        ),
+        liveness=_make_liveness(base, core, subscribers, nodes),
+    )
+
+
+def _make_node_ports(settings: Settings, lifeline: ControlLifeline, core: MasterCore) -> NodePorts:
+    return NodePorts(
+        settings.listen_address[0],
+        range(0),  # those of the policy, once it is in force
+        keep=lifeline.keep,
+        drop=lifeline.drop,
+        policy=core.policy,
+        relays=settings.relays,
+    )
+
+
+def _make_rosmaster(settings: Settings) -> RosMaster:
+    limits = limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes))
+    return RosMaster(settings.rosmaster_port, limits=limits)
+
+
+def _make_subscribers(core: MasterCore, relay: RelayControl, delivery: Delivery) -> Subscribers:
+    return Subscribers(
+        core.registry,
+        core.grants,
+        relay,
+        delivery,
+        lambda: core.parameters.tree,
+        may_read_value=core.rights.may_read_value,
+        may_know_value=core.rights.may_know_value,
+    )
+
+
+def _make_call_gate(base: Foundation, core: MasterCore, relay: RelayControl, sinks: Sinks) -> MonitorCallGate:
+    return MonitorCallGate(
+        core.registry,
+        core.graph,
+        sinks.flush,
+        core.policy,
+        base.trail,
+        relay,
+        base.settings.publish_as,
+        own_host(base.sockets[RVMASTER].getsockname()[0]),
+    )
+
+
+def _make_addresses(base: Foundation) -> AdvertisedAddresses:
+    settings = base.settings
+    return AdvertisedAddresses(
+        [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
+        base.lifeline.route_to if settings.isolation == "netns" else None,
+        base.sockets[RVMASTER].getsockname()[0],
+        fixed=base.role.address,
+        tunnels=settings.ipsec.pool,
+    )
+
+
+def _make_liveness(
+    base: Foundation, core: MasterCore, subscribers: Subscribers, nodes: NodeApiClient
+) -> Liveness:
+    return Liveness(
+        core.registry,
+        core.graph,
+        core.revocation,
+        subscribers,
+        core.watchlist,
+        nodes=nodes,
+        settings=base.settings.liveness,
+        quota_class=base.quota_class,
+        refusals=_REFUSALS_OF_A_ROBOT if base.role.paired else _REFUSALS,
+        shut_out=base.role.in_doubt,
     )
 
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import Enforcement
-from appliance.policy.judgement import IN_CONTROL
+from appliance.policy.judgement import IN_CONTROL, PolicyContext
 from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
@@ -84,82 +84,122 @@ async def make_foundation(
     """
     policy, registry = CurrentPolicy(), Registry(settings.limits.nodes_per_host)
     quota_class = HostQuotaClass(policy, registry.registrations_of)
-    monitors, enforcement = Current[SpecificationManager](), Current[Enforcement]()
-    signing, receipts, audit, trail = _open_log(settings, lifeline, quota_class)
-    services = PolicyServices()
-    store = StateStore(
-        settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
-    )
-    role.inherit(store)
-    ends = role.ends(store, settings.state / "control" / "age")
-    blocks = BlockTable(store, ends)
+    log = _open_log(settings, lifeline, quota_class)
+    state = _open_state(settings, role)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
-    table = make_host_table(settings, store)
-    host_authority = role.host_authority(signing.link, store, trail, table)
-    tunnels.set(
-        Tunnels(
-            table,
-            trail,
-            *host_authority,
-            listen=settings.listen_address,
-            say=lifeline.say,
-            blocked=lambda: blocks.reasons,
+    hosts = _make_hosts(settings, lifeline, role, log, state)
+    tunnels.set(hosts.tunnels)
+    role.hand_tunnels_to(hosts.tunnels)
+    await hosts.tunnels.start()
+    services, enforcement = PolicyServices(), Current[Enforcement]()
+    known = _policy_context(settings, lifeline, role, hosts, services)
+    return Foundation(
+        settings=settings,
+        lifeline=lifeline,
+        compiler=compiler,
+        signing=log.signing,
+        audit=log.audit,
+        trail=log.trail,
+        receipts=log.receipts,
+        policy_services=services,
+        calls=CallHolder(),
+        own_services=OwnServiceTable(),
+        monitors=Current(),
+        store=state.store,
+        ends=state.ends,
+        hosts=hosts,
+        policies=_make_policies(
+            settings, state, log.trail, policy, known, services=services, enforcement=enforcement
+        ),
+        registry=registry,
+        quota_class=quota_class,
+        listener_limits=ListenerLimits(settings, log.trail, policy, quota_class),
+        sockets=_open_listeners(settings, lifeline),
+        enforcement=enforcement,
+        parameters_dirty=asyncio.Event(),
+        role=role,
+    )
+
+
+class _OpenState(NamedTuple):
+    """The durable state."""
+
+    store: StateStore
+    ends: EndTable
+
+
+def _open_state(settings: Settings, role: ActiveRole) -> _OpenState:
+    folder = settings.state / "control"
+    store = StateStore(folder, failed=lambda reason: _log.error("state is not written", reason=reason))
+    role.inherit(store)
+    return _OpenState(store, role.ends(store, folder / "age"))
+
+
+def _make_hosts(
+    settings: Settings, lifeline: ControlLifeline, role: ActiveRole, log: "_OpenLog", state: _OpenState
+) -> SiteHosts:
+    blocks = BlockTable(state.store, state.ends)
+    table = make_host_table(settings, state.store)
+    authority = role.host_authority(log.signing.link, state.store, log.trail, table)
+    tunnels = Tunnels(
+        table,
+        log.trail,
+        *authority,
+        listen=settings.listen_address,
+        say=lifeline.say,
+        blocked=lambda: blocks.reasons,
+    )
+    blocks.on_change(tunnels.state_anew)
+    return SiteHosts(blocks, table, tunnels, authority)
+
+
+def _policy_context(
+    settings: Settings,
+    lifeline: ControlLifeline,
+    role: ActiveRole,
+    hosts: SiteHosts,
+    services: PolicyServices,
+) -> Callable[[], PolicyContext]:
+    robot = robot_addresses(settings, role.robot)
+    return lambda: services.added_to(
+        replace(
+            IN_CONTROL,
+            hosts=dict(hosts.tunnels.addresses),
+            robot=robot,
+            own=frozenset(lifeline.surroundings.machine),
+            site_keys=settings.site_keys,
+            blocks=hosts.blocks.reasons,
         )
     )
-    blocks.on_change(tunnels().state_anew)
-    role.hand_tunnels_to(tunnels())
-    await tunnels().start()
+
+
+def _make_policies(
+    settings: Settings,
+    state: _OpenState,
+    trail: AuditTrail,
+    policy: CurrentPolicy,
+    known: Callable[[], PolicyContext],
+    *,
+    services: PolicyServices,
+    enforcement: Current[Enforcement],
+) -> Policies:
+    """Make the policies, whose `enforcement` is assembled later."""
 
     def changed(_before: Policy, policy: Policy) -> int:
         services.changed()
         return enforcement().policy_changed(policy)
 
-    robot = robot_addresses(settings, role.robot)
-
-    policies = Policies(
+    return Policies(
         settings.policy,
-        store,
-        ends,
+        state.store,
+        state.ends,
         trail,
         policy,
-        known=lambda: services.added_to(
-            replace(
-                IN_CONTROL,
-                hosts=dict(tunnels().addresses),
-                robot=robot,
-                own=frozenset(lifeline.surroundings.machine),
-                site_keys=settings.site_keys,
-                blocks=blocks.reasons,
-            )
-        ),
+        known=known,
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=changed,
         carried_out=lambda: enforcement().relay.carried_out(),  # noqa: PLW0108  it is assembled later
-    )
-    return Foundation(
-        settings=settings,
-        lifeline=lifeline,
-        compiler=compiler,
-        signing=signing,
-        audit=audit,
-        trail=trail,
-        receipts=receipts,
-        policy_services=services,
-        calls=CallHolder(),
-        own_services=OwnServiceTable(),
-        monitors=monitors,
-        store=store,
-        ends=ends,
-        hosts=SiteHosts(blocks, table, tunnels(), host_authority),
-        policies=policies,
-        registry=registry,
-        quota_class=quota_class,
-        listener_limits=ListenerLimits(settings, trail, policy, quota_class),
-        sockets=_open_listeners(settings, lifeline),
-        enforcement=enforcement,
-        parameters_dirty=asyncio.Event(),
-        role=role,
     )
 
 

@@ -23,66 +23,72 @@ from appliance.supervisor.state_directory import StateDirectory
 from rosmop.tool.terminal import printable, say
 
 _VERB = "rosrv standby"
-_Address = Annotated[str | None, typer.Option(metavar="ADDRESS", show_default=False)]
+_File = Annotated[
+    Path | None,
+    typer.Argument(help="On the other appliance: the file standby-NAME.json that the first one wrote"),
+]
+_Address = Annotated[str | None, typer.Option(help="Address of this appliance, as the robot sees it (IPv4)")]
+_Other = Annotated[str | None, typer.Option(help="Address of the other appliance")]
+_Witness = Annotated[str | None, typer.Option(help="Address of the robot's computer")]
+_Fixed = Annotated[
+    str | None,
+    typer.Option(help="Unused address in the robot's network, at which nodes reach the active appliance"),
+]
+_Name = Annotated[
+    str | None, typer.Option(help="Name of this appliance (default: its name in an earlier pair, or a)")
+]
+_OtherName = Annotated[
+    str | None, typer.Option(help="Name of the other appliance (default: as in an earlier pair, or b)")
+]
+_Followers = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=ADDRESS", help="Another computer that uses the fixed address (repeatable)"),
+]
+_Ports = Annotated[
+    str | None,
+    typer.Option(
+        help="TCP ports at the fixed address: 11311,19001-26000 (default: those of the appliance's configuration"
+        " and policy)"
+    ),
+]
+_PeerPort = Annotated[int, typer.Option(help="Port between the appliances, UDP and TCP", min=1, max=65_535)]
+_Configuration = Annotated[
+    Path | None,
+    typer.Option(help="Configuration file, for the default of --ports (default: ./appliance.yaml)"),
+]
+_KitFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="DIR",
+        help="New folder for the files of the other machines; it has private keys",
+    ),
+]
+_Force = Annotated[
+    bool,
+    typer.Option(
+        "--force", help="Join even if this appliance is one of a pair; all machines are set up again"
+    ),
+]
 
 
 def join(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="On the other appliance: the file standby-NAME.json that the first one wrote"),
-    ] = None,
+    file: _File = None,
     *,
     state: State = DEFAULT_STATE,
-    address: Annotated[
-        str | None, typer.Option(help="Address of this appliance, as the robot sees it (IPv4)")
-    ] = None,
-    other: Annotated[str | None, typer.Option(help="Address of the other appliance")] = None,
-    witness: Annotated[str | None, typer.Option(help="Address of the robot's computer")] = None,
-    fixed: Annotated[
-        str | None,
-        typer.Option(help="Unused address in the robot's network, at which nodes reach the active appliance"),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of this appliance (default: its name in an earlier pair, or a)")
-    ] = None,
-    other_name: Annotated[
-        str | None, typer.Option(help="Name of the other appliance (default: as in an earlier pair, or b)")
-    ] = None,
-    follower: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=ADDRESS", help="Another computer that uses the fixed address (repeatable)"
-        ),
-    ] = None,
-    ports: Annotated[
-        str | None,
-        typer.Option(
-            help="TCP ports at the fixed address: 11311,19001-26000 (default: those of the appliance's configuration"
-            " and policy)"
-        ),
-    ] = None,
-    port: Annotated[
-        int, typer.Option(help="Port between the appliances, UDP and TCP", min=1, max=65_535)
-    ] = PORT,
-    config: Annotated[
-        Path | None,
-        typer.Option(help="Configuration file, for the default of --ports (default: ./appliance.yaml)"),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR",
-            help="New folder for the files of the other machines; it has private keys",
-        ),
-    ] = None,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="Join even if this appliance is one of a pair; all machines are set up again"
-        ),
-    ] = False,
+    address: _Address = None,
+    other: _Other = None,
+    witness: _Witness = None,
+    fixed: _Fixed = None,
+    name: _Name = None,
+    other_name: _OtherName = None,
+    follower: _Followers = None,
+    ports: _Ports = None,
+    port: _PeerPort = PORT,
+    config: _Configuration = None,
+    out: _KitFolder = None,
+    force: _Force = False,
     as_json: Json = False,
 ) -> None:
     """Make this appliance one of two at its next start, and write the files for the other machines.
@@ -99,29 +105,20 @@ def join(
             raise usage_error(f"{file} has all settings: give --state and --force only", _VERB)
         join_second(file, state, again=force, as_json=as_json)
         return
-    given = {"--address": address, "--other": other, "--witness": witness, "--fixed": fixed, "--output": out}
-    missing = [option for option, value in given.items() if value is None]
     if address is None or other is None or witness is None or fixed is None or out is None:
-        raise usage_error(
-            f"missing {', '.join(missing)}; on the other appliance, give the file standby-NAME.json instead",
-            _VERB,
-        )
+        raise _missing(address=address, other=other, witness=witness, fixed=fixed, output=out)
     options = JoinOptions(
-        state=state,
-        address=address,
-        other=other,
-        witness=witness,
-        fixed=fixed,
-        name=name,
-        other_name=other_name,
-        followers=tuple(follower or ()),
-        ports=ports,
-        port=port,
-        config=config,
-        out=out,
-        again=force,
-    )
+        state=state, address=address, other=other, witness=witness, fixed=fixed, name=name, other_name=other_name,
+        followers=tuple(follower or ()), ports=ports, port=port, config=config, out=out, again=force,
+    )  # fmt: skip
     join_first(options, as_json=as_json)
+
+
+def _missing(**options: object) -> typer.Exit:
+    missing = ", ".join(f"--{option}" for option, value in options.items() if value is None)
+    return usage_error(
+        f"missing {missing}; on the other appliance, give the file standby-NAME.json instead", _VERB
+    )
 
 
 def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:

@@ -5,6 +5,7 @@ Exit status: 0 done, or closed; 1 a port is open; 2 failed, no answer, or closed
 
 import json
 import sys
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal, NoReturn
 from urllib.parse import urlsplit
@@ -31,63 +32,72 @@ _MOST_TOLD = 100
 _UNANNOUNCED_SECONDS = 5.0
 
 
+_Appliances = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Address of the appliance, as this machine sees it (default: the one at --state; repeatable)",
+    ),
+]
+_OpenServices = Annotated[
+    list[str] | None,
+    typer.Option("--open", metavar="SERVICES", help="Keep open to all: tcp/22,udp/123 (repeatable)"),
+]
+_Ports = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FIRST-LAST",
+        help="The ports to close or check (default: the local port range here, of this machine or container)",
+    ),
+]
+_Strict = Annotated[
+    bool,
+    typer.Option(
+        "--strict",
+        help="Close the ports also to programs of this machine, except those of --user and --cgroup",
+    ),
+]
+_Users = Annotated[
+    list[str] | None,
+    typer.Option("--user", metavar="USER", help="With --strict: a user that runs nodes (repeatable)"),
+]
+_ControlGroups = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--cgroup",
+        metavar="PATH",
+        help="With --strict: a control group of nodes, such as system.slice/robot.service (repeatable)",
+    ),
+]
+_Apply = Annotated[bool, typer.Option("--apply", help="Apply the rules now, replacing earlier ones")]
+_Checked = Annotated[
+    str | None, typer.Option(metavar="HOST", help="Try the ports of another machine from here")
+]
+_HostName = Annotated[
+    str | None,
+    typer.Option(
+        "--as", metavar="NAME", help="With --check: report the result under this name of an enrolled host"
+    ),
+]
+_Remove = Annotated[bool, typer.Option("--remove", help="Remove the rules")]
+_Within = Annotated[str, typer.Option(help="With --check: the longest wait for each port, 0.05s to 1m")]
+
+
 @speaks_with("One JSON object")
 def protect(
     running: Appliance,
     *,
-    appliance: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Address of the appliance, as this machine sees it (default: the one at --state; repeatable)",
-        ),
-    ] = None,
-    open_services: Annotated[
-        list[str] | None,
-        typer.Option("--open", metavar="SERVICES", help="Keep open to all: tcp/22,udp/123 (repeatable)"),
-    ] = None,
-    ports: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FIRST-LAST",
-            help="The ports to close or check (default: the local port range here, of this machine or container)",
-        ),
-    ] = None,
-    strict: Annotated[
-        bool,
-        typer.Option(
-            "--strict",
-            help="Close the ports also to programs of this machine, except those of --user and --cgroup",
-        ),
-    ] = False,
-    users: Annotated[
-        list[str] | None,
-        typer.Option("--user", metavar="USER", help="With --strict: a user that runs nodes (repeatable)"),
-    ] = None,
-    groups: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--cgroup",
-            metavar="PATH",
-            help="With --strict: a control group of nodes, such as system.slice/robot.service (repeatable)",
-        ),
-    ] = None,
-    apply: Annotated[
-        bool, typer.Option("--apply", help="Apply the rules now, replacing earlier ones")
-    ] = False,
-    check: Annotated[
-        str | None, typer.Option(metavar="HOST", help="Try the ports of another machine from here")
-    ] = None,
-    name: Annotated[
-        str | None,
-        typer.Option(
-            "--as", metavar="NAME", help="With --check: report the result under this name of an enrolled host"
-        ),
-    ] = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove the rules")] = False,
-    within: Annotated[
-        str, typer.Option(help="With --check: the longest wait for each port, 0.05s to 1m")
-    ] = "1s",
+    appliance: _Appliances = None,
+    open_services: _OpenServices = None,
+    ports: _Ports = None,
+    strict: _Strict = False,
+    users: _Users = None,
+    groups: _ControlGroups = None,
+    apply: _Apply = False,
+    check: _Checked = None,
+    name: _HostName = None,
+    remove: _Remove = False,
+    within: _Within = "1s",
 ) -> None:
     """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
 
@@ -115,9 +125,7 @@ def protect(
     try:
         services = protection.parse_services(open_services or ())
         chosen = protection.parse_ports(ports) if ports is not None else protection.local_port_range()
-        if (users or groups) and not strict:
-            _fail("--user and --cgroup need --strict")
-        local = protection.LocalCallers(tuple(users or ()), tuple(groups or ())) if strict else None
+        local = _local_callers(users or (), groups or (), strict=strict)
         if check is not None:
             _check(_CheckTarget(check, name, chosen, services, seconds), running)
         elif remove:
@@ -125,12 +133,24 @@ def protect(
         else:
             _make(appliance or [_own(running)], chosen, services, local, apply=apply, as_json=running.as_json)
             if ports is None and not apply:
-                sys.stderr.write(
-                    f"rosrv: note: {chosen} is the local port range here; for another machine, or the machine of this"
-                    " container, give its own: --ports\n"
-                )
+                _note_default(chosen)
     except (ValueError, NetworkError) as error:
         _fail(str(error))
+
+
+def _local_callers(
+    users: Collection[str], groups: Collection[str], *, strict: bool
+) -> protection.LocalCallers | None:
+    if (users or groups) and not strict:
+        _fail("--user and --cgroup need --strict")
+    return protection.LocalCallers(tuple(users), tuple(groups)) if strict else None
+
+
+def _note_default(ports: PortRange) -> None:
+    sys.stderr.write(
+        f"rosrv: note: {ports} is the local port range here; for another machine, or the machine of this"
+        " container, give its own: --ports\n"
+    )
 
 
 def _make(
