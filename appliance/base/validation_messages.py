@@ -52,6 +52,7 @@ _BODY: dict[str, Callable[..., str]] = {
 
 
 _NAME = re.compile(r"\^\(?\[([\w.-]+)\]\[([\w.-]+)\]\{0,(\d+)\}(?:\)\?)?(?:\$|\\Z)")
+_HEX = re.compile(r"\^\[0-9a-f\]\{(\d+)\}\$")
 _YAML = {
     r"'\\t'": "indent with spaces, not tabs",
     "mapping values are not allowed": "put a string with `: ` in quotes, and indent the keys of a section equally",
@@ -117,6 +118,8 @@ def _cut(text: str) -> str:
 
 
 def _shape(pattern: str) -> str:
+    if (digits := _HEX.fullmatch(pattern)) is not None:
+        return f"{digits[1]} hexadecimal digits (0-9, a-f)"
     found = _NAME.fullmatch(pattern)
     if found is None:
         return f"a string that matches {pattern}"

@@ -11,7 +11,7 @@ from appliance.base.option_group import GroupedVerb
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, say_row
 from rosmop.tool.terminal import say
 
@@ -22,14 +22,14 @@ _Done = TypeVar("_Done")
 ConfirmWithin = Annotated[
     str | None,
     typer.Option(
-        help="Commit-confirm: roll back after this time (30s, 5m, 1h) unless you run `rosrv policy confirm`, or for"
-        " monitors and guards `rosrv monitor confirm`"
+        help="Commit-confirm: roll back after this time (5m; at most 24h) unless you run `rosrv policy confirm`, or"
+        " for monitors and guards `rosrv monitor confirm`"
     ),
 ]
 
 
 def seconds_within(text: str | None, noun: str) -> float | None:
-    return None if text is None else span_given("--confirm-within", text, "30s, 5m or 1h", f"rosrv {noun}")
+    return None if text is None else bounded_span("--confirm-within", text, "1s", "24h", f"rosrv {noun}")
 
 
 def say_deadline(confirm_by: float | None, noun: str) -> None:

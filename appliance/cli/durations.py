@@ -21,22 +21,13 @@ def seconds_of(text: str, units: str) -> float | None:
     return float(found[1]) * _SECONDS[found[2]]
 
 
-def span_given(option: str, text: str, spans: str, verb: str = "rosrv", *, bare: str = "") -> float:
-    """Return seconds; `spans` lists one example of each accepted unit. Exit with status 2 for any other text.
-
-    `bare` is the unit of a number without one, for an option that took such numbers in the last release.
-    """
-    text = _with_unit(option, text, bare)
-    seconds = seconds_of(text, "".join(filter(str.isalpha, spans.replace(" or ", ""))))
-    if seconds is None:
-        raise usage_error(f"{option} {text!r} is not a duration: write {spans}", verb)
-    return seconds
-
-
 def bounded_span(
     option: str, text: str, shortest: str, longest: str, verb: str = "rosrv", *, bare: str = ""
 ) -> float:
-    """Return seconds; both bounds are durations. Exit with status 2 for any other text. `bare` as above."""
+    """Return seconds; both bounds are durations. Exit with status 2 for any other text.
+
+    `bare` is the unit of a number without one, for an option that took such numbers in the last release.
+    """
     text = _with_unit(option, text, bare)
     found = _SPAN.fullmatch(text)
     if found is None:

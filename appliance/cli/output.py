@@ -48,6 +48,14 @@ def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
     return typer.Exit(2)
 
 
+def refuse_beside_dry_run(verb: str, **given: object) -> None:
+    """Exit with a usage error if an option is given that changes nothing in a dry run."""
+    for name, value in given.items():
+        if value:
+            option = f"--{name.replace('_', '-')}"
+            raise usage_error(f"{option} has no effect with --dry-run: leave one of them out", verb)
+
+
 def write_told(path: Path, data: bytes | mmap) -> None:
     """Write a file, and warn if a power cut may lose the data. Raises `OSError`."""
     try:

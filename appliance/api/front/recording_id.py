@@ -10,12 +10,12 @@ OneId = Annotated[
 ]
 
 
-class _HexId(StringConvertor):
-    """Matches a recording's id, but not the word `memory`."""
+class _MeantId(StringConvertor):
+    """Matches what may be meant as a recording's id, so that a wrong one is named (422); not the word `memory`."""
 
-    regex = "[0-9a-f]{20}"
+    regex = "(?!memory(?:/|$))[^/]+"
 
 
-register_url_convertor("recording", _HexId())
+register_url_convertor("recording", _MeantId())
 CONVERTORS = {"{recording_id}": "{recording_id:recording}"}
 """The name of each converter in the contract, and as Starlette matches it."""

@@ -7,10 +7,9 @@ import typer
 from appliance.base.timestamps import in_local_zone
 from appliance.channel.alarms import AlarmList
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, usage_error
 from appliance.features.alarms.requests import (
-    LONGEST_SILENCE_SECONDS,
     AlarmAcknowledge,
     AlarmSilence,
     AlarmsWanted,
@@ -60,9 +59,7 @@ def silence(
     """
     if (time is None) is not end:
         raise usage_error("give either --for TIME or --end", "rosrv alarm")
-    seconds = None if time is None else span_given("--for", time, "30m, 12h or 7d", "rosrv alarm")
-    if seconds is not None and not 1 <= seconds <= LONGEST_SILENCE_SECONDS:
-        raise usage_error(f"--for {time}: an alarm is silenced for 1s to 7d", "rosrv alarm")
+    seconds = None if time is None else bounded_span("--for", time, "1s", "7d", "rosrv alarm")
     _say(appliance.ask_or_exit(AlarmSilence(kind, seconds, note)), as_json=appliance.as_json)
 
 

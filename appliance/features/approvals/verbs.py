@@ -7,7 +7,7 @@ import typer
 
 from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, say_row, usage_error
 from appliance.features.approvals.requests import (
     Approval,
@@ -60,7 +60,7 @@ def approve(
         typer.echo(f"rosrv approve --refuse is now rosrv approval refuse {number}", err=True)
     if refused and last is not None:
         raise usage_error("give --for or --refuse, not both", "rosrv approve")
-    seconds = None if last is None else span_given("--for", last, "30s, 5m or 1h", "rosrv approve")
+    seconds = None if last is None else bounded_span("--for", last, "1s", "1h", "rosrv approve")
     _say(appliance, appliance.answer_or_exit(RefuseCall(number) if refused else ApproveCall(number, seconds)))
 
 

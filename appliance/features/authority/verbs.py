@@ -1,5 +1,6 @@
 """The commands `rosrv drive status|assign|free|ask`."""
 
+import ipaddress
 from typing import Annotated
 
 import typer
@@ -92,7 +93,8 @@ def _show(appliance: Appliance, one: GroupState) -> None:
     shown = appliance.host_in_words
     if one.ranks:
         since = "" if one.held_seconds is None else f" for {one.held_seconds:g} s"
-        say_row([f"{one.group}: {one.standing}{since}: {one.why}"])
+        why = " ".join(shown(word) if _is_address(word) else word for word in one.why.split(" "))
+        say_row([f"{one.group}: {one.standing}{since}: {why}"])
         say_row([f"  rank: {' > '.join(one.ranks)}"])
         return
     held = (
@@ -104,3 +106,11 @@ def _show(appliance: Appliance, one: GroupState) -> None:
     if one.waiting:
         parts = [f"{parts[0]};", f"waiting: {', '.join(map(shown, one.waiting))}"]
     say_row(parts, gap=" ")
+
+
+def _is_address(word: str) -> bool:
+    try:
+        ipaddress.ip_address(word)
+    except ValueError:
+        return False
+    return True

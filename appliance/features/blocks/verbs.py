@@ -10,10 +10,9 @@ from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import moment, say_json, say_row
 from appliance.features.blocks.requests import (
-    LONGEST_BLOCK_SECONDS,
     BlockedHost,
     BlockEnded,
     HostBlock,
@@ -59,11 +58,7 @@ def block(
 
     Example: rosrv host block 10.0.0.7 --for 1h --note "strange traffic"
     """
-    seconds = None if time is None else span_given("--for", time, "30s, 10m, 1h or 2d", "rosrv host")
-    if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
-        raise _usage_error(
-            f"--for {time}: a block lasts 1s to {LONGEST_BLOCK_SECONDS // 86_400}d; without --for it has no end"
-        )
+    seconds = None if time is None else bounded_span("--for", time, "1s", "365d", "rosrv host")
     body = running.answer_or_exit(HostBlock(address, seconds, note, force, dry_run))
     end = (
         f"until {moment(body.until)}"

@@ -6,7 +6,7 @@ import typer
 
 from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import moment, say_json, say_row
 from appliance.features.doors.requests import (
     ConnectedClient,
@@ -105,7 +105,7 @@ def ticket(
 
     Example: rosrv door ticket alice --for 8h
     """
-    seconds = span_given("--for", time, "30s, 10m, 1h or 2d", "rosrv door")
+    seconds = bounded_span("--for", time, "1s", "30d", "rosrv door")
     body = appliance.answer_or_exit(DoorTicket(name, seconds))
     say(f"wss://ADDRESS:8443{body.path}")
     typer.echo(

@@ -60,8 +60,8 @@ class NewDriverCheck(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     command: Annotated[_Name, doc("the topic of the base's velocities")]
     by: Annotated[_Name, doc("the topic that shows how the base moves")]
-    seconds: Annotated[float, doc("motions are withheld for at most this time")] = 2.0
-    patience: Annotated[float, doc("how long it waits for a slow drive, in seconds")] = 30.0
+    seconds: Annotated[float, doc("motions are withheld for at most this time", ge=0.2, le=10)] = 2.0
+    patience: Annotated[float, doc("how long it waits for a slow drive, in seconds", ge=1, le=300)] = 30.0
 
 
 @rest("viewer", "GET", "/v1/guards", ("presets",), name="guards")

@@ -17,7 +17,7 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
-from appliance.cli.output import say_json, say_row
+from appliance.cli.output import refuse_beside_dry_run, say_json, say_row, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.guards.guard_answers import GuardList, GuardRow
 from appliance.features.guards.guard_facts import preset_row, values_of
@@ -43,6 +43,7 @@ from appliance.features.table import verb_function
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import say
 
+_VERB = "rosrv guard"
 _Name = Annotated[
     str,
     typer.Argument(
@@ -163,12 +164,13 @@ def new(
     topics = _pairs([*named, *(further or [])], "--topic NAME=TOPIC")
     given, types = _pairs(values, "PARAMETER=VALUE"), _pairs(kinds, "--type NAME=TYPE")
     guard = name or preset
+    confirmed = seconds_within(confirm_within, "guard")
     if dry_run:
+        refuse_beside_dry_run(_VERB, confirm_within=confirmed, when_standing=when_standing)
         _plan(appliance, GuardTry(preset, topics, types, guard, given, shadow, hold=hold))
         return
-    confirmed = seconds_within(confirm_within, "guard")
     if when_standing:
-        stand_or_exit(appliance, within, "rosrv guard")
+        stand_or_exit(appliance, within, _VERB)
     body = appliance.ask_or_exit(
         GuardNew(preset, topics, given, types, guard, shadow, confirm_within=confirmed, hold=hold)
     )
@@ -200,9 +202,13 @@ def set_values(
         ),
     ] = False,
     since: Annotated[
-        str,
-        typer.Option("--since", help="With --dry-run: from this time: 1h (ago), 14:03, a date, or RFC 3339"),
-    ] = "1h",
+        str | None,
+        typer.Option(
+            "--since",
+            help="With --dry-run: from this time: 1h (ago), 14:03, a date, or RFC 3339",
+            show_default="1h",
+        ),
+    ] = None,
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
     hold: _Hold = False,
@@ -212,16 +218,20 @@ def set_values(
     Example: rosrv guard set fence margin=0.5
     """
     wanted = _pairs(values, "PARAMETER=VALUE")
+    if dry_run:
+        refuse_beside_dry_run(_VERB, when_standing=when_standing)
+    elif since is not None:
+        raise usage_error("--since goes with --dry-run: give both, or neither", _VERB)
     loaded, row, text = _guard(appliance, name)
     preset = preset_of(text)
     assert preset is not None  # noqa: S101  `_guard` checks it
     checked = {each: preset.parameter(each).checked(value) for each, value in wanted.items()}
     if dry_run:
         _plan(appliance, GuardTry(name=name, values=wanted, hold=hold))
-        _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since)
+        _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since or "1h")
         return
     if when_standing:
-        stand_or_exit(appliance, within, "rosrv guard")
+        stand_or_exit(appliance, within, _VERB)
     in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
     constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
     if in_text:
@@ -255,13 +265,15 @@ def enforce(
 
     Example: rosrv guard enforce fence --confirm-within 5m
     """
+    confirmed = seconds_within(confirm_within, "guard")
     if dry_run:
+        refuse_beside_dry_run(_VERB, confirm_within=confirmed, when_standing=when_standing)
         _plan(appliance, GuardTry(name=name, enforce=True))
         return
     _guard(appliance, name)
-    order = admin.MonitorShadow([name], False, confirm_within=seconds_within(confirm_within, "guard"))
+    order = admin.MonitorShadow([name], False, confirm_within=confirmed)
     if when_standing:
-        stand_or_exit(appliance, within, "rosrv guard")
+        stand_or_exit(appliance, within, _VERB)
     body = appliance.answer_or_exit(order)
     say(f"in force: {', '.join(body.names) or 'no change'}")
     if body.began:
@@ -301,20 +313,21 @@ def upgrade(
 
     Example: rosrv guard upgrade --dry-run
     """
+    confirmed, refused = seconds_within(confirm_within, "guard"), False
+    if dry_run:
+        refuse_beside_dry_run(_VERB, confirm_within=confirmed, when_standing=when_standing)
     if name is None:
-        if confirm_within is not None:
-            raise GuardError("--confirm-within is for one guard: name it; see rosrv guard list")
-        if further:
-            raise GuardError("--topic is for one guard: name it; see rosrv guard list")
+        option = "--confirm-within" if confirmed is not None else "--topic" if further else ""
+        if option:
+            raise GuardError(f"{option} is for one guard: name it; see rosrv guard list")
         names = [row.name for row in appliance.ask_or_exit(GuardsWanted()).guards if row.origin == "older"]
         if not names and not appliance.as_json:
             say("no guard has an older version")
     else:
         names = [name]
-    confirmed, refused = seconds_within(confirm_within, "guard"), False
     topics = _pairs(further, "--topic NAME=TOPIC")
-    if when_standing and names and not dry_run:
-        stand_or_exit(appliance, within, "rosrv guard")
+    if when_standing and names:
+        stand_or_exit(appliance, within, _VERB)
     for each in names:
         try:
             if dry_run:
@@ -343,9 +356,10 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
 
     Example: rosrv guard remove fence
     """
+    confirmed = seconds_within(confirm_within, "guard")
     loaded, row, _text = _guard(appliance, name)
     guard = next(one for one in appliance.ask_or_exit(GuardsWanted()).guards if one.name == name)
-    order = admin.MonitorRemove([name], confirm_within=seconds_within(confirm_within, "guard"))
+    order = admin.MonitorRemove([name], confirm_within=confirmed)
     body = appliance.ask_or_exit(order)
     _say_changed(appliance, body)
     if not appliance.as_json and body.confirm_by is None:

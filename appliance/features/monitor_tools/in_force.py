@@ -12,7 +12,7 @@ from appliance.channel.messages import GivenValue
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
@@ -149,9 +149,7 @@ def disable(
 
     Example: rosrv monitor disable safeTrigger --for 10m
     """
-    seconds = (
-        None if time_off is None else span_given("--for", time_off, "30s, 10m, 2h or 1d", "rosrv monitor")
-    )
+    seconds = None if time_off is None else bounded_span("--for", time_off, "1s", "30d", "rosrv monitor")
     _switch(appliance, admin.MonitorSwitch(names, False, for_seconds=seconds), "disabled")
 
 

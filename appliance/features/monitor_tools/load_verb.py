@@ -52,6 +52,7 @@ def load(
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """
+    confirmed = seconds_within(confirm_within, "monitor")
     try:
         sent = read_to_send(files, msg or [])
     except SpecificationError as error:
@@ -62,7 +63,7 @@ def load(
         sent.files,
         sent.definitions,
         note,
-        confirm_within=seconds_within(confirm_within, "monitor"),
+        confirm_within=confirmed,
         signatures=sent.signatures,
         force=force,
         shadow=shadow,

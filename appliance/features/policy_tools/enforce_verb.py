@@ -14,7 +14,7 @@ from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import say_json, write_told
+from appliance.cli.output import refuse_beside_dry_run, say_json, write_told
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.policy_tools.audit_only import EnforcedText, EnforceError, enforced
 from appliance.features.policy_tools.learn import Observation, needed_rights
@@ -95,6 +95,8 @@ def enforce(
     Example: rosrv policy enforce Publishers --confirm-within 5m
     """
     confirmed = seconds_within(confirm_within, "policy")
+    if dry_run:
+        refuse_beside_dry_run("rosrv policy", confirm_within=confirmed, when_standing=when_standing)
     body = body_in_force(appliance)
     try:
         change = enforced(body.text, sections or ())

@@ -25,8 +25,8 @@ RecordingId = Annotated[
 class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The wanted recording: seconds before and after now (by default, as configured), and why."""
 
-    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, doc("seconds")] = None
-    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, doc("seconds")] = None
+    before: Annotated[Annotated[float, msgspec.Meta(ge=0, le=3600)] | None, doc("seconds")] = None
+    after: Annotated[Annotated[float, msgspec.Meta(gt=0, le=3600)] | None, doc("seconds")] = None
     note: Annotated[str, msgspec.Meta(max_length=300)] = ""
 
 

@@ -19,7 +19,7 @@ from appliance.base.user_errors import with_remedy
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given, time_given
+from appliance.cli.durations import bounded_span, time_given
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
 from appliance.features.recorder import requests as recording_requests
@@ -358,7 +358,7 @@ def _convert(bag: Path, target: Path) -> None:
 
 
 def _seconds(option: str, given: str | None) -> float | None:
-    return None if given is None else span_given(option, given, "10s, 2m or 1h", "rosrv record")
+    return None if given is None else bounded_span(option, given, "0.1s", "1h", "rosrv record")
 
 
 def _moment(nanoseconds: int) -> str:

@@ -9,7 +9,7 @@ from appliance.channel.answers.token_answers import NewToken, Token, TokenRole
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.connection.target import Appliance, speaks, speaks_here
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import moment, say_json, say_row
 from rosmop.tool.terminal import say
 
@@ -38,7 +38,7 @@ def add(
 
     Example: rosrv token add alice --role operator --for 30d
     """
-    seconds = span_given("--for", lifetime, "30m, 12h, 90d or 52w")
+    seconds = bounded_span("--for", lifetime, "1s", "3650d", "rosrv token")
     _say_new(appliance.answer_or_exit(TokenAdd(name, role, seconds)))
 
 
@@ -67,11 +67,10 @@ def rotate(
 
     Example: rosrv token rotate dashboard --grace 10m
     """
-    forms = "30m, 12h, 90d or 52w"
     order = TokenRotate(
         name,
-        None if lifetime is None else span_given("--for", lifetime, forms),
-        0.0 if grace is None else span_given("--grace", grace, "30s, 10m, 12h or 7d"),
+        None if lifetime is None else bounded_span("--for", lifetime, "1s", "3650d", "rosrv token"),
+        0.0 if grace is None else bounded_span("--grace", grace, "1s", "3650d", "rosrv token"),
     )
     body = appliance.ask_or_exit(order)
     for row in body.earlier:

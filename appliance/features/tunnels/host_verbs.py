@@ -11,7 +11,7 @@ from appliance.base.validation_messages import meant
 from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import span_given
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import moment, say_json, say_row
 from appliance.features.tunnels.kit_output import key_and_request, placed, wishes_of, write_kit, write_script
 from appliance.features.tunnels.kits import KitOptions
@@ -63,7 +63,10 @@ _Open = Annotated[
 ]
 _Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
 _Within = Annotated[
-    str, typer.Option(help="With --token: the longest wait until the host enrols: 30m, 1h or 7d")
+    str | None,
+    typer.Option(
+        help="With --token: the longest wait until the host enrols: 30m, 1h or 7d", show_default="1h"
+    ),
 ]
 
 
@@ -81,7 +84,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             "--token", help="Print a one-time token and write a script; the host creates its own key"
         ),
     ] = False,
-    within: _Within = "1h",
+    within: _Within = None,
     csr: _Csr = None,
     valid: _Valid = "90d",
     out: _Out = None,
@@ -93,12 +96,9 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     Example: rosrv host add ocu-1 --token
     """
     wishes, days = wishes_of(appliance, ports, opened), _days(valid)
+    seconds = _token_seconds(within, csr, token=token)
     if token:
-        if csr is not None:
-            raise usage_error(
-                "--csr and --token exclude each other: with a token the host sends its own request"
-            )
-        order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
+        order = HostToken(name, token_seconds=seconds, days=days, address=address, new=True)
         _write_script(running, order, wishes, out)
     else:
         _write_kit(running, HostAdd(name, "", days, address), csr, wishes, out)
@@ -112,7 +112,7 @@ def kit(  # noqa: PLR0917  as above
     token: Annotated[
         bool, typer.Option("--token", help="Print a one-time token instead; the host creates a new key")
     ] = False,
-    within: _Within = "1h",
+    within: _Within = None,
     csr: _Csr = None,
     valid: _Valid = "90d",
     out: _Out = None,
@@ -124,8 +124,9 @@ def kit(  # noqa: PLR0917  as above
     Example: rosrv host kit ocu-1
     """
     wishes, days = wishes_of(appliance, ports, opened), _days(valid)
+    seconds = _token_seconds(within, csr, token=token)
     if token:
-        order = HostToken(name, token_seconds=_seconds(within), days=days)
+        order = HostToken(name, token_seconds=seconds, days=days)
         _write_script(running, order, wishes, out)
     else:
         _write_kit(running, HostRenew(name, "", days), csr, wishes, out)
@@ -195,11 +196,16 @@ def revoke(running: Appliance, name: _Name) -> None:
 
 
 def _days(valid: str) -> float:
-    return span_given("--for", valid, "60s, 30m, 12h, 90d or 52w", "rosrv host", bare="d") / _DAY
+    return bounded_span("--for", valid, "1s", "398d", "rosrv host", bare="d") / _DAY
 
 
-def _seconds(within: str) -> float:
-    return span_given("--within", within, "30m, 1h or 7d", "rosrv host")
+def _token_seconds(within: str | None, csr: Path | None, *, token: bool) -> float:
+    if token and csr is not None:
+        raise usage_error("--csr and --token exclude each other: with a token the host sends its own request")
+    seconds = bounded_span("--within", within or "1h", "1m", "7d", "rosrv host")
+    if within is not None and not token:
+        raise usage_error("--within goes with --token: give both, or neither", "rosrv host")
+    return seconds
 
 
 def _write_kit(

@@ -29,11 +29,12 @@ LIBRARY = re.compile(
 @pytest.mark.parametrize(
     ("pattern", "words"),
     [
+        ("^[0-9a-f]{20}$", "20 hexadecimal digits (0-9, a-f)"),
         (r"^([A-Za-z0-9][A-Za-z0-9.-]{0,62})?$",
          "a name of letters, digits, '.', '-', at most 63, that begins with a letter or digit"),
         (r"^[a-z][a-z0-9_-]{0,30}\Z",
          "a name of small letters, digits, '_', '-', at most 31, that begins with a small letter"),
-        ("^[0-9a-f]{64}$", "a string that matches ^[0-9a-f]{64}$"),
+        ("^[0-9a-f]{64}$", "64 hexadecimal digits (0-9, a-f)"),
     ],
 )  # fmt: skip
 def test_the_form_of_a_name_is_described_in_words(pattern: str, words: str) -> None:

@@ -55,3 +55,12 @@ def test_status_has_the_group_and_the_exit_status(
     else:
         found = [line.removesuffix(": free") for line in text.splitlines() if line.endswith(": free")]
     assert (found, ended) == expected
+
+
+def test_the_reason_names_the_host_of_the_driver(capsys: pytest.CaptureFixture[str]) -> None:
+    why = "/teleop on 10.0.0.5 fell silent after a motion: lower ranks wait until it lets go"
+    row = GroupState("base", [], "10.0.0.5", 3.0, 0.0, None, [], ["a"], "/teleop", "lost", why)
+    appliance = appliance_of([row], as_json=False)
+    appliance.host_in_words = lambda host: f"ocu ({host})"
+    verbs.status.function(appliance, None)
+    assert "/teleop on ocu (10.0.0.5) fell silent after a motion" in capsys.readouterr().out
