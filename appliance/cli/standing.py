@@ -1,4 +1,4 @@
-"""Wait until a robot stands: before its protection is changed, a person wants to see that it does not move.
+"""Wait until a robot stands still: before its protection is changed, a person wants to see that it does not move.
 
 1. A robot stands if its last command was zero, and, where it measures its own speed, that was zero too, both for some
    seconds. All commands and all odometry count.
@@ -181,14 +181,14 @@ async def wait_until_standing(master: str, longest: float, source: str = "127.0.
         until = clock.now() + longest
         while why := judge.why_not(clock.now()):
             if clock.now() > until or not commands:
-                raise NotStandingError(f"the robot is not known to stand: {why}")
+                raise NotStandingError(f"the robot is not known to stand still: {why}")
             await asyncio.sleep(_LOOK_SECONDS)
     except RosError as error:
         raise NotStandingError(f"the topics cannot be heard: {error}") from None
     finally:
         await node.close()
     seen = f" and {counted(len(odometry), 'odometry topic')}" if odometry else ""
-    stands = f"the robot stands: zero for {judge.seconds:g} s on {', '.join(commands)}{seen}"
+    stands = f"the robot stands still: zero for {judge.seconds:g} s on {', '.join(commands)}{seen}"
     return f"{stands}. Not seen: {unseen(graph)}"
 
 

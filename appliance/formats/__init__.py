@@ -1,1 +1,1 @@
-"""Define formats that one of appliance and collector writes and the other reads."""
+"""Define the formats of files and messages between the appliance and the collector."""

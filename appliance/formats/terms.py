@@ -78,7 +78,7 @@ class Terms(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for index, ring in enumerate(self.rings):
             if robot in ring.robots or position < ring.percent:
                 return index
-        raise TermsError("the last ring does not have 100 percent")
+        raise TermsError("the last ring does not have 100 percent: write it as --ring rest=100%")
 
     def earliest(self, robot: str, path: BundlePath) -> float:
         """Return when the robot may take the bundle, in seconds since the epoch."""
@@ -96,20 +96,23 @@ def checked_terms(terms: Terms) -> Terms:
     if not 1 <= len(rings) <= _MOST_RINGS:
         raise TermsError(f"a bundle has 1 to {_MOST_RINGS} rings, not {len(rings)}")
     if len({ring.name for ring in rings}) < len(rings):
-        raise TermsError("two rings have the same name")
+        raise TermsError("two rings have the same name: give each --ring its own")
     for ring in rings:
         if _WORD.fullmatch(ring.name) is None:
             raise TermsError(f"{ring.name[:80]!r} is not a valid name of a ring, for example canary")
         if not (ring.robots or ring.percent):
             raise TermsError(f"ring {ring.name} has no robots: give names or a percentage")
         if len(ring.robots) > _MOST_ROBOTS or not all(map(ROBOT_NAME.fullmatch, ring.robots)):
-            raise TermsError(f"ring {ring.name} names more than {_MOST_ROBOTS} robots, or an invalid name")
+            raise TermsError(
+                f"ring {ring.name}: give at most {_MOST_ROBOTS} robots, each by its valid name, or a percentage"
+            )
         if not (0 <= ring.percent <= 100 and 0 <= ring.after <= _LONGEST_WAIT):
             raise TermsError(f"ring {ring.name}: a percentage is 0 to 100, a wait at most 30 days")
     for former, ring in itertools.pairwise(rings):
         if ring.after < former.after or ring.percent < former.percent:
             raise TermsError(
-                f"ring {ring.name} has a shorter wait or a smaller percentage than {former.name}"
+                f"ring {ring.name} has a shorter wait or a smaller percentage than {former.name}, which comes before"
+                " it: change their order"
             )
     if rings[-1].percent != 100:
         raise TermsError(f"the last ring, {rings[-1].name}, must have 100 percent")

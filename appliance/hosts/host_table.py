@@ -74,7 +74,9 @@ class HostTable:
     def require(self, expected: int | None) -> None:
         """Raise `HostsChangedError` unless `expected` is None or the present revision."""
         if expected not in (None, self.revision):
-            raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
+            raise HostsChangedError(
+                f"the table of hosts has revision {self.revision}, not {expected}: read it again (GET /v1/hosts)"
+            )
 
     def changed(self) -> None:
         self.revision += 1
@@ -136,9 +138,14 @@ class HostTable:
             )
         twin = next((other for other in self.rows if other.lower() == name.lower() and other != name), None)
         if twin is not None:
-            raise HostRefusedError(f"{name} differs from {twin} only in letter case, which IKE ignores")
+            raise HostRefusedError(
+                f"{name} differs from {twin} only in letter case, which IKE ignores: choose another name"
+            )
         if name not in self.rows and len(self.rows) >= MOST_HOSTS:
-            raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
+            raise HostRefusedError(
+                f"the table is full: it has {MOST_HOSTS} hosts, including revoked ones, whose names can be enrolled"
+                " again"
+            )
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
         """Return a free address for a host. Raises `HostRefusedError`.
@@ -166,9 +173,11 @@ class HostTable:
             ) from None
         ends = (self.pool.network_address, self.pool.broadcast_address)
         if address not in self.pool or address in ends or str(address) == self.own_address:
-            raise HostRefusedError(f"{address} is not an address of a host in {self.pool}")
+            raise HostRefusedError(
+                f"{address} is not an address of a host in {self.pool}: leave it out, for the next free one"
+            )
         if str(address) in taken:
-            raise HostRefusedError(f"{address} is the address of {taken[str(address)]}")
+            raise HostRefusedError(f"{address} is the address of {taken[str(address)]}: choose another one")
         if before is not None and str(address) != before.address:
             raise HostRefusedError(
                 f"{name} keeps {before.address} permanently: policies and logs identify it by that address"

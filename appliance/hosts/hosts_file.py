@@ -120,7 +120,7 @@ def _read(path: Path) -> tuple[str, dict[str, DeclaredHost]]:
 
 def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:
     if len(text) > _LARGEST:
-        raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
+        raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters: declare fewer hosts")
     reading = _Reading()
     try:
         reading.file(yaml.compose(text, Loader=yaml.SafeLoader))

@@ -16,7 +16,10 @@ class TunnelHosts:
         """Take the hosts of a bundle; with an empty string, go back to `hosts.yaml`. Raises `HostRefusedError`."""
         del who
         if text.strip():
-            raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")
+            raise HostRefusedError(
+                "the bundle declares hosts, and this appliance has no tunnels: remove the hosts"
+                " from the bundle"
+            )
         self._text = text
         return None
 

@@ -164,7 +164,7 @@ def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519Public
     except (ValueError, TypeError, UnsupportedAlgorithm, InvalidSignature, x509.InvalidVersion) as error:
         raise RequestRefusedError(f"not a signing request (PKCS #10) in PEM: {error}") from error
     if not signed:
-        raise RequestRefusedError("the signing request is not signed by its own key")
+        raise RequestRefusedError("the signing request is not signed by its own key: make it again")
     if isinstance(key, ed25519.Ed25519PublicKey):
         return key
     if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP384R1):

@@ -32,10 +32,14 @@ def require_proof(
         certificate = x509.load_pem_x509_certificate(former)
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
-        raise RequestRefusedError("the current certificate is not from this authority") from error
+        raise RequestRefusedError(
+            "the current certificate is not from this authority: create a new kit (rosrv host kit)"
+        ) from error
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     if [attribute.value for attribute in names] != [name]:
-        raise RequestRefusedError("the current certificate has a different name")
+        raise RequestRefusedError(
+            "the current certificate has a different name: create a new kit (rosrv host kit)"
+        )
     if certificate.not_valid_after_utc <= now:
         raise RequestRefusedError("the current certificate has expired: create a new kit (rosrv host kit)")
     key = certificate.public_key()

@@ -31,13 +31,13 @@ class LimitReachedError(Exception):
 
 
 class OwnersJournal(Protocol):
-    """A store of the owners of places. It survives a crash of control."""
+    """Stores which host owns the parameters below a key, so that it survives a crash of control."""
 
     def parameter_owned(self, key: str, host: str) -> None:
         """Store a host as the owner of the parameters at this key and below."""
 
     def parameters_disowned(self, key: str) -> None:
-        """Remove the places at this key and below."""
+        """Remove the owners at this key and below."""
 
 
 @dataclass(slots=True)

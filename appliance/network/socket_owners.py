@@ -89,7 +89,7 @@ def _calls(one: TcpSocket, master_port: int) -> bool:
 
 
 def owners_of(inodes: Iterable[str]) -> dict[str, SocketOwner]:
-    """Return a process that has each socket open."""
+    """Return, for each socket, one process that has it open."""
     found: dict[str, SocketOwner] = {}
     wanted = {f"socket:[{inode}]": inode for inode in inodes}
     for entry in Path("/proc").iterdir() if wanted else ():

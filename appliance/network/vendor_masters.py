@@ -22,7 +22,7 @@ log = structlog.get_logger()
 
 
 def leave_alone(namespace: Namespace, groups: Sequence[str]) -> None:
-    """Exempt the processes of these control groups, and of those that are added to the set, from the translation."""
+    """Exempt the processes of control groups from the address translation; `add_to_set` exempts another group later."""
     lines = [
         f"add set inet {TABLE} {SET} {{ type cgroupsv2; }}",
         f"insert rule inet {TABLE} {Chain.NAT.value} socket cgroupv2 level {_LEVEL} @{SET} counter return",

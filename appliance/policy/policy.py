@@ -249,7 +249,7 @@ class Policy:
         return self.standing(address).alike
 
     def counted_as(self, address: Address) -> str:
-        """Return the same text for hosts that count as one; all unknown hosts have the empty one."""
+        """Return the key of a host in tables by host: equal for hosts that count as one, empty for unknown hosts."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:

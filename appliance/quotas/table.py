@@ -11,9 +11,9 @@ from appliance.quotas.pool import Bounds
 class HonestUse(NamedTuple):
     """The honest use that comes closest to a quota.
 
-    `needs` is its amount in the unit of the row; 0 if no honest host comes near, or if only turns are divided. `of`
-    names the bound that it meets first: that of a host or of the whole, the whole without the kept part, or the
-    robot's part of the disk. `beyond` describes what the host or person notices beyond the bound.
+    `needs` is its amount in the unit of the row; 0 if no honest host comes near, or if only turns are divided.
+    `of` is the bound that it meets first: of one host, of all hosts (`whole`), of all without the part that is kept
+    free (`unkept`), or of the robot's part of the disk. `beyond` describes what a host or person notices beyond it.
     """
 
     use: str

@@ -39,7 +39,7 @@ _encode = msgspec.msgpack.Encoder(order="deterministic").encode
 
 
 class CompiledStore:
-    """The answers in a folder of control."""
+    """A cache of the compiler's answers, as files. The key is the question and the digest of the toolchain."""
 
     def __init__(self, folder: Path, toolchain: str | None = None) -> None:
         """`toolchain` is the digest of everything but the question (default: found when it is needed)."""

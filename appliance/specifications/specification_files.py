@@ -142,11 +142,14 @@ def require_bounded(sources: Sources) -> None:
     """Raise `SpecificationsRefusedError` if the specifications exceed a limit."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
-            [f"{len(sources.files)} specification files; the limit is {_MOST_FILES}"]
+            [
+                f"{len(sources.files)} specification files; the limit is {_MOST_FILES}: put several specifications"
+                " into one file"
+            ]
         )
     if sum(map(len, [*sources.files.values(), *sources.definitions.values()])) > _LONGEST:
         raise SpecificationsRefusedError(
-            [f"specifications and definitions are longer than {_LONGEST} characters"]
+            [f"specifications and definitions are longer than {_LONGEST} characters: load fewer"]
         )
     for name, text in sources.files.items():
         if len(text) > _LONGEST_FILE:

@@ -81,7 +81,11 @@ def reason_of(error: BaseException) -> str:
 def init(
     address: Annotated[
         str | None,
-        typer.Option("--address", help="IP address at which robots reach the collector, for its certificate"),
+        typer.Option(
+            "--address",
+            metavar="ADDRESS",
+            help="IP address at which robots reach the collector, for its certificate",
+        ),
     ] = None,
     config: Config = DEFAULT_CONFIG,
 ) -> None:

@@ -36,9 +36,12 @@ def search(
     context: typer.Context,
     robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot; a glob")] = None,
     limit: Annotated[
-        int, typer.Option("--limit", min=1, max=LARGEST_FLEET_PAGE, help="Largest number of records")
+        int,
+        typer.Option("--limit", min=1, max=LARGEST_FLEET_PAGE, metavar="N", help="Largest number of records"),
     ] = 100,
-    cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
+    cursor: Annotated[
+        str | None, typer.Option("--cursor", metavar="CURSOR", help="Continue where a search ended")
+    ] = None,
     config: Config = DEFAULT_CONFIG,
     *,
     as_json: Json = False,

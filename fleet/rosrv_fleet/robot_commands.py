@@ -13,7 +13,7 @@ from appliance.formats.fleet_membership import Invitation
 from rosrv_fleet.config import load_config
 from rosrv_fleet.enrolment import Robot, RobotGroup, check_name
 from rosrv_fleet.invitations import Invitations
-from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
+from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json, duration
 from rosrv_fleet.presence import RobotPresence
 from rosrv_fleet.receipt_key import make_receipt_key
 from rosrv_fleet.robots import Robots
@@ -26,19 +26,29 @@ OfPair = Annotated[
     str,
     typer.Option("--appliance", metavar="NAME", help="One appliance of a robot with a standby, such as b"),
 ]
-Certificate = Annotated[Path, typer.Option("--certificate", help="The robot's client certificate (PEM)")]
-_LONGEST_HOURS = 24.0 * 30
+_WITHIN = duration("1s", "30d", bare="h")
+Certificate = Annotated[
+    Path, typer.Option("--certificate", metavar="FILE", help="The robot's client certificate (PEM)")
+]
 
 
 @robot_app.command("invite")
 def invite_robots(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of the robots")],
     group: InGroup = "",
-    hours: Annotated[
+    within: Annotated[
         float,
-        typer.Option("--hours", min=0.01, max=_LONGEST_HOURS, help="Hours until the invitations expire"),
-    ] = 24.0,
+        typer.Option(
+            "--within",
+            parser=_WITHIN,
+            metavar="DURATION",
+            show_default="24h",
+            help="The longest wait until the robots join: 30m, 24h or 7d",
+        ),
+    ] = 86_400.0,
     appliance: OfPair = "",
+    *,
+    hours: Annotated[str | None, typer.Option("--hours", hidden=True)] = None,  # its name in the last release
     config: Config = DEFAULT_CONFIG,
 ) -> None:
     """Print an invitation for each robot, one a line. A robot uses it once: `rosrv fleet join FILE`.
@@ -48,6 +58,9 @@ def invite_robots(
 
     Example: rosrv-fleet robot invite arm7 --group site-a/arms > arm7.json
     """
+    if hours is not None:
+        typer.echo("rosrv-fleet: --hours is now --within", err=True)
+        within = _WITHIN(hours)
     found = load_config(config)
     if group:
         RobotGroup.parse(group)
@@ -59,7 +72,7 @@ def invite_robots(
     enrolled = Robots(found.data / "robots").known()
     for name in names:
         own = group or (enrolled[name].group if name in enrolled else "")
-        pending, token = invitations.add(name, group, hours * 3600.0, appliance)
+        pending, token = invitations.add(name, group, within, appliance)
         invitation = Invitation(
             robot=name, group=own, collector=collector, authority=authority, receipt_key=receipt_key, token=token,
             expires=pending.expires,
@@ -70,7 +83,7 @@ def invite_robots(
 @robot_app.command("add")
 def add_robot(
     name: Name,
-    key: Annotated[Path, typer.Option("--key", help="The robot's control/audit.pub (PEM)")],
+    key: Annotated[Path, typer.Option("--key", metavar="FILE", help="The robot's control/audit.pub (PEM)")],
     certificate: Certificate,
     group: InGroup = "",
     *,

@@ -17,9 +17,10 @@ _SEARCHES = 4
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The shared parts. `judging` gives tokens turns to compile texts for queries and dry runs.
+    """The parts that all routes use.
 
-    `ordering` limits the compiling for orders separately, so that orders never wait for queries.
+    `judging` queues the compilations of queries and dry runs, fairly by token. Orders have `ordering` instead, so they
+    never wait for queries.
     """
 
     settings: Settings

@@ -57,7 +57,9 @@ class LogReader:
         """Return a record with its neighbours. Raises `ProblemError`."""
         shown = await self.read(bearer, show, self.path, record_id, neighbours)
         if shown is None:
-            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+            raise ProblemError(
+                404, "unknown", f"there is no record {record_id}: rosrv audit search lists records"
+            )
         return shown
 
     async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:

@@ -148,7 +148,9 @@ def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connec
                     f"{path}: written by version 0.1.0 of rosrv; start version 0.2.0 on it once"
                 )
             if version != LAYOUT_VERSION:
-                raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
+                raise LogUnreadableError(
+                    f"{path}: written by another version of rosrv (layout {version}): use that version"
+                )
             for setting in settings:
                 connection.execute(setting)
             connection.execute("SELECT count(*) FROM sqlite_schema")  # an error may quote bytes of the schema

@@ -283,5 +283,5 @@ def _take_lock(path: Path) -> int:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(lock)
-        raise LogUnreadableError(f"{path}: another process writes this log") from error
+        raise LogUnreadableError(f"{path}: another process writes this log: stop that appliance") from error
     return lock

@@ -12,9 +12,10 @@ from appliance.base.option_group import GroupedCommand, OptionGroup
 from appliance.base.timestamps import TimestampError, parse_timestamp
 
 Since = Annotated[
-    str | None, typer.Option("--since", help="From this time: 1h (ago), 14:03, a date, or RFC 3339")
+    str | None,
+    typer.Option("--since", metavar="TIME", help="From this time: 1h (ago), 14:03, a date, or RFC 3339"),
 ]
-Until = Annotated[str | None, typer.Option("--until", help="Before this time")]
+Until = Annotated[str | None, typer.Option("--until", metavar="TIME", help="Before this time")]
 
 
 def filter_given(

@@ -17,7 +17,7 @@ from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUE
 
 @dataclass(frozen=True)
 class OwnUses:
-    """The resources of the core."""
+    """Yields the use of each resource of the core, for `rosrv limits`; features add their own."""
 
     parts: Parts
     settings: Settings

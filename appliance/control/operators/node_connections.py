@@ -23,7 +23,7 @@ class NodeConnections:
     surroundings: Surroundings
 
     def is_here(self, host: str) -> bool | None:
-        """Return whether a host is the appliance's machine, or null if the appliance, in a container, cannot know."""
+        """Return whether a host is the appliance's machine; None if an appliance in a container cannot know it."""
         address, own = ipaddress.ip_address(host), urlsplit(self.surroundings.master).hostname or ""
         if address.is_loopback or host == own:
             return True

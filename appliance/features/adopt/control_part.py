@@ -1,4 +1,4 @@
-"""Keep the adoption in control: bring the graph to what the record wants, at the start and by orders."""
+"""Adopt or release the graph, at the start and by orders, until it is as the adoption record says."""
 
 import asyncio
 from collections.abc import Callable, Mapping

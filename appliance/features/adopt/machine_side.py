@@ -70,7 +70,7 @@ class AdoptWork:
         self._cuts, self._cut_at = 0, -math.inf
 
     def takes_over(self) -> bool:
-        """Return whether an adoption is wanted or not yet undone; then for the rest of this supervisor's life."""
+        """Return whether an adoption is wanted or not yet undone, now or earlier in this supervisor's life."""
         self._took_over = self._took_over or self.wants()
         return self._took_over
 
@@ -324,7 +324,7 @@ def start_stand_in(host: Namespace, port: int, record: AdoptRecord) -> int:
     until, pause = clock.now() + _START_SECONDS, threading.Event()
     while (holder := host.run(lambda: port_holder(port))) is None:
         if clock.now() > until:
-            raise NetworkError(f"{ROSMASTER} does not listen on TCP {port}")
+            raise NetworkError(f"{ROSMASTER} does not listen on TCP {port}: journalctl has its output")
         pause.wait(_LOOK_SECONDS)
     log.warning("a ROS master was started for the robot", unit=STAND_IN_UNIT, user=user, port=port)
     return holder.pid

@@ -44,16 +44,14 @@ def release(
     ] = False,
     force: Annotated[
         bool,
-        typer.Option(
-            "--force", help="Release even if monitors are enabled and the robot is not known to stand"
-        ),
+        typer.Option("--force", help="Release even if monitors are enabled and the robot may be moving"),
     ] = False,
-    within: Annotated[float, longest_wait("until the robot stands")] = WITHIN,
+    within: Annotated[float, longest_wait("until the robot stands still")] = WITHIN,
 ) -> None:
     """Give the graph of an adopted robot back to its own ROS master, without restarting a node. Needs root.
 
     The appliance runs on, but the robot's nodes no longer use it. While monitors are enabled, it waits until the robot
-    stands, because guards end with the release. Without a master of its own, the robot gets one.
+    stands still, because guards end with the release. Without a master of its own, the robot gets one.
 
     Example: rosrv release
     """

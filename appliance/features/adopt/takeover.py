@@ -252,7 +252,9 @@ class AdoptOperation:
             if same:
                 break
             if readings >= _READINGS:
-                raise AdoptError(f"the graph still changes after {readings} readings")
+                raise AdoptError(
+                    f"the graph still changes after {readings} readings: wait until all nodes have started"
+                )
         await self.machine("phase", phase=Phase.TAKEN)
         report = self._report(cut, readings, [*graph.left_out, *parameters_left], clock.now() - began)
         if reads:

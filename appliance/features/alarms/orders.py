@@ -37,7 +37,9 @@ class AlarmOrders:
         kind, seconds, earlier = request.kind, request.seconds, self._handled.state(request.kind)
         if seconds is None:
             if not self._handled.end(kind):
-                raise UnknownThingError(f"the alarm {kind[:200]} is neither silenced nor acknowledged")
+                raise UnknownThingError(
+                    f"the alarm {kind[:200]} is neither silenced nor acknowledged: rosrv alarm list"
+                )
             self._record("alarm sounds again", f"{kind} is an alarm again", kind, who, "", earlier=earlier)
             return self._list()
         if not 1 <= seconds <= LONGEST_SILENCE_SECONDS:

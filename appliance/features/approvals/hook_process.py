@@ -115,6 +115,7 @@ class HookSender:
         lines = read_given(self._wanted.secret_file, _LONGEST_SECRET).splitlines()
         if not lines or len(lines[0]) < LEAST_SECRET:
             raise ValueError(
-                f"the first line of {self._wanted.secret_file} has fewer than {LEAST_SECRET} characters"
+                f"the first line of {self._wanted.secret_file} has fewer than {LEAST_SECRET} characters: write a"
+                " longer secret"
             )
         return lines[0]

@@ -34,7 +34,7 @@ def purge(state: Path) -> tuple[int, int]:
     try:
         reason = foreign(state)
         if not state.is_dir() or reason is not None:
-            raise BackupError(reason or f"the state directory {state} does not exist")
+            raise BackupError(reason or f"the state directory {state} does not exist: give it with --state")
         if not any(state.iterdir()):
             raise BackupError(f"{state} is empty: nothing to purge")
         lock = StateDirectory(state)

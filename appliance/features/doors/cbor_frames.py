@@ -66,11 +66,13 @@ def _scan(frame: bytes) -> None:
             position, count = _scan_typed_array(frame, position, argument)
             numbers += count
         if numbers > MOST_NUMBERS:
-            raise MessageValueError(f"a frame of more than {MOST_NUMBERS} numbers in typed arrays")
+            raise MessageValueError(
+                f"a frame of more than {MOST_NUMBERS} numbers in typed arrays: send smaller messages"
+            )
         if position + left[-1] > len(frame):
             raise MessageValueError(f"not CBOR: the frame ends inside the value at byte {start}")
         if len(left) > MOST_DEPTH:
-            raise MessageValueError(f"a frame nested deeper than {MOST_DEPTH} levels")
+            raise MessageValueError(f"a frame nested deeper than {MOST_DEPTH} levels: nest it less")
         if items > MOST_ITEMS:
             raise MessageValueError(
                 f"a frame of more than {MOST_ITEMS} values; send numbers as a typed array (RFC 8746)"
@@ -102,7 +104,9 @@ def _scan_typed_array(frame: bytes, position: int, tag: int) -> tuple[int, int]:
         raise MessageValueError(f"the CBOR tag {tag} of a value that is not a byte string")
     element = struct.calcsize(_CODES[tag])
     if size % element:
-        raise MessageValueError(f"a typed array of {size} bytes, with elements of {element} bytes")
+        raise MessageValueError(
+            f"a typed array of {size} bytes, which is not a multiple of its elements' {element} bytes"
+        )
     return position + size, 0 if tag in _BYTE_TAGS else size // element
 
 

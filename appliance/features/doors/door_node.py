@@ -525,7 +525,7 @@ class DoorNode:
                 raise
 
     async def learn(self, topic: str) -> KnownType:
-        """Return the type that counts on a topic. Raise `RosError` if no publisher answers, or none can be used."""
+        """Return the type of a topic, from its publishers. Raise `RosError` if none of them answers or can be used."""
         headers = await self._headers(topic)
         if not headers:
             raise PeerUnreachableError(f"no publisher of {topic} answers")

@@ -103,7 +103,9 @@ class DoorTable:
             raise SenselessError(f"there is a door {name} already: choose another name, or remove it first")
         twin = next((one for one in self._rows if one != name and node_name(one) == node_name(name)), None)
         if twin is not None:
-            raise SenselessError(f"{name} differs from {twin} only in - and _, which ROS names do not allow")
+            raise SenselessError(
+                f"{name} differs from {twin} only in - and _, which is the same name in ROS: choose another name"
+            )
         if name not in self._rows and len(self._rows) >= _MOST_NAMES:
             raise SenselessError(
                 f"{_MOST_NAMES} names of doors were used, the limit: use an earlier name again"

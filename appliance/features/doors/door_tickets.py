@@ -1,4 +1,4 @@
-"""Tickets that open a door. A viewer carries nothing but a URL, so the ticket is part of the URL."""
+"""Tickets that open a door. A browser or Foxglove can be given nothing but a URL, so the ticket is part of it."""
 
 from collections.abc import Collection
 
@@ -39,7 +39,9 @@ class DoorTickets:
         if not 1 <= seconds <= LONGEST_SECONDS:
             raise SenselessError("a ticket is valid for one second to 30 days: write 8h or 7d")
         if len(self.valid()) >= _MOST:
-            raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some end")
+            raise SenselessError(
+                f"there are {_MOST} tickets, the limit: wait until some end, or remove a door (rosrv door remove NAME)"
+            )
         row, text = new_ticket(door, seconds, who)
         self._rows[row.id] = row
         with self._tables.together():

@@ -93,7 +93,7 @@ def one_type(topic: str, headers: Collection[Mapping[str, str]], types: KnownTyp
         raise ProtocolError(f"{topic} has publishers of two types, {words}: use one version")
     for key, header in found.items():
         if key.name != name:
-            raise ProtocolError(f"{topic} has the type {key.name[:200]}, not {name[:200]}")
+            raise ProtocolError(f"{topic} has the type {key.name[:200]}, not {name[:200]}: use that type")
         return types.learn(header)
     raise DefinitionError(
         f"the door does not know this message type: no publisher of {topic} has been heard, and it is not one of"

@@ -142,7 +142,10 @@ class _Bundle:
         found = sequences_in_period(log, *self._span, upto=sealed, limit=MOST_RECORDS + 1)
         self._runs = _runs(found)
         if not found:
-            raise BundleError("the log has no record in that period", "unknown")
+            raise BundleError(
+                "the log has no record in that period: give another one (rosrv audit search --since)",
+                "unknown",
+            )
         if len(found) > MOST_RECORDS:
             raise BundleError(f"more than {MOST_RECORDS} records match: export a shorter period", "request")
         begin = self._runs[0][0]

@@ -227,13 +227,18 @@ def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[byt
     for part in _checked(path, answer).iter_stream():
         size += len(part)
         if size > longest:
-            raise CollectorError(f"{path}: the answer has more than {longest} bytes")
+            raise CollectorError(
+                f"{path}: the answer has more than {longest} bytes: check that fleet.collector is the address of"
+                " rosrv-fleet"
+            )
         yield part
 
 
 def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
     if _header(answer, b"content-encoding") not in (b"", b"identity"):
-        raise CollectorError(f"{path}: the collector compresses its answer")
+        raise CollectorError(
+            f"{path}: the answer is compressed: a proxy before the collector must not do that"
+        )
     if answer.status in _EXPECTED:
         return answer
     refusal = b""

@@ -47,10 +47,10 @@ _log = structlog.get_logger()
 
 
 class PushPosition(msgspec.Struct, frozen=True):
-    """The last segment with a receipt.
+    """The checkpoint and the last record of the last segment with a receipt.
 
-    Before the first receipt (`number` is 0), `sequence` is the last record that was removed before the first step.
-    None: unknown.
+    Before the first receipt, `number` is 0, and `sequence` is the last record that retention had removed by then, or
+    None if that is unknown.
     """
 
     log: str
@@ -110,7 +110,8 @@ class SegmentPusher:
             head = msgspec.json.decode(self.collector.get(f"v1/logs/{log}?upto={upto}"), type=StoredHead)
             if head.number > upto:
                 raise ValueError(
-                    f"the collector answers with checkpoint {head.number}, later than the requested {upto}"
+                    f"the collector answers with checkpoint {head.number}, later than the requested {upto}: upgrade"
+                    " both to the same version"
                 )
             if head.number < lowest:  # the log has no such checkpoint (any more)
                 position = PushPosition(log, head.number, self._kept_sequence(log, head.number))
@@ -228,7 +229,8 @@ class SegmentPusher:
             raise ValueError(f"the collector's receipt is not for segment {number}")
         if not receipt.is_signed(self.receipt_key):
             raise ValueError(
-                "the collector's receipt has a wrong signature: fleet.receipt_key is another collector's"
+                "the collector's receipt has a wrong signature: fleet.receipt_key is another collector's, so join"
+                " again (rosrv fleet join)"
             )
 
     def _keep(self, receipt: SegmentReceipt) -> None:

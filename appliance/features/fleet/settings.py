@@ -57,7 +57,7 @@ class Bundles:
     )
     wait_for_order: bool = key(
         default=False,
-        description="a new bundle waits until `rosrv fleet take`, for example until the robot stands",
+        description="a new bundle waits until `rosrv fleet take`, for example until the robot stands still",
     )
 
     def __post_init__(self) -> None:

@@ -15,9 +15,9 @@ _VERB = "rosrv fleet"
 
 @speaks_here
 def take(appliance: Appliance, *, when_standing: WhenStanding = False, within: Within = WITHIN) -> None:
-    """Try the bundle that waits for an order, as `fleet.bundles.wait_for_order` wants it. Exit status 1 if none waits.
+    """Try the bundle that waits for this order (`fleet.bundles.wait_for_order`). Exit status 1 if none waits.
 
-    With --when-standing, the bundle comes into force only if the robot stands. `rosrv status` shows the result.
+    With --when-standing, the bundle comes into force only when the robot stands still. `rosrv status` shows the result.
 
     Example: sudo rosrv fleet take --when-standing --within 10m
     """

@@ -100,9 +100,9 @@ _BEFORE = _closure()
 
 
 def statements(new: Placed, loaded: Iterable[Placed]) -> str:
-    """Return the `order` statements that the text of a new guard needs, as lines behind it.
+    """Return the `order` statements to append to the source of a new guard.
 
-    The files alone do not order the two: phases move guards, also because of guards of other topics.
+    The order of files is not enough, because a phase may move a guard, even for a guard of another topic.
     """
     pairs = [pair for other in loaded if not other.phased for pair in ((other, new), (new, other))]
     return "".join(

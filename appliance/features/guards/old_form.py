@@ -52,7 +52,7 @@ def list_of(preset: str) -> tuple[str, str] | None:
 
 
 def list_in(text: str, preset: str) -> str | None:
-    """Return the list of a text in its present form, or nothing if the preset has none."""
+    """Return the polygon, joints, deadline or hosts in a source, as `rosrv guard set` takes them now; None without."""
     match _LISTS.get(preset, ("", ""))[0]:
         case "corners":
             cells = _between(text, _POLYGON, "}").split(", ")

@@ -29,7 +29,7 @@ Other = Annotated[
     typer.Option(
         "--other",
         metavar="DIR",
-        help="State directory, or a copy, of the other appliance of a pair: of both logs",
+        help="Also report from the log of the other appliance of a pair: its state directory, or a copy",
     ),
 ]
 

@@ -47,7 +47,7 @@ def who_drove(
         option, (first, last) = ("--between", between) if between else ("--at", (at or "", at or ""))
         begin, end = (time_given(option, text, _VERB) for text in (first, last))
         if begin > end:
-            raise usage_error(f"--between: {first} is after {last}", verb=_VERB)
+            raise usage_error(f"--between: {first} is after {last}: give the earlier time first", verb=_VERB)
         logs = logs_of(audit_of(appliance.way), other, _VERB)
         with OpenedLogs(logs) as opened:
             read = read_records(opened.of_events(_EVENTS), Period(begin, end + 1))

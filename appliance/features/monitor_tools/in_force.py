@@ -41,7 +41,10 @@ Hold = Annotated[
     ),
 ]
 Force = Annotated[
-    bool, typer.Option("--force", help="Load even if this cuts a topic whose publisher has another type")
+    bool,
+    typer.Option(
+        "--force", help="Load or enforce even if this cuts a topic whose publisher has another type"
+    ),
 ]
 
 

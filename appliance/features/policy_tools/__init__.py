@@ -1,1 +1,1 @@
-"""Check, explain, test, compare, grant and learn policies, besides the running appliance."""
+"""Check, explain, test, compare, grant and learn policies; most of it also without a running appliance."""

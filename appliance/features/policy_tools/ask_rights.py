@@ -88,7 +88,7 @@ class AskedPolicy:
     def missing(self, counts: Counter[tuple[RightKind, str]]) -> Iterator[tuple[RightKind, str, int]]:
         """Yield the kinds that the rules deny and no test case denies, with a node and the number of requests.
 
-        Each is judged when it is asked for, by the text of that time.
+        The answer to a kind may change the text, by which the next kind is judged.
         """
         totals: Counter[RightKind] = Counter()
         nodes: dict[RightKind, str] = {}

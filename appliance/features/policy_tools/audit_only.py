@@ -39,7 +39,7 @@ def enforced(text: str, sections: Collection[str] = ()) -> EnforcedText:
     words = [] if entry is None else [word.text.strip("[]").casefold() for word in entry.values]
     lenient = list(_NAMES.values()) if "all" in words else [_NAMES[word] for word in words if word in _NAMES]
     if entry is None or not lenient:
-        raise EnforceError("no section of the policy is audit-only: all of them are enforced")
+        raise EnforceError("no section of the policy is audit-only: all of them are enforced already")
     chosen = [_section(name, lenient) for name in sections] or lenient
     rest = [name for name in lenient if name not in chosen]
     lines = text.split("\n")

@@ -64,7 +64,7 @@ def _of_connection(record: AuditRecord) -> DecidedRequest:
     call = _ASKS.get(record.category or "")
     if call is None or not record.reason.startswith(NO_GRANT) or record.decision is None:
         raise UngrantableError(
-            "no change of the policy would allow it: it was denied for its recorded reason"
+            "no change of the policy would allow it: the reason of the record says what to correct"
         )
     return _of_call(record, call)
 

@@ -89,8 +89,8 @@ def enforce(
 
     The rights of running nodes are compared too, because the record of a right may be older than the period. With
     --dry-run, exit status 1 if a recorded request would have been denied, or a right of a running node would end. The
-    policy file is not changed: a reload brings its text back. A denial because another host holds a node name is not
-    compared.
+    policy file is not changed: a reload brings its text back. Denials that depend on which host
+    has a node name now are not compared.
 
     Example: rosrv policy enforce Publishers --confirm-within 5m
     """

@@ -193,7 +193,7 @@ class RecordingOrders:
                 "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
             )
         if self.link.channel is None:
-            raise UnavailableError("the flight recorder is not running now")
+            raise UnavailableError("the flight recorder is not running now: see rosrv status")
 
     def _find(self, recording_id: str) -> Recording:
         known = self._kept | self._lent
@@ -203,16 +203,16 @@ class RecordingOrders:
                 " further triggers make it longer"
             )
         if recording_id not in known:
-            raise UnknownThingError(f"there is no recording {recording_id[:40]}")
+            raise UnknownThingError(f"there is no recording {recording_id[:40]}: rosrv record list")
         return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
         try:
             answer: _M | recorder_link.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
-            raise UnavailableError("the flight recorder ended before it answered") from None
+            raise UnavailableError("the flight recorder ended before it answered: try again") from None
         except TimeoutError:
-            raise UnavailableError("the flight recorder did not answer") from None
+            raise UnavailableError("the flight recorder did not answer: try again") from None
         if isinstance(answer, recorder_link.RecordingRefused):
             raise (UnknownThingError if answer.unknown else UnavailableError)(answer.reason)
         assert isinstance(answer, kind)  # noqa: S101  the only other answer to such an order

@@ -48,7 +48,10 @@ class RecorderRules(FeatureSection):
 
     def __post_init__(self) -> None:
         if self.longest < self.before + self.after:
-            raise ValueError(f"longest is {self.longest:g}, but before and after together are longer")
+            raise ValueError(
+                f"longest is {self.longest:g}, but before and after together are {self.before + self.after:g}: set"
+                " longest to this at least"
+            )
 
     def services(self) -> tuple[str, ...]:
         return ("record_now",) if self.enabled and "service" in self.triggers else ()

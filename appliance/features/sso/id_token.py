@@ -108,7 +108,7 @@ def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise _refused("its header is not JSON") from None
     if not isinstance(header, dict) or not isinstance(header.get("kid", ""), str):
-        raise _refused("its header has another form")
+        raise _refused("its header is not a JSON object, or its kid is not a string")
     if header.get("alg") not in algorithms:
         raise _refused(
             f"it is signed with {str(header.get('alg'))[:20]!r}; sso.algorithms has {', '.join(algorithms)}"
@@ -136,7 +136,9 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
     public = {name: fitting[0][name] for name in _PUBLIC if name in fitting[0]}
     try:
         if not curve and 8 * len(_decoded(public["n"]).lstrip(b"\0")) < _LEAST_RSA_BITS:
-            raise _refused(f"the provider's key has less than {_LEAST_RSA_BITS} bits")
+            raise _refused(
+                f"the provider's key has less than {_LEAST_RSA_BITS} bits: let it use a longer one"
+            )
         return ECKey.import_key(public) if curve else RSAKey.import_key(public)
     except (JoseError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise _refused(f"the provider's key cannot be used: {error}") from None

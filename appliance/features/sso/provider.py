@@ -83,7 +83,9 @@ class Provider:
             )
         methods = found.code_challenge_methods_supported
         if methods is not None and "S256" not in methods:
-            raise ProviderError(f"{url}: the provider does not support PKCE with S256")
+            raise ProviderError(
+                f"{url}: the provider does not support PKCE with S256: enable it there for this client"
+            )
         return found
 
     async def keys(self) -> Sequence[dict[str, Any]]:

@@ -123,10 +123,16 @@ def _tls(wanted: Sso) -> ssl.SSLContext:
 async def _bounded(url: str, answer: httpcore.Response) -> bytes:
     for name, value in answer.headers:
         if name.lower() == b"content-encoding" and value.lower() != b"identity":
-            raise ProviderError(f"{url}: the provider compresses its answer, which was not requested")
+            raise ProviderError(
+                f"{url}: the provider compresses its answer, which was not requested: switch compression off for the"
+                " appliance"
+            )
     body = bytearray()
     async for part in answer.aiter_stream():
         body += part
         if len(body) > LARGEST_ANSWER:
-            raise ProviderError(f"{url}: the answer has more than {LARGEST_ANSWER} bytes")
+            raise ProviderError(
+                f"{url}: the answer has more than {LARGEST_ANSWER} bytes: check that sso.issuer is the provider's"
+                " address"
+            )
     return bytes(body)

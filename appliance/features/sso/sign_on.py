@@ -124,7 +124,8 @@ class SignOns:
             form |= {"client_id": client, "client_secret": secret}
         else:
             raise ProviderError(
-                f"{url}: the provider accepts a client's secret neither as Basic nor in the form"
+                f"{url}: the provider accepts a client's secret neither as Basic nor in the form: allow one of them"
+                " there"
             )
         status, body = await self._provider.post(url, headers, urlencode(form).encode())
         answer = _json(body)
@@ -138,7 +139,9 @@ class SignOns:
             raise ProviderError(text)
         token = answer.get("id_token")
         if not isinstance(token, str):
-            raise ProviderError(f"{url}: the provider's answer has no ID token")
+            raise ProviderError(
+                f"{url}: the provider's answer has no ID token: make the client there one of OpenID Connect"
+            )
         return token
 
     def _make_room(self, address: str) -> None:

@@ -88,7 +88,7 @@ class ClaimPromise:
 
 @dataclass(frozen=True)
 class TakeOver:
-    """The order to claim now. It ends the promises up to this number."""
+    """The order to claim the lease now. It ends the promises with this number or a lower one."""
 
     epoch: int
     session: str

@@ -85,7 +85,7 @@ class LeaseClient:
 
     async def hand_over(self) -> None:
         if self._handing_over is not None:
-            raise HandOverError("a switchover has already begun")
+            raise HandOverError("a switchover has already begun: wait for it (rosrv standby status)")
         self._handing_over = asyncio.get_running_loop().create_future()
         try:
             self.send(lease_link.HandOverWanted())

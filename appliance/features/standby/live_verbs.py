@@ -38,8 +38,8 @@ def status(
 ) -> None:
     """Show both appliances and the witness: which one is active, and how far behind the standby is.
 
-    Exit status, on both appliances: 0 if the standby could take over now, 1 if not or a follower reports trouble, with
-    the reason, 2 if no appliance runs.
+    Exit status, on both appliances: 0 if the standby could take over now; 1 if not, or if a follower reports trouble,
+    with the reason; 2 if no appliance runs.
 
     Example: rosrv standby status --watch
     """

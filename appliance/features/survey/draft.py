@@ -223,4 +223,7 @@ def _check(text: str, tests: str, robot: str) -> None:
     wrong = [result for result in run_cases(policy, tests, "draft.ini.tests.yaml") if not result.passed]
     if wrong:
         rows = ", ".join(f"{row.request.category.value} {row.request.resource}" for row in wrong[:5])
-        raise DraftError(f"the draft does not decide as the graph is: {rows}")
+        raise DraftError(
+            f"the draft would decide these calls of the present graph differently: {rows}; report this defect, and"
+            " write the policy by hand"
+        )

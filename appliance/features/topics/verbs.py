@@ -123,7 +123,7 @@ def publishers(
         now = clock.wall_ns()
         then = now if at == "now" else time_given("--at", at, "rosrv topic")
         if then > now:
-            raise usage_error(f"--at {at} is in the future")
+            raise usage_error(f"--at {at} is in the future: give a time in the past")
         log = audit_of(appliance.way)
         first = next(iter(log.search(Filter(), None, 1, newest_first=False).entries), None)
         found = publishers_at(log.export, first, topic, then)

@@ -76,7 +76,9 @@ class Certification:
         before = self._revocations[name]
         yield
         if self._revocations[name] != before:
-            raise HostForbiddenError(f"{name} was revoked in the meantime")
+            raise HostForbiddenError(
+                f"{name} was revoked in the meantime: enrol it again (rosrv host add {name})"
+            )
 
     async def require_authority(self) -> None:
         try:
@@ -153,7 +155,9 @@ class Certification:
             )
         row, certificate = self.table.rows[name], self.table.certificates.get(name)
         if certificate is None or not certificate.certificate:
-            raise HostRefusedError(f"the certificate of {name} is not stored here: rosrv host kit {name}")
+            raise HostRefusedError(
+                f"the certificate of {name} is not stored here: issue a new one (rosrv host kit {name})"
+            )
         return KitParts(
             revision=self.table.revision,
             name=name,

@@ -41,7 +41,10 @@ class PortChecks:
         now = clock.wall()
         checked = now if request.checked is None else request.checked
         if checked > now + _CLOCKS_DIFFER:
-            raise HostRefusedError("the time of the check is more than a day in the future")
+            raise HostRefusedError(
+                "the time of the check is more than a day in the future: correct the clock of the host, or of the"
+                " appliance"
+            )
         row = PortsRow(key, state, sorted(set(request.open))[:_MOST_PORTS], min(checked, now), who)
         self._table.keep_ports(row)
         self._trail.happened(

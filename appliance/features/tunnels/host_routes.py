@@ -46,7 +46,7 @@ def add_host_routes(router: Routes, services: Services) -> None:
         for host in found.hosts:
             if host.name == name:
                 return Tagged(host, found.revision)
-        raise ProblemError(404, "unknown", f"there is no host {name}")
+        raise ProblemError(404, "unknown", f"there is no host {name}: GET /v1/hosts lists them")
 
     @router.get(
         "/v1/hosts/{name}/kit", operation_id="host_kit", responses=_KIT | _UNKNOWN, response_class=Response

@@ -204,7 +204,7 @@ def _token_seconds(within: str | None, csr: Path | None, *, token: bool) -> floa
         raise usage_error("--csr and --token exclude each other: with a token the host sends its own request")
     seconds = bounded_span("--within", within or "1h", "1m", "7d", "rosrv host")
     if within is not None and not token:
-        raise usage_error("--within goes with --token: give both, or neither", "rosrv host")
+        raise usage_error("--within goes with --token: give both, or neither")
     return seconds
 
 

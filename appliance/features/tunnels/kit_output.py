@@ -23,7 +23,9 @@ _LONGEST_REQUEST = 16 << 10
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
     """Return the options of a kit. The endpoint is empty if the appliance must choose it."""
     if appliance is not None and not _ENDPOINT.fullmatch(appliance):
-        raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
+        raise usage_error(
+            f"--appliance {appliance!r} is neither an address nor a name: write 10.0.0.2 or robot.example.org"
+        )
     try:
         return KitOptions(appliance or "", ports, tuple(opened or ()))
     except ValueError as error:
@@ -117,4 +119,6 @@ def _read_request(path: Path) -> str:
     except OSError as error:
         raise usage_error(f"--csr {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise usage_error(f"--csr {path}: not a signing request in PEM") from None
+        raise usage_error(
+            f"--csr {path}: not a signing request in PEM: make one with openssl req -new"
+        ) from None

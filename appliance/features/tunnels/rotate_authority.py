@@ -23,7 +23,7 @@ def rotate_authority(state: Path) -> None:
     try:
         reason = foreign(state)
         if not state.is_dir() or reason is not None:
-            raise BackupError(reason or f"the state directory {state} does not exist")
+            raise BackupError(reason or f"the state directory {state} does not exist: give it with --state")
         with closing(StateDirectory(state)):
             _require_single(state)
             with acting_as(folder.stat().st_uid):  # in a container, root may not use the signer's folder

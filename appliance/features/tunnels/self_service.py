@@ -70,7 +70,9 @@ class HostSelfService:
             row = self._in_its_tunnel(name, request.peer)
             certificate = self._table.certificates.get(name)
             if certificate is None or not certificate.certificate:
-                raise HostRefusedError(f"the certificate of {name} is not stored here: rosrv host kit {name}")
+                raise HostRefusedError(
+                    f"the certificate of {name} is not stored here: issue a new one (rosrv host kit {name})"
+                )
             life = row.expires - certificate.made
             self._require_patience(name, life)
             with self._certification.unless_revoked(name):
@@ -111,7 +113,9 @@ class HostSelfService:
             self._trail.happened(
                 "renewal refused", f"not in the tunnel of {name[:80]}", decision="deny", host=peer
             )
-            raise HostForbiddenError(f"{peer} is not the address of {name} in its tunnel")
+            raise HostForbiddenError(
+                f"{peer} is not the address of {name} in its tunnel: run this on {name}, while the tunnel is up"
+            )
         return row
 
     def _require_patience(self, name: str, life: float) -> None:

@@ -114,7 +114,10 @@ class CallGate:
     def _over_limit(self, caller: Caller, api: ApiUri) -> Decision | None:
         host = caller.peer.host
         if self._registry.registrations_of(host) >= self._limits.registrations:
-            return _no(f"{host} has {self._limits.registrations} registrations, the limit for one host")
+            return _no(
+                f"{host} has {self._limits.registrations} registrations, the limit for one host: raise"
+                " limits.topics_per_host"
+            )
         denial = self._too_many_names(host)
         if denial is not None:
             return denial

@@ -242,7 +242,9 @@ class Registry:
             return None
         evicted = self._evictable_of(host)
         if evicted is None:
-            raise HostFullError(f"{host} has {self._most_of_host} nodes, the limit for one host")
+            raise HostFullError(
+                f"{host} has {self._most_of_host} nodes, the limit for one host: raise limits.nodes_per_host"
+            )
         return evicted
 
     def _evictable_of(self, host: Address) -> Incarnation | None:

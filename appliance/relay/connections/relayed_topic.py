@@ -287,7 +287,7 @@ class RelayedTopic:
         self.upstream.connect()
 
     def hush(self) -> None:
-        """Repeat no message to later subscribers, and read on: another publisher of the topic drives."""
+        """Discard the latched and startup messages, because another publisher of the topic now drives; read on."""
         self._startup_replay.forget()
         if not self._superseded:
             self.latch.forget()

@@ -152,7 +152,7 @@ class PublisherConnection(Upstream):
     def recheck(self) -> None:
         """Disconnect a publisher that the specifications now reject, or retry a rejected one.
 
-        Even a quiet publisher must release the monitors' previous module, so its connection is disarmed.
+        The connection is disarmed first: that of a silent publisher would otherwise use the previous module for ever.
         """
         if self._reader is not None:
             self._reader.disarm()

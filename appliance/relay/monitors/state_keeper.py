@@ -58,9 +58,10 @@ class _Head(msgspec.Struct, array_like=True):
 
 @dataclass(slots=True)
 class RecoveredState:
-    """The states that earlier processes left, newest last, and the reasons for lost ones (by monitor; "": all).
+    """The states that earlier processes left.
 
-    A state of a group has the names of its monitors, the layout of its cells, its base, and newer cells.
+    Each of `groups`, newest last, is the names of its monitors, the layout of its cells, its base, and cells that are
+    newer than the base. `lost` has the reason why a monitor's state is missing, or, with the key "", that of all.
     """
 
     groups: list[tuple[list[str], bytes, bytes, bytes | None]] = field(default_factory=list)

@@ -76,7 +76,7 @@ def add(
         list[str] | None,
         typer.Option(metavar="NAME=ROBOT,…|PERCENT%[+WAIT]", help="A ring, in order; the last one has 100%"),
     ] = None,
-    note: Annotated[str, typer.Option(help="A note that is signed with the bundle")] = "",
+    note: Annotated[str, typer.Option(metavar="TEXT", help="A note that is signed with the bundle")] = "",
     keep: Annotated[
         int, typer.Option(min=1, max=20, help="Signed bundles of the group; older ones are withdrawn")
     ] = KEPT,

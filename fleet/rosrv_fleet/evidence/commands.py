@@ -88,7 +88,9 @@ def _content(found: dict[str, Any]) -> str:
 @evidence.command()
 def get(
     evidence_id: Annotated[str, typer.Argument(metavar="ID", help="Its SHA-256, as in `evidence list`")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File (ZIP), must not exist")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="File (ZIP), must not exist")
+    ],
     collector: Url,
     ca: Authority = None,
     token_file: Token = NO_TOKEN,

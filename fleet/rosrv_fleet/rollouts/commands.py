@@ -9,6 +9,7 @@ import typer
 from appliance.base.counted import counted
 from appliance.base.timestamps import local_text
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
+from rosrv_fleet.options import Json, duration
 from rosrv_fleet.output import say, say_json
 
 rollout = typer.Typer(
@@ -16,7 +17,6 @@ rollout = typer.Typer(
 )
 
 Place = Annotated[str, typer.Argument(metavar="SITE/GROUP", help="The site and the robot group")]
-Json = Annotated[bool, typer.Option("--json", metavar="", help="Machine-readable output")]
 _NO_BUNDLES = "; without the section `bundles` of its configuration, a collector has no rollouts"
 _GOOD = ("in force", "no bundle")
 
@@ -30,11 +30,20 @@ def start(
     *,
     share: Annotated[float, typer.Option(help="Share of a ring that must have it in force")] = 0.95,
     tolerance: Annotated[float, typer.Option(help="Share of a ring that may be unhealthy")] = 0.05,
-    healthy: Annotated[float, typer.Option(help="Seconds that a ring must stay healthy")] = 600.0,
+    healthy: Annotated[
+        float,
+        typer.Option(
+            "--healthy",
+            parser=duration("0s", "7d", bare="s"),
+            metavar="DURATION",
+            show_default="10m",
+            help="How long a ring must stay healthy: 90s, 15m",
+        ),
+    ] = 600.0,
 ) -> None:
     """Begin a rollout; the rings are those that were signed with the bundle.
 
-    Example: rosrv-fleet rollout start site-a/arms/13.tar --healthy 900
+    Example: rosrv-fleet rollout start site-a/arms/13.tar --healthy 15m
     """
     gates = {"share": share, "tolerance": tolerance, "healthy_seconds": healthy}
     _show(_asked("POST", "", collector, ca, token_file, {"bundle": bundle, "gates": gates}))

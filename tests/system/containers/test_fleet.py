@@ -308,7 +308,7 @@ def test_a_bundle_reaches_a_robot_in_a_container(walk: Walk) -> None:
     shutil.copy(walk.folder / "bundles" / "root.json", compose.directory)
     compose("up", "--detach", "--no-build", "appliance")
     walk.wait_healthy("collector")
-    walk.run(NAMED["rolls out"].replace("1.tar\n", "1.tar --healthy 0\n"))
+    walk.run(NAMED["rolls out"].replace("1.tar\n", "1.tar --healthy 0s\n"))
 
     def rolled_out() -> bool:
         status = "command rosrv-fleet rollout status --json"

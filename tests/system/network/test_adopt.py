@@ -178,13 +178,14 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
     publish("/odom", "nav_msgs/Odometry", "{twist: {twist: {linear: {x: 0.0}}}}")
     eventually(lambda: "/odom" in str(robot.graph()), robot.ros.story)
     said = rosrv(robot, appliance, "adopt", "--when-standing", "--within", "30s")
-    assert "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic" in said
+    assert "the robot stands still: zero for 3 s on /cmd_vel and 1 odometry topic" in said
     assert "noted" in said
     appliance.start()
     until_taken(robot, appliance)
     said = rosrv(robot, appliance, "policy", "enforce", "--when-standing", "--within", "30s")
     assert (
-        "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no" in said
+        "the robot stands still: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no"
+        in said
     )
     assert "enforces [Publishers]" in said
 

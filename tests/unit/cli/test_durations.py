@@ -1,7 +1,8 @@
 import pytest
 import typer
 
-from appliance.cli.durations import bounded_span, seconds_of
+from appliance.base.durations import seconds_of
+from appliance.cli.durations import bounded_span
 
 
 @pytest.mark.parametrize(
@@ -9,18 +10,12 @@ from appliance.cli.durations import bounded_span, seconds_of
     [("30s", 30), ("5m", 300), ("1.5h", 5400), ("90d", 90 * 86_400), ("52w", 52 * 7 * 86_400)],
 )
 def test_a_duration_is_a_number_and_a_unit(text: str, seconds: float) -> None:
-    assert seconds_of(text, "smhdw") == seconds
+    assert seconds_of(text) == seconds
 
 
-@pytest.mark.parametrize(
-    "text", ["", "5", "m", "-1m", "0s", "0.0h", "1y", "1e9d", "1 h", "٣m", "1m\n", "9999999999s"]
-)
+@pytest.mark.parametrize("text", ["", "5", "m", "-1m", "1y", "1e9d", "1 h", "٣m", "1m\n", "9999999999s"])
 def test_an_invalid_duration_is_none(text: str) -> None:
-    assert seconds_of(text, "smhdw") is None
-
-
-def test_only_the_allowed_units_count() -> None:
-    assert seconds_of("1w", "smh") is None
+    assert seconds_of(text) is None
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("1s", 1), ("0.5m", 30), ("1h", 3600), ("7", 7)])

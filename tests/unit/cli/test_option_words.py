@@ -17,7 +17,7 @@ DURATIONS = {"--for", "--within", "--confirm-within", "--every", "--grace", "--b
 NO_TIME = {("audit checkpoints", "--after"), ("report interventions", "--after")}  # a number, and a report
 # Only these flags let a command do what it would refuse. `--hold` is beside `--force`, so that an operator who
 # accepts one consequence has not accepted the other.
-EVEN = re.compile(r"(Block|Join|Load|Release) even\b")
+EVEN = re.compile(r"(Block|Join|Load|Load or enforce|Release) even\b")
 CONSENT = {"--force", "--hold"}
 # These write a file beside the output of the verb.
 SECOND_OUTPUTS = {

@@ -127,7 +127,10 @@ def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -
     fetched = appliance.recorded("--event", "recording fetched", "--oldest-first", count=2)
     assert [record["detail"]["who"] for record in fetched] == ["operator", "carol"]
     refused = appliance.rosrv("evidence", "export", "../x", "-o", str(tmp_path / "x.zip"), check=False)
-    assert (refused.returncode, refused.stderr) == (1, "rosrv: there is no recording ../x\n")
+    assert (refused.returncode, refused.stderr) == (
+        1,
+        "rosrv: there is no recording ../x: rosrv record list\n",
+    )
     both = ("evidence", "export", recording, "--since", "1h", "-o", str(tmp_path / "x.zip"))
     assert appliance.rosrv(*both, check=False).returncode == 2
 
@@ -136,7 +139,10 @@ def test_a_time_without_records(appliance: Appliance, tmp_path: Path) -> None:
     place = tmp_path / "x.zip"
     span = ("--since", "1970-01-01", "--until", "1970-01-02")
     done = appliance.rosrv("evidence", "export", *span, "-o", str(place), check=False)
-    assert (done.returncode, done.stderr) == (1, "rosrv: the log has no record in that period\n")
+    assert (done.returncode, done.stderr) == (
+        1,
+        "rosrv: the log has no record in that period: give another one (rosrv audit search --since)\n",
+    )
     assert not place.exists()
 
 

@@ -71,8 +71,8 @@ def _unbounded(
 
 
 def test_a_number_of_a_client_has_a_maximum(contract: dict[str, Any]) -> None:
-    """Numbers of more than 64 bits cannot be sent to control, so without a maximum they were a defect (500); a time
-    without one was a change that nobody confirms for years."""
+    """Numbers of more than 64 bits cannot be sent to control, so without a maximum they were a defect (500); without
+    one for times, a change could wait for years to be confirmed."""
     schemas, found, seen = contract["components"]["schemas"], [], 0
     for path, methods in contract["paths"].items():
         for method, operation in methods.items():

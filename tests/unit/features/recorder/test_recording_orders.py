@@ -89,7 +89,7 @@ async def test_a_call_of_the_service_is_an_order() -> None:
 
     scene = Scene()
     away = await scene.orders.called(call)
-    assert (away.success, away.text) == (False, "the flight recorder is not running now")
+    assert (away.success, away.text) == (False, "the flight recorder is not running now: see rosrv status")
     assert scene.trail.events == []
     recorder = scene.attach(answer)
     assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, True, KEPT.id)

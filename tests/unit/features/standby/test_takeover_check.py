@@ -211,7 +211,10 @@ async def test_an_audit_log_that_cannot_be_written(standby: Standby) -> None:
     async with standby.checked(again=0.05) as checked:
         assert await checked.next_obstacle() == ""
         with contextlib.closing(ChainWriter(path, 1)):
-            assert await checked.next_obstacle() == f"{refused}another process writes this log"
+            assert (
+                await checked.next_obstacle()
+                == f"{refused}another process writes this log: stop that appliance"
+            )
         assert await checked.next_obstacle() == ""
         path.with_name("audit.db-wal").mkdir()
         assert await checked.next_obstacle() == f"{refused}unable to open database file"

@@ -126,8 +126,16 @@ def joined(registry: Registry, number: int, name: str) -> Incarnation:
 @pytest.mark.parametrize(
     ("registry", "limits", "words"),
     [
-        (Registry(3), HostLimits(), "10.1.0.1 has 3 nodes, the limit for one host"),
-        (Registry(), HostLimits(registrations=3), "10.1.0.1 has 3 registrations, the limit for one host"),
+        (
+            Registry(3),
+            HostLimits(),
+            "10.1.0.1 has 3 nodes, the limit for one host: raise limits.nodes_per_host",
+        ),
+        (
+            Registry(),
+            HostLimits(registrations=3),
+            "10.1.0.1 has 3 registrations, the limit for one host: raise limits.topics_per_host",
+        ),
     ],
 )
 def test_a_host_has_a_limit_of_nodes_and_registrations(

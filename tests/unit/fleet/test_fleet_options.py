@@ -1,0 +1,92 @@
+"""The options of `rosrv-fleet` have the names and the kinds of values of `rosrv`'s."""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import typer
+from rosrv_fleet.cli import app
+from typer.testing import CliRunner
+
+from tests.unit.cli.test_option_words import DURATIONS, MEANINGS, OPTIONS, POINTS
+
+# Names with another kind of value than in `rosrv`, where it is another thing.
+OTHER_THINGS = {
+    "--key": {"FILE"},
+    "--appliance": {"NAME"},  # one appliance of a pair; in `rosrv` the appliance's address
+    "--group": {"SITE/GROUP"},
+    "--keep": {""},  # a number of bundles
+    "--robot": {""},  # a name; in `rosrv` an address
+    "--role": {""},
+}
+OWN_DURATIONS = {"--healthy"}
+
+
+def _commands(command: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    if not hasattr(command, "commands"):
+        yield name.strip(), command
+    for inner, one in getattr(command, "commands", {}).items():
+        yield from _commands(one, f"{name} {inner}")
+
+
+FLEET = [
+    (verb, max(one.opts, key=len), one)
+    for verb, command in _commands(typer.main.get_command(app))
+    for one in command.params
+    if one.param_type_name == "option" and one.name != "help" and not one.hidden
+]
+
+
+def test_commands_are_found() -> None:
+    assert len(FLEET) > 80
+
+
+def test_times_are_time_and_lengths_of_time_are_duration() -> None:
+    for verb, name, one in FLEET:
+        assert (name in POINTS) is (one.metavar == "TIME"), (verb, name)
+        assert (name in DURATIONS | OWN_DURATIONS) is (one.metavar == "DURATION"), (verb, name)
+
+
+def test_no_time_is_a_bare_number() -> None:
+    numbers = {name for _verb, name, one in FLEET if one.metavar is None and type(one.default) is float}
+    assert numbers == {"--share", "--tolerance"}  # shares
+
+
+def test_a_written_file_is_the_output() -> None:
+    for verb, name, one in FLEET:
+        writes = one.help.startswith(("File (", "File for", "Write", "Draw"))
+        assert (name == "--output") is writes, (verb, name)
+        assert (name == "--output") is ("-o" in one.opts), (verb, name)
+
+
+def test_consent_has_one_name() -> None:
+    for verb, name, one in FLEET:
+        assert (name == "--yes") is one.help.startswith("Do not ask"), (verb, name)
+        assert name not in {"--confirm", "--again", "--wait", "--days", "--hours", "--seconds"}, (verb, name)
+
+
+def test_help_is_a_phrase_without_a_full_stop() -> None:
+    assert [(verb, name) for verb, name, one in FLEET if not one.help or one.help.endswith(".")] == []
+
+
+def test_an_option_of_both_programs_has_one_kind_of_value() -> None:
+    both = defaultdict(set)
+    for option in OPTIONS:
+        both[option.name].add(option.metavar)
+    for _verb, name, one in FLEET:
+        if name in both and name not in MEANINGS:
+            found = {one.metavar or ""}
+            assert found <= both[name] | OTHER_THINGS.get(name, set()), (name, found, both[name])
+
+
+def test_the_former_option_is_accepted_with_a_note() -> None:
+    done = CliRunner().invoke(app, ["robot", "invite", "a", "--hours", "9999"])
+    assert (done.exit_code, "--hours is now --within" in done.output) == (2, True)
+    assert "9999 is now 9999h" in done.output and "out of bounds" in done.output
+
+
+def test_a_number_of_seconds_is_accepted_with_a_note() -> None:
+    done = CliRunner().invoke(
+        app, ["rollout", "start", "a/b/1.tar", "--collector", "https://x", "--healthy", "9999999"]
+    )
+    assert (done.exit_code, "9999999 is now 9999999s" in done.output) == (2, True)
