@@ -2,12 +2,13 @@
 
 When no callback is ready, the clock jumps to the next timer. Without a timer, `DeadlockError` names the waiting
 tasks. A function passed to `to_thread` runs in the loop. Sockets, signals, programs and calls from other threads
-raise `RealLoopError`.
+raise `RealLoopError`; `LocalLoop` has the sockets of `local_sockets.py`.
 """
 
 import asyncio
 import contextlib
 import math
+import selectors
 import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextvars import Context
@@ -30,21 +31,18 @@ class RealLoopError(Exception):
     pass
 
 
-class AutojumpLoop(asyncio.BaseEventLoop):
-    """The loop. It must be used inside `clock.using(machine)`, as `autojump` does."""
+class _JumpingLoop(asyncio.BaseEventLoop):
+    """The part that both loops share. They must be used inside `clock.using(machine)`, as `autojump` does."""
 
+    machine: VirtualClock
+    _jumps = 0
+    _most_jumps = _MOST_JUMPS
     _thread_id: int | None  # of the thread that runs the loop
-
-    def __init__(self, machine: VirtualClock, most_jumps: int = _MOST_JUMPS) -> None:
-        super().__init__()
-        self.machine = machine
-        self._selector = self  # `BaseEventLoop` selects when it has run what was ready
-        self._jumps, self._most_jumps = 0, most_jumps
 
     def time(self) -> float:
         return self.machine.now_ns() / 1e9
 
-    def select(self, timeout: float | None) -> list[Never]:
+    def _jump(self, timeout: float | None) -> None:
         if timeout is None:
             raise DeadlockError(f"deadlock: {self._waiting()}")
         if timeout > 0:
@@ -54,9 +52,7 @@ class AutojumpLoop(asyncio.BaseEventLoop):
             self.machine.advance_ns(math.ceil(timeout * 1e9))
         # A timer is due if it is later by less than this: after a year, a float has steps of more than a nanosecond.
         self._clock_resolution = max(1e-9, 2 * math.ulp(self.time()))
-        return []
 
-    def _process_events(self, _events: list[Never]) -> None: ...
     def _write_to_self(self) -> None: ...
 
     def _waiting(self) -> str:
@@ -68,7 +64,7 @@ class AutojumpLoop(asyncio.BaseEventLoop):
         self, callback: Callable[[*_Arguments], object], *args: *_Arguments, context: Context | None = None
     ) -> asyncio.Handle:
         if self._thread_id not in (None, threading.get_ident()):
-            self._refuse()
+            self.refuse()
         return self.call_soon(callback, *args, context=context)
 
     def run_in_executor(
@@ -94,28 +90,64 @@ class AutojumpLoop(asyncio.BaseEventLoop):
         finally:
             asyncio._set_running_loop(self)
 
-    def remove_reader(self, _fd: object) -> bool:
-        return False
-
-    remove_writer = remove_signal_handler = remove_reader  # type: ignore[assignment]  # parameters' names differ
-
-    def _refuse(self, *_args: object, **_options: object) -> Never:
+    def refuse(self, *_args: object, **_options: object) -> Never:
         raise RealLoopError(
             "this test uses a socket, a signal, a program or a thread, which a loop with virtual time does not have:"
             " replace it, or mark the test `real` or `nightly`"
         )
 
-    async def _refuse_to_wait(self, *_args: object, **_options: object) -> Never:
-        self._refuse()
+    async def refuse_to_wait(self, *_args: object, **_options: object) -> Never:
+        self.refuse()
 
     if not TYPE_CHECKING:  # the signatures are many, and nothing is done with the arguments
-        add_reader = add_writer = add_signal_handler = _refuse
-        sock_accept = sock_connect = sock_recv = sock_recv_into = sock_recvfrom = _refuse_to_wait
-        sock_sendall = sock_sendfile = sock_sendto = _refuse_to_wait
-        create_connection = create_server = create_datagram_endpoint = _refuse_to_wait
-        create_unix_connection = create_unix_server = _refuse_to_wait
-        connect_accepted_socket = connect_read_pipe = connect_write_pipe = _refuse_to_wait
-        subprocess_exec = subprocess_shell = _refuse_to_wait
+        add_signal_handler = refuse
+        create_datagram_endpoint = connect_read_pipe = connect_write_pipe = refuse_to_wait
+        subprocess_exec = subprocess_shell = refuse_to_wait
+
+
+class AutojumpLoop(_JumpingLoop):
+    def __init__(self, machine: VirtualClock, most_jumps: int = _MOST_JUMPS) -> None:
+        super().__init__()
+        self.machine, self._most_jumps = machine, most_jumps
+        self._selector = self  # `BaseEventLoop` selects when it has run what was ready
+
+    def select(self, timeout: float | None) -> list[Never]:
+        self._jump(timeout)
+        return []
+
+    def _process_events(self, _events: list[Never]) -> None: ...
+
+    def remove_reader(self, _fd: object) -> bool:
+        return False
+
+    remove_writer = remove_signal_handler = remove_reader  # type: ignore[assignment]  # parameters' names differ
+
+    if not TYPE_CHECKING:
+        add_reader = add_writer = _JumpingLoop.refuse
+        sock_accept = sock_connect = sock_recv = sock_recv_into = sock_recvfrom = _JumpingLoop.refuse_to_wait
+        sock_sendall = sock_sendfile = sock_sendto = _JumpingLoop.refuse_to_wait
+        create_connection = create_server = connect_accepted_socket = _JumpingLoop.refuse_to_wait
+        create_unix_connection = create_unix_server = _JumpingLoop.refuse_to_wait
+
+
+class LocalLoop(_JumpingLoop, asyncio.SelectorEventLoop):
+    """A loop for local sockets: time passes when no socket is ready. It is made inside `local_sockets`."""
+
+    def __init__(self, machine: VirtualClock, most_jumps: int = _MOST_JUMPS) -> None:
+        self.machine, self._most_jumps = machine, most_jumps
+        super().__init__(_JumpingSelector(self._jump))
+
+
+class _JumpingSelector(selectors.EpollSelector):
+    def __init__(self, jump: Callable[[float | None], None]) -> None:
+        super().__init__()
+        self._jump = jump
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        if not ready and timeout != 0:
+            self._jump(timeout)
+        return ready
 
 
 def _place(coroutine: Any) -> str:
@@ -131,13 +163,16 @@ def _place(coroutine: Any) -> str:
 
 @contextlib.contextmanager
 def autojump(
-    machine: VirtualClock | None = None, *, most_jumps: int = _MOST_JUMPS
-) -> Iterator[Callable[[], AutojumpLoop]]:
+    machine: VirtualClock | None = None,
+    *,
+    most_jumps: int = _MOST_JUMPS,
+    kind: type[AutojumpLoop | LocalLoop] = AutojumpLoop,
+) -> Iterator[Callable[[], AutojumpLoop | LocalLoop]]:
     """Yield a factory of loops. `machine` becomes the clock of the block; the default is the test's own."""
     present = clock.source()
     machine = machine or (present if isinstance(present, VirtualClock) else VirtualClock())
     with clock.using(machine):
-        yield lambda: AutojumpLoop(machine, most_jumps)
+        yield lambda: kind(machine, most_jumps)
 
 
 def run(main: Coroutine[Any, Any, _Result], *, most_jumps: int = _MOST_JUMPS) -> _Result:

@@ -17,6 +17,8 @@ from typing import Any
 
 import pytest
 
+from tests.support.local_sockets import LocalSocket
+
 _FORBIDDEN = {
     "os.exec": "starts a program",
     "os.fork": "starts a process",
@@ -62,8 +64,8 @@ class Watch:
         finally:
             self._found, self._watched = outer
 
-    def _event(self, event: str, _arguments: tuple[Any, ...]) -> None:
-        if self._watched and event in _FORBIDDEN and not _is_harmless(event):
+    def _event(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if self._watched and event in _FORBIDDEN and not _is_harmless(event, arguments):
             self._refuse(_FORBIDDEN[event])
 
     def _forbidding(self, what: str, act: Callable[..., Any]) -> Callable[..., Any]:
@@ -105,7 +107,9 @@ def callers(depth: int) -> Iterator[str]:
         depth, frame = depth - 1, frame.f_back
 
 
-def _is_harmless(event: str) -> bool:
-    """Allow the sockets with which threads wake a loop, and the one with which urllib3 tests for IPv6."""
+def _is_harmless(event: str, arguments: tuple[Any, ...]) -> bool:
+    """Allow local sockets, those with which threads wake a loop, and the one with which urllib3 tests for IPv6."""
+    if event == "socket.__new__" and isinstance(arguments[0], LocalSocket):
+        return True
     makers = {"asyncio.selector_events", "urllib3.util.connection"}
     return event == "socket.__new__" and not makers.isdisjoint(itertools.islice(callers(2), 5))

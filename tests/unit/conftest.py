@@ -1,10 +1,13 @@
+import itertools
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from tests.support.autojump import autojump
+from tests.support.autojump import AutojumpLoop, LocalLoop, autojump
 from tests.support.determinism import may_depend_on_chance
+from tests.support.local_sockets import local_sockets as in_one_thread
 
 
 @pytest.fixture
@@ -12,5 +15,29 @@ def anyio_backend(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[st
     if may_depend_on_chance(request.node):
         yield "asyncio", {}
     else:
-        with autojump() as new_loop:
+        local = not {"sockets", "local_sockets"}.isdisjoint(request.fixturenames)
+        with autojump(kind=LocalLoop if local else AutojumpLoop) as new_loop:
             yield "asyncio", {"loop_factory": new_loop}
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Repeat each test with the fixture `sockets` with real sockets and clocks, at night."""
+    if "sockets" in metafunc.fixturenames and not metafunc.definition.get_closest_marker("nightly"):
+        kinds = ["local", pytest.param("real", marks=pytest.mark.nightly)]
+        metafunc.parametrize("sockets", kinds, indirect=True)
+
+
+@pytest.fixture
+def sockets(request: pytest.FixtureRequest) -> None:
+    """Give the test local sockets at the gate, and real ones at night."""
+    if not may_depend_on_chance(request.node):
+        request.getfixturevalue("local_sockets")
+
+
+@pytest.fixture
+def local_sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Replace `socket.socket`, see `tests/support/local_sockets.py`. A reading of the processor time takes 1 µs."""
+    monkeypatch.setattr(time, "thread_time", itertools.count(0.0, 1e-6).__next__)
+    monkeypatch.setattr(time, "thread_time_ns", itertools.count(step=1000).__next__)
+    with in_one_thread():
+        yield

@@ -11,7 +11,7 @@ import pytest
 from appliance.channel.channel import SOON_SECONDS, Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Lifeline, Message, Ping, Pong, ProbeFailed, SocketKept, StateBegan
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 Pair = tuple[Channel, Channel]
 

@@ -9,7 +9,7 @@ from appliance.channel.link import Link
 from appliance.channel.messages import Ping, Pong
 from tests.support.heard import Heard
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 class World:

@@ -2,167 +2,151 @@ import asyncio
 import errno
 import os
 import socket
-import struct
-from collections.abc import Callable
-from types import SimpleNamespace
-from typing import Any, cast
+from collections.abc import Iterator
+from typing import Any
 
-import msgspec
 import pytest
 
-from appliance.channel import channel
+from appliance.base import clock
 from appliance.channel.channel import AGAIN_SECONDS, Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Lifeline, Message, Ping, SocketKept
-from appliance.relay.loop import READ, WRITE
 from appliance.relay.transport.loop_channel import LoopLink
+from tests.support.local_sockets import LocalSocket
+from tests.unit.relay.world import WorldLoop
 
-_BODY = msgspec.msgpack.Decoder(Lifeline)
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("local_sockets")]
+
 TEMPORARY = [errno.ETOOMANYREFS, errno.ENOBUFS, errno.ENOMEM]
 
 
-class Socket:
-    def __init__(self) -> None:
-        self.refusal = 0
-        self.attempts = 0
-        self.written = b""
-        self.ended = False
+class Refusing(LocalSocket):
+    """A socket of which every write fails with the error `refusal`, if it is not 0."""
 
-    def setblocking(self, _flag: bool) -> None:
-        """Act as a socket."""
+    refusal = attempts = 0
 
-    def fileno(self) -> int:
-        return 99
+    def send(self, *arguments: Any) -> int:
+        self._attempt()
+        return super().send(*arguments)
 
-    def send(self, data: bytes) -> int:
+    def sendmsg(self, *arguments: Any) -> int:
+        self._attempt()
+        return super().sendmsg(*arguments)
+
+    def _attempt(self) -> None:
         self.attempts += 1
         if self.refusal:
             raise OSError(self.refusal, os.strerror(self.refusal))
-        self.written += data
-        return len(data)
-
-    def sendmsg(self, parts: list[bytes], _descriptors: object, *_flags: object) -> int:
-        return self.send(b"".join(parts))
-
-    def shutdown(self, _how: int) -> None:
-        self.ended = True
-
-    def close(self) -> None:
-        """Act as a socket."""
-
-    def messages(self) -> list[Message]:
-        found, position = list[Message](), 0
-        while position < len(self.written):
-            (length,) = struct.unpack_from(">I", self.written, position)
-            position += 4 + length
-            found.append(_BODY.decode(self.written[position - length : position]))
-        return found
-
-
-class Loop:
-    def __init__(self) -> None:
-        self.events = READ
-        self.timers: list[tuple[float, Callable[..., None]]] = []
-
-    def add_reader(self, _descriptor: int, _ready: Callable[[], None]) -> None:
-        """Act as a loop."""
-
-    remove_reader = watch = lambda *_given: None
-
-    def add_writer(self, _descriptor: int, _ready: Callable[[], None]) -> None:
-        self.events = READ | WRITE
-
-    def remove_writer(self, _descriptor: int) -> None:
-        self.events = READ
-
-    def change(self, _descriptor: int, events: int) -> None:
-        self.events = events
-
-    def call_later(self, seconds: float, call: Callable[[], None]) -> SimpleNamespace:
-        self.timers.append((seconds, call))
-        return SimpleNamespace(cancel=lambda: None)
-
-    after = call_later
-
-    def run(self) -> None:
-        timers, self.timers = self.timers, []
-        for _seconds, call in timers:
-            call()
 
 
 @pytest.fixture
-def sock(monkeypatch: pytest.MonkeyPatch) -> Socket:
-    monkeypatch.setattr(
-        channel, "os", SimpleNamespace(dup=lambda descriptor: descriptor, close=lambda _: None)
-    )
-    return Socket()
+def pair() -> Iterator[tuple[Refusing, Channel]]:
+    near, far = socket.socketpair()
+    with Refusing(fileno=near.detach()) as sock:
+        other = Channel(far, Lifeline)
+        yield sock, other
+        other.close()
 
 
-def attached(sock: Socket) -> tuple[Channel, Loop]:
-    end, loop = Channel(cast(socket.socket, sock), Lifeline), Loop()
-    end.attach(cast(asyncio.AbstractEventLoop, loop), lambda *_: None, lambda: None)
-    return end, loop
+def attached(sock: Refusing) -> Channel:
+    end = Channel(sock, Lifeline)
+    end.attach(asyncio.get_running_loop(), lambda *_: None, lambda: None)
+    return end
+
+
+def received(other: Channel) -> list[Message]:
+    messages = list[Message]()
+    for message, descriptors in other.receive():
+        messages.append(message)
+        for descriptor in descriptors:
+            os.close(descriptor)
+    return messages
 
 
 @pytest.mark.parametrize("refusal", TEMPORARY)
-def test_messages_that_the_kernel_refuses_for_a_while_are_sent_later_in_order(
-    sock: Socket, refusal: int
+async def test_messages_that_the_kernel_refuses_for_a_while_are_sent_later_in_order(
+    pair: tuple[Refusing, Channel], refusal: int
 ) -> None:
     """A timer tries again: no event would, because the socket stays writable."""
-    end, loop = attached(sock)
+    sock, other = pair
+    end = attached(sock)
     sock.refusal = refusal
     sent = [SocketKept("first"), Ping(2), SocketKept("third"), Ping(4)]
     for message in sent:
-        end.send(message, (7,) * message.descriptors)
-    assert ([seconds for seconds, _ in loop.timers], loop.events) == ([AGAIN_SECONDS], READ)
-    loop.run()
-    assert len(loop.timers) == 1
+        end.send(message, (other.fileno(),) * message.descriptors)
+    at_first = sock.attempts
+    await asyncio.sleep(3.5 * AGAIN_SECONDS)
+    assert sock.attempts == at_first + 3
     sock.refusal = 0
-    loop.run()
-    assert (sock.messages(), loop.timers, loop.events) == (sent, [], READ)
+    await asyncio.sleep(AGAIN_SECONDS)
+    assert received(other) == sent
+    end.close()
 
 
 @pytest.mark.parametrize("refusal", TEMPORARY)
-def test_a_relay_sends_later_what_the_kernel_refuses_for_a_while(sock: Socket, refusal: int) -> None:
-    loop, ended = Loop(), list[str]()
-    link = LoopLink(
-        cast(Any, loop), Channel(cast(socket.socket, sock), Lifeline), lambda *_: None, ended.append
-    )
+def test_a_relay_sends_later_what_the_kernel_refuses_for_a_while(
+    pair: tuple[Refusing, Channel], refusal: int
+) -> None:
+    sock, other = pair
+    loop, ended = WorldLoop(), list[str]()
+    link = LoopLink(loop, Channel(sock, Lifeline), lambda *_: None, ended.append)
     sock.refusal = refusal
     link.send(Ping(1))
     link.send(Ping(2))
-    assert (len(loop.timers), loop.events, ended) == (1, READ, [])
+    at_first = sock.attempts
+    for _ in range(3):
+        loop.turn(AGAIN_SECONDS)
+    assert (sock.attempts, ended) == (at_first + 3, [])
     sock.refusal = 0
-    loop.run()
-    assert (sock.messages(), loop.timers, loop.events) == ([Ping(1), Ping(2)], [], READ)
+    loop.turn(AGAIN_SECONDS)
+    assert received(other) == [Ping(1), Ping(2)]
+    link.close()
+    loop.close()
 
 
-def test_a_socket_that_is_full_is_written_when_it_is_writable(sock: Socket) -> None:
-    end, loop = attached(sock)
+async def test_a_socket_that_is_full_is_written_when_it_is_writable(pair: tuple[Refusing, Channel]) -> None:
+    sock, other = pair
+    end, began = attached(sock), clock.now()
     sock.refusal = errno.EAGAIN
     end.send(Ping(1))
-    assert (loop.timers, loop.events) == ([], READ | WRITE)
+    sock.refusal = 0
+    while end.pending:
+        await asyncio.sleep(0)
+    assert (received(other), clock.now()) == ([Ping(1)], began)
+    end.close()
 
 
 @pytest.mark.parametrize("error", [errno.EPIPE, errno.EPERM])
-def test_any_other_error_ends_the_stream_for_both_ends(sock: Socket, error: int) -> None:
+async def test_any_other_error_ends_the_stream_for_both_ends(
+    pair: tuple[Refusing, Channel], error: int
+) -> None:
     """Otherwise a message would be missing between others that arrive."""
-    end, _loop = attached(sock)
+    sock, other = pair
+    end = attached(sock)
     sock.refusal = error
     end.send(Ping(1))
-    assert (sock.ended, end.pending) == (True, False)
-    alone = Channel(cast(socket.socket, Socket()), Lifeline)
-    vars(alone)["_socket"].refusal = error
+    assert not end.pending
     with pytest.raises(ChannelClosedError):
-        alone.send(Ping(1))
+        other.receive()
+    end.close()
 
 
-def test_a_sender_sees_that_the_backlog_grows_before_it_is_full(sock: Socket) -> None:
-    end = Channel(cast(socket.socket, sock), Lifeline, limit=1000)
+@pytest.mark.parametrize("error", [errno.EPIPE, errno.EPERM])
+def test_without_a_loop_any_other_error_is_raised(pair: tuple[Refusing, Channel], error: int) -> None:
+    sock, _other = pair
+    sock.refusal = error
+    with pytest.raises(ChannelClosedError):
+        Channel(sock, Lifeline).send(Ping(1))
+
+
+def test_a_sender_sees_that_the_backlog_grows_before_it_is_full(pair: tuple[Refusing, Channel]) -> None:
+    sock, other = pair
+    end = Channel(sock, Lifeline, limit=1000)
     sock.refusal = errno.EAGAIN
     seen = []
     with pytest.raises(ChannelFullError):
         for number in range(1000):
-            end.send(SocketKept(f"{number:040}"), (7,))
+            end.send(SocketKept(f"{number:040}"), (other.fileno(),))
             seen.append(end.crowded)
+    end.close()
     assert (seen[0], seen[-1]) == (False, True)
     assert 0.4 < seen.count(False) / len(seen) < 0.6

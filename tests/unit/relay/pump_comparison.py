@@ -10,7 +10,6 @@ import contextlib
 import socket
 import struct
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,6 +19,7 @@ from typing import Any
 
 from msgspec import structs
 
+from appliance.base import clock
 from appliance.channel.messages import (
     GrantInstalled,
     MonitorsCounted,
@@ -80,7 +80,7 @@ class ComparedRelay(Monitored):
         self.pumped = pumped
         self.port.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 << 10)  # accepted sockets inherit it
         self.memory = memoryview(bytearray(1 << 20))
-        self.given = StateGiven(True, "boot", time.time_ns() - time.monotonic_ns())
+        self.given = StateGiven(True, "boot", clock.wall_ns() - clock.now_ns())
         self.engine.interceptor.remember(StateKeeper(self.given, self.memory))
         self.state(PublicationPlaced("k", "/other", "*"))
         self.publishers: dict[str, Peer] = {}

@@ -4,13 +4,13 @@ import contextlib
 import random
 import socket
 import struct
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from appliance.base import clock
 from appliance.channel.messages import (
     UNLIMITED,
     ClientGranted,
@@ -54,7 +54,7 @@ from tests.unit.relay.dialogue import Dialogue
 from tests.unit.relay.world import ASK, CALL, HEADER, IMPATIENT, LIMITS, LOOPBACK, UNHURRIED, Peer, World
 from tests.unit.transcripts import transcripts
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 impatient = pytest.mark.parametrize("world", [IMPATIENT], indirect=True)
 
@@ -258,9 +258,9 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
     for _ in range(6):
         world.upstream().sock.close()
         world.hears(UpstreamLost)
-        began = time.monotonic()
+        began = clock.now()
         world.until(lambda: any(isinstance(one, UpstreamWanted) for one in world.told))
-        waits.append(time.monotonic() - began)
+        waits.append(clock.now() - began)
     assert waits[-1] > 10 * LIMITS.retry_first
     patient = World(replace(LIMITS, retry_first=0.001, retry_longest=1.0))
     patient.connect(encode_header(ASK))
@@ -271,8 +271,8 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
     (topic,) = patient.engine.topics.values()
     publisher = topic.upstream
     patient.until(lambda: topic.header is not None)
-    ends = time.monotonic() + 1.2
-    patient.until(lambda: time.monotonic() > ends)
+    ends = clock.now() + 1.2
+    patient.until(lambda: clock.now() > ends)
     assert isinstance(publisher, PublisherConnection)
     assert publisher.failures == 3
     staying.sock.close()
@@ -470,8 +470,8 @@ def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
     message = encode_frame(bytes(MIB))
     for start in range(0, MIB, MIB // 4):
         patient.push(publisher, message[start : start + MIB // 4])
-        ends = time.monotonic() + 0.4
-        patient.until(lambda: time.monotonic() > ends)  # noqa: B023 - called at once
+        ends = clock.now() + 0.4
+        patient.until(lambda: clock.now() > ends)  # noqa: B023 - called at once
     patient.push(publisher, message[MIB:])
     patient.gets(subscriber, message)
     patient.push(publisher, message[: MIB // 2])

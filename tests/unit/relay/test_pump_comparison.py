@@ -3,22 +3,22 @@ import gc
 import pytest
 
 from appliance.relay.transport.pump import ModuleCall
-from tests.support.examples import examples
 from tests.support.stated import stated
 from tests.unit.relay.monitors.monitored import string
 from tests.unit.relay.pump_comparison import ComparedRelay, PumpComparison
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 _SEED = 20261124
 _COUNTS = "counts() { int n; event e(std::string s) /chatter std_msgs/String '{data:s}' { n = n + 1; } }"
 
 
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_the_pump_has_the_same_effects_as_python() -> None:
     comparison = PumpComparison(_SEED)
     try:
-        comparison.run(examples(18_000))
+        comparison.run(18_000)
     except AssertionError as error:
         raise AssertionError(f"python -m tests.unit.relay.pump_comparison {_SEED} 18000: {error}") from error
     finally:
@@ -27,6 +27,7 @@ def test_the_pump_has_the_same_effects_as_python() -> None:
     assert done["pump: without Python"] > 5 + done["plain: without Python"]
 
 
+@pytest.mark.nightly  # other tests of the process may have objects of the kind
 def test_a_quiet_publisher_keeps_no_earlier_module() -> None:
     others, relay = _calls(), ComparedRelay(pumped=True)
     try:

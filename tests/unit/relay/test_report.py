@@ -19,7 +19,7 @@ from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.transport.loop_channel import LoopLink
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 ROW = TopicTraffic("k", "/chatter", 1, 2, 0, 1)
 

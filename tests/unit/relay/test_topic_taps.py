@@ -8,7 +8,7 @@ from appliance.relay.topic_taps import MOST_LOOKS, MOST_MESSAGES
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, HEADER, Peer, World
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 TOLD = HEADER | {"message_definition": "string data\n"}
 

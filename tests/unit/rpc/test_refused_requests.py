@@ -4,7 +4,7 @@ import pytest
 
 from tests.support.http_server import LIMITS, Client, Server, fault, post, serving
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from appliance.rpc.processor_time import TURN_SECONDS
 from appliance.rpc.server import HttpRequest, NoAnswerError
 from tests.support.http_server import WAIT, Client, Server, Shares, post, serving, until
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 async def test_requests_on_one_connection(client: Client) -> None:
@@ -176,6 +176,7 @@ async def test_connections_that_come_faster_than_they_are_opened() -> None:
             sock.close()
 
 
+@pytest.mark.nightly  # the kernel chooses among connections over TCP
 async def test_unknown_hosts_that_came_before_a_named_one() -> None:
     program = first_for([ipaddress.ip_network("127.0.0.2")])
     now = 0.0
@@ -201,6 +202,7 @@ async def test_unknown_hosts_that_came_before_a_named_one() -> None:
             sock.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("later", [False, True])
 async def test_a_program_that_the_kernel_refuses(later: bool) -> None:
     wrong = bytes(8)

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 
 @pytest.fixture

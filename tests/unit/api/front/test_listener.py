@@ -15,16 +15,20 @@ from appliance.api.front.certificate import tls_context
 from appliance.api.front.listener import Listener
 from appliance.configuration.settings import ApiLimits
 from appliance.quotas.pool import QuotaClass
+from tests.support.determinism import may_depend_on_chance
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
-
-REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
-Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 @pytest.fixture
-def anyio_backend() -> tuple[str, dict[str, Any]]:
-    return "asyncio", {"use_uvloop": True}
+def anyio_backend(
+    request: pytest.FixtureRequest, anyio_backend: tuple[str, dict[str, Any]]
+) -> tuple[str, dict[str, Any]]:
+    return ("asyncio", {"use_uvloop": True}) if may_depend_on_chance(request.node) else anyio_backend
+
+
+REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
 
 
 async def application(scope: Scope, receive: Receive, send: Send) -> None:

@@ -19,7 +19,7 @@ from appliance.channel.messages import (
 )
 from appliance.control.links.supervisor_link import ROUTES_AT_ONCE, ControlLifeline
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 _LIMIT_SECONDS = 30
 

@@ -14,7 +14,7 @@ from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.supervisor import Supervisor
 from tests.unit.supervisor.test_supervisor import CONTROL, StandIn
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 @pytest.mark.parametrize("end", ["renewed", "a death", "a new epoch", "a stop"])

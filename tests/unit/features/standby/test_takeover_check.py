@@ -30,7 +30,7 @@ from tests.support.site_key import LINE, signed
 from tests.support.stated import parts_here
 from tests.unit.specifications.monitor_desk import TEXTS, Desk, here
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 SECONDS = 60
 
 
@@ -163,7 +163,8 @@ async def test_an_unreadable_folder_of_specifications(standby: Standby) -> None:
     standby.monitors.rmdir()
     async with standby.checked(again=0.05) as checked:
         assert await checked.next_obstacle() == (
-            f"{standby.monitors}: the folder of specifications does not exist"
+            f"{standby.monitors}: the folder of specifications does not exist;"
+            " create it, or name another with --monitors"
         )
         standby.monitors.mkdir()
         assert await checked.next_obstacle() == ""

@@ -17,7 +17,7 @@ from roswire.standard import standard_definitions
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.unit.relay.world import IMPATIENT, LIMITS, LOOPBACK, Peer, World
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 OTHER = "127.0.0.9"
 CALL = {"callerid": "/client", "service": "/rosrv/record_now", "md5sum": "*"}

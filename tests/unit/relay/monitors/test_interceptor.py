@@ -54,12 +54,17 @@ from tests.unit.relay.monitors.monitored import (
 from tests.unit.relay.world import LOOPBACK, Peer
 from tests.unit.transcripts import transcripts
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 DIALOGUES = transcripts(Path(__file__).with_name("dialogues.txt"))
 
 
-@pytest.mark.parametrize("title", DIALOGUES, ids=DIALOGUES)
+def _marks(title: str) -> list[pytest.MarkDecorator]:
+    """Mark the dialogues about processor time, which virtual time does not have."""
+    return [pytest.mark.nightly] * any("processor time" in line for line in DIALOGUES[title])
+
+
+@pytest.mark.parametrize("title", [pytest.param(title, id=title, marks=_marks(title)) for title in DIALOGUES])
 def test_dialogue(world: Monitored, title: str) -> None:
     dialogue = MonitoredDialogue(world)
     for line in DIALOGUES[title]:
@@ -141,6 +146,7 @@ def test_specifications_of_a_new_control_are_in_force_before_its_placements(
     assert ("k", "/late") in world.engine.topics
 
 
+@pytest.mark.nightly
 def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world: Monitored) -> None:
     slow = "slow() { int n; event tick() every 1ms { for (int i = 0; i < 60000; i++) n += i; } }"
     world.load(slow)

@@ -20,7 +20,7 @@ from tests.unit.relay.monitors.monitored import (
     string,
 )
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 
 class Trying(Monitored):
@@ -68,6 +68,7 @@ def test_waiting_messages_are_judged_before_it_is_promoted(
     world.gets(subscriber, string("4"))
 
 
+@pytest.mark.nightly
 def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()

@@ -12,7 +12,7 @@ from appliance.channel.messages import NodePlaced, NodeWithdrawn, RelayLink, Ups
 from appliance.relay.loop import QUANTUM, EventLoop
 from appliance.relay.transport.loop_channel import LoopLink
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 
 class Ends:
