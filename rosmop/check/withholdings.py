@@ -55,6 +55,7 @@ def _checked(
 def _networks(node: tree.WithholdDeclaration) -> Iterator[str]:
     yield from node.given
     for network in node.networks:
+        assert isinstance(network, tree.StringLiteral)  # a name of hosts is resolved already
         text = network.value.decode(errors="replace")
         try:
             yield str(ip_network(text))

@@ -12,7 +12,6 @@ import math
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from rosmop.fast.abi import ALTERED, BEYOND, MOST_KEPT, NOW, POSITION, SAID, UNDO, kept_size
 from rosmop.fast.batch_codegen import WasmModule
@@ -26,7 +25,7 @@ from rosmop.run.engine import MonitorSet
 from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import WireMessage
 from rosmop.types import value_types
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 HAPPENED, DROPPED, CHANGED, ELSEWHERE, REPLACED = 1, 2, 4, 8, 32
 """Bits of the result of an event's function."""
@@ -64,7 +63,7 @@ class EventState:
 
     message: bytes
     now: int
-    variables: Mapping[str, Any]
+    variables: Mapping[str, Value]
     budget: int
     throttled: Mapping[tuple[str, int], int]
     names: tuple[bytes, bytes]
@@ -86,7 +85,7 @@ class _Effect:
 
     bits: int
     message: bytes
-    variables: Mapping[str, Any]
+    variables: Mapping[str, Value]
     output: list[LogLine] | None
     rest: int
     publishes: bool = False
@@ -119,7 +118,7 @@ class ConcreteRuns:
         ]
         """Variables that the module does not have, and so does not change."""
         self._monitors = {context: each.monitor for context, each in self._interpreter.contexts.items()}
-        self._latest: tuple[EventState, Mapping[str, Any]] | None = None
+        self._latest: tuple[EventState, Mapping[str, Value]] | None = None
         self.compared = 0
         """The number of runs in which the module did not leave the message to the interpreter."""
 
@@ -155,7 +154,7 @@ class ConcreteRuns:
         agrees = done.rest == meant.rest or (bool(done.output) and done.rest < meant.rest)
         return None if agrees else BUDGET_ONLY
 
-    def after(self, event: EventPair, state: EventState) -> Mapping[str, Any]:
+    def after(self, event: EventPair, state: EventState) -> Mapping[str, Value]:
         """Return the variables after the event, or those before it if it faults."""
         if self._latest is None or self._latest[0] is not state:
             self._in_interpreter(event, state)
@@ -223,7 +222,7 @@ class ConcreteRuns:
         rest = _TIME.unpack_from(memory, module.budgets[context])[0]
         return _Effect(bits, bytes(memory[at:]), variables, self._output(), rest)
 
-    def _kept(self, word: int, before: Any, kind: Type) -> Any:
+    def _kept(self, word: int, before: Value, kind: Type) -> Value | None:
         """Return a string or an array, or None if it does not end within the memory."""
         count = word >> 32
         is_outside = (word & BEYOND) + count * kept_size(kind) > len(self._memory)
@@ -252,7 +251,7 @@ def _with_exports(module: bytes, numbers: Iterable[int]) -> bytes:
     return module[:8] + b"".join(section(kind, content) for kind, content in parts.items())
 
 
-def _same(one: Any, other: Any) -> bool:
+def _same(one: object, other: object) -> bool:
     """Whether two values are equal; NaN equals NaN, and zeros have a sign."""
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(map(_same, one, other))
@@ -263,6 +262,8 @@ def _same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-def _shown(value: Any) -> str:
+def _shown(value: Value) -> str:
     shown = repr(value)
-    return shown if len(shown) <= 100 else f"{shown[:90]}… ({len(value)} elements)"
+    if len(shown) <= 100 or not isinstance(value, bytes | list):
+        return shown
+    return f"{shown[:90]}… ({len(value)} elements)"

@@ -19,7 +19,6 @@ each byte in the log (`module_terms.py`).
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
 
 import z3
 
@@ -54,11 +53,13 @@ from rosmop.prove.terms import (
     DiffersError,
     FormResult,
     LineTerm,
+    Model,
     NotProvedError,
     StartTerms,
     Term,
     TextTerm,
     as_bits,
+    as_term,
     both,
     either,
     integer,
@@ -254,7 +255,7 @@ class Validation:
         if not questions.exclude(wrong.values()):
             self._search(event, states)
 
-            def replay(model: Any) -> None:
+            def replay(model: Model) -> None:
                 self._search(event, [state_of(model, begin, self._kinds, context)])
 
             answer = first_difference(questions, wrong, replay, in_induction=bool(form_cuts))
@@ -265,8 +266,8 @@ class Validation:
                 return f"uses {what}"
         return EQUAL
 
-    def _names(self, context: str) -> Mapping[int, Any]:
-        names: dict[int, Any] = {
+    def _names(self, context: str) -> Mapping[int, object]:
+        names: dict[int, object] = {
             address: ("shared", name)
             for own in self._module.cells
             for name, (address, _) in own.variables.items()
@@ -282,24 +283,25 @@ class Validation:
             for name, (_, kind) in own.variables.items():
                 if kept_size(kind) and not isinstance(kind, value_types.StringType):
                     kept = begin.variables[name]
+                    assert isinstance(kept, TextTerm)  # noqa: S101  as in `_beginning`
                     known = z3.ULE(kept.count, most_kept(kind))
                     spans.append(ReadableBytes(kept.place, kept.count * kept_size(kind), known))
         return spans
 
     def _beginning(self) -> tuple[StartTerms, dict[int, Term], list[Term]]:
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
-        known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
+        known: list[Term] = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
         cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
-        variables: dict[str, Any] = {}
+        variables: dict[str, Term | TextTerm] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
                 if kept_size(kind):
                     variables[name] = _text(name, address, cells)
                     continue
-                variables[name] = cells[address] = _variable(name, kind)
+                value = variables[name] = cells[address] = _variable(name, kind)
                 if isinstance(kind, value_types.TimeType | value_types.DurationType):
                     most = MAX_TIME + (1 << 32)
-                    known += [variables[name] >= -most, variables[name] <= most]
+                    known += [value >= -most, value <= most]
         budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
         for context, address in self._module.budgets.items():
             known += [budgets[context] >= 0, budgets[context] <= BUDGET]
@@ -327,7 +329,7 @@ class Validation:
                     yield address, value.place
                     yield address + 4, z3.Extract(31, 0, value.count)
                 elif value is not None:
-                    yield address, value
+                    yield address, as_term(value)
         for context, address in self._module.budgets.items():
             yield address, meant.budgets[context]
 
@@ -344,15 +346,14 @@ def _text(name: str, address: int, cells: dict[int, Term]) -> TextTerm:
     return TextTerm(place, z3.ZeroExt(32, length))
 
 
-def _same(held: Term, value: Term) -> Term:
+def _same(held: object, value: Term) -> Term:
     if isinstance(held, Pointer):
         raise NotProvedError("keeps a string of the message")
-    return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
+    return as_term(held) == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
 
 
 def _among(noted: LineTerm, lines: Term) -> Term:
-    held = number_at(lines, noted.offset, noted.allowed[0].size() // 8) if noted.allowed else None
-    return either(*(held == one for one in noted.allowed))
+    return either(*(number_at(lines, noted.offset, one.size() // 8) == one for one in noted.allowed))
 
 
 def _bit(bits: Term, which: int) -> Term:

@@ -19,7 +19,7 @@ import z3
 from rosmop.fast.abi import kept_size, most_kept
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine
 from rosmop.form import nodes
-from rosmop.prove.loops import BUDGET_SLOT, Loops, constant_for
+from rosmop.prove.loops import BUDGET_SLOT, Log, Loops, constant_for
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
@@ -32,6 +32,7 @@ from rosmop.prove.terms import (
     SINGLE,
     FormResult,
     LineTerm,
+    Mixed,
     NotProvedError,
     StartTerms,
     State,
@@ -66,6 +67,9 @@ class _View:
     start: Term
     count: Term
 
+
+Value = Term | TextTerm | _View | Mixed | None
+"""The value of an expression; that of a procedure's call is None."""
 
 _LONG = value_types.IntegerType(64, True, "long")
 
@@ -136,7 +140,7 @@ class FormTerms:
         self._left: list[Term] = []
         self._unknown: list[tuple[str, Term]] = []
         self._exits: list[tuple[State, Term]] = []
-        self._returned: list[tuple[State, Term]] | None = None
+        self._returned: list[tuple[State, Value]] | None = None
         self._calls = 0
         self._frame = 0
         self._shared: Sequence[str] = self._function.shared
@@ -144,24 +148,25 @@ class FormTerms:
     def result(self) -> FormResult:
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
-        slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
+        slots: dict[object, object] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
         slots |= {BUDGET_SLOT: budget, _SAID: integer(0, 32)}
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
         self._left.append(state.alive)  # every message leaves the function before its end
-        happened, end = no, slots
+        happened: Term = no
+        end = State(no, slots)
         for left, value in self._exits:
             happened = choice(left.alive, value, happened)
-            end = merged(left.alive, left, State(opposite(left.alive), end))
+            end = State(no, merged(left.alive, left, State(opposite(left.alive), end.slots)))
         unknown: dict[str, Term] = {}
         for what, condition in self._unknown:
             unknown[what] = either(unknown.get(what, no), condition)
-        variables = {name: end["shared", name] for name in begin.variables}
+        variables = {name: end.slots["shared", name] for name in begin.variables}
+        budgets = {**begin.budgets, self._function.context: end.term(BUDGET_SLOT)}
         return FormResult(
-            either(*self._left), unknown, happened, end[_DROPPED], end[_REPLACED], end[_CHANGED], end[_MESSAGE],
-            variables, {**begin.budgets, self._function.context: end[BUDGET_SLOT]}, end[_SAID], self._noted,
-            self._loops,
+            either(*self._left), unknown, happened, end.term(_DROPPED), end.term(_REPLACED), end.term(_CHANGED),
+            end.term(_MESSAGE), variables, budgets, end.term(_SAID), self._noted, self._loops,
         )  # fmt: skip
 
     # Ends
@@ -196,7 +201,7 @@ class FormTerms:
         self._value(node.value, state)
 
     def _if(self, node: nodes.If, state: State) -> None:
-        test = self._value(node.test, state)
+        test = self._term(node.test, state)
         yes, no = state.where(test), state.where(opposite(test))
         self._block(node.yes, yes)
         self._block(node.no, no)
@@ -212,10 +217,10 @@ class FormTerms:
             finally:
                 self._breaks, self._continues = outer
 
-        logs = [self._left, self._unknown, self._exits, self._noted, self._returned or []]
+        logs: list[Log] = [self._left, self._unknown, self._exits, self._noted, self._returned or []]
         self._loops.run(state, body, self._frame, self._at_head, logs)
 
-    def _at_head(self, _number: int, key: Any, value: Any) -> Any:
+    def _at_head(self, _number: int, key: object, value: object) -> Term | Mixed:
         if key in (_MESSAGE, _SAID):
             raise NotProvedError("not loop-free: a loop changes the message or prints")
         return constant_for(key, value)
@@ -234,7 +239,7 @@ class FormTerms:
         raise NotProvedError(f"not loop-free: {_LOOPS[type(node)]}")
 
     def _select(self, node: nodes.Select, state: State) -> None:
-        value = self._value(node.value, state)
+        value = self._term(node.value, state)
         number = integer(node.default, 32)
         for wanted, index in reversed(node.table):
             number = z3.If(value == integer(wanted, value.size()), integer(index, 32), number)
@@ -254,8 +259,9 @@ class FormTerms:
         self._spend(integer(node.instructions, 64), state)
 
     def _spend(self, instructions: Term, state: State) -> None:
-        state.slots[BUDGET_SLOT] = state.slots[BUDGET_SLOT] - instructions
-        self._leave_to_python(state, state.slots[BUDGET_SLOT] < 0)
+        rest = state.term(BUDGET_SLOT) - instructions
+        state.slots[BUDGET_SLOT] = rest
+        self._leave_to_python(state, rest < 0)
 
     def _allocate(self, node: nodes.Allocate, state: State) -> None:
         if node.size is not None:
@@ -285,7 +291,7 @@ class FormTerms:
         state.slots[_REPLACED] = z3.BoolVal(True)
 
     def _put_safe(self, safe: nodes.SafeMessage, state: State) -> None:
-        message, changed = state.slots[_MESSAGE], state.slots[_CHANGED]
+        message, changed = state.term(_MESSAGE), state.term(_CHANGED)
         place = SAFE_HEAD if safe.stamped else 0
         while place < len(
             safe.data
@@ -309,7 +315,7 @@ class FormTerms:
                 cost = cost + z3.UDiv(value.count, integer(BYTES, 64))
                 words.append(_text(value))
             else:
-                words.append(_word(value, expression.type))
+                words.append(_word(_known(value, expression.type), expression.type))
         self._put_out(node, words, cost, state)
 
     def _put_out(self, node: nodes.Log, parts: Sequence[Term], cost: Term, state: State) -> None:
@@ -319,7 +325,7 @@ class FormTerms:
             if line.node is node and line.context == self._context
         ]
         self._spend(cost, state)
-        begin = state.slots[_SAID]
+        begin = state.term(_SAID)
         self._noted += (LineTerm(state.alive, begin, numbers), LineTerm(state.alive, begin + 4, [FRAME]))
         offset = HEAD.size
         for part in parts:
@@ -331,22 +337,22 @@ class FormTerms:
         """Only `Whole` uses the list of fields, and `Whole` is not compiled."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
-        test = self._value(node.test, state)
+        test = self._term(node.test, state)
         self._exit(state.where(opposite(test)), False)
         state.require(test)
 
     def _not_past(self, node: nodes.NotPast, state: State) -> None:
-        self._leave_to_python(state, state.slots[self._frame, node.count] <= node.index)
+        self._leave_to_python(state, state.term((self._frame, node.count)) <= node.index)
 
     # Fields of the message
 
     def _position(self, at: nodes.Spot, state: State) -> Term:
         offset = integer(at.offset, 64)
-        return offset if at.base is None else state.slots[self._frame, at.base] + offset
+        return offset if at.base is None else state.term((self._frame, at.base)) + offset
 
     def _place(self, at: nodes.Spot, state: State) -> Term:
         offset = integer(at.offset, 32)
-        return offset if at.base is None else z3.Extract(31, 0, state.slots[self._frame, at.base]) + offset
+        return offset if at.base is None else z3.Extract(31, 0, state.term((self._frame, at.base))) + offset
 
     def _within(self, at: nodes.Spot, size: int, state: State) -> None:
         short = z3.ULT(z3.ZeroExt(32, self._beginning.size), self._position(at.plus(size), state))
@@ -354,7 +360,7 @@ class FormTerms:
 
     def _length(self, at: nodes.Spot, state: State) -> Term:
         self._within(at, 4, state)
-        return z3.ZeroExt(32, number_at(state.slots[_MESSAGE], self._place(at, state), 4))
+        return z3.ZeroExt(32, number_at(state.term(_MESSAGE), self._place(at, state), 4))
 
     def _after_text(self, node: nodes.AfterText, state: State) -> None:
         length = self._length(node.at, state)
@@ -372,7 +378,7 @@ class FormTerms:
 
     def _after_elements(self, node: nodes.AfterElements, state: State) -> None:
         count = (
-            integer(node.count, 64) if isinstance(node.count, int) else state.slots[self._frame, node.count]
+            integer(node.count, 64) if isinstance(node.count, int) else state.term((self._frame, node.count))
         )
         state.slots[self._frame, node.name] = self._position(node.at, state) + count * node.size
 
@@ -384,7 +390,7 @@ class FormTerms:
         self._within(node.at, max(offset + self._size(kind) for _, kind, offset in node.fields), state)
         for name, kind, offset in node.fields:
             place = self._place(node.at.plus(offset), state)
-            state.slots[self._frame, name] = self._number(state.slots[_MESSAGE], place, kind)
+            state.slots[self._frame, name] = self._number(state.term(_MESSAGE), place, kind)
 
     def _number(self, message: Term, place: Term, kind: Type) -> Term:
         return self._decoded(number_at(message, place, self._size(kind)), kind)
@@ -429,35 +435,35 @@ class FormTerms:
             self._within(node.at, size, state)
             if isinstance(kind, value_types.VectorType):
                 count, size = integer(kind.length or 0, 64), self._size(kind.element)
-        state.slots[self._frame, node.name] = _View(state.slots[_MESSAGE], start, count)
+        state.slots[self._frame, node.name] = _View(state.term(_MESSAGE), start, count)
         state.slots[self._frame, node.end] = start + count * size
 
     def _write_back(self, node: nodes.WriteBack, state: State) -> None:
-        dropped = state.slots[_DROPPED]
+        dropped = state.term(_DROPPED)
         self._exit(state.where(dropped), True)
         state.require(opposite(dropped))
         if self._safe is not None:
-            replaced = state.slots[_REPLACED]
+            replaced = state.term(_REPLACED)
             stopped = state.where(replaced)
             self._put_safe(self._safe, stopped)
             self._exit(stopped, True)
             state.require(opposite(replaced))
         puts = []
         for write in node.writes:
-            flag = state.slots[self._frame, write.flag]
+            flag = state.term((self._frame, write.flag))
             if write.end is not None:
                 self._ignore(state.where(flag), "a string or vector that is written")
                 state.require(opposite(flag))
                 continue
             wanted = state.where(flag)
-            bits = self._packed(self._value(write.value, wanted), write.value.type, wanted)
+            bits = self._packed(self._term(write.value, wanted), write.value.type, wanted)
             state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
             puts.append((flag, bits, self._place(write.at, state)))
         for flag, bits, place in puts:
-            message = state.slots[_MESSAGE]
+            message = state.term(_MESSAGE)
             differs = both(flag, number_at(message, place, bits.size() // 8) != bits)
             state.slots[_MESSAGE] = choice(differs, with_number(message, place, bits), message)
-            state.slots[_CHANGED] = either(state.slots[_CHANGED], differs)
+            state.slots[_CHANGED] = either(state.term(_CHANGED), differs)
 
     def _packed(self, value: Term, kind: Type, state: State) -> Term:
         if isinstance(kind, value_types.FloatingType):
@@ -480,13 +486,16 @@ class FormTerms:
 
     # Expressions
 
-    def _value(self, node: nodes.Expression, state: State) -> Any:
+    def _value(self, node: nodes.Expression, state: State) -> Value:
         row = EXPRESSIONS[type(node)]
         if isinstance(row, nodes.Left):
             raise UnknownError(row.reason)
         return row(self, node, state)
 
-    def _literal(self, node: nodes.Literal, _state: State) -> Any:
+    def _term(self, node: nodes.Expression, state: State) -> Term:
+        return _known(self._value(node, state), node.type)
+
+    def _literal(self, node: nodes.Literal, _state: State) -> Value:
         if node.value is None:
             return None
         if isinstance(node.value, bytes) and kept_size(node.type):
@@ -507,7 +516,7 @@ class FormTerms:
             z3.BoolVal(bool(value)) if isinstance(kind, value_types.BoolType) else integer(value, width(kind))
         )
 
-    def _zero(self, node: nodes.Zero, state: State) -> Any:
+    def _zero(self, node: nodes.Zero, state: State) -> Value:
         if isinstance(node.type, value_types.FloatingType):
             return self._literal(nodes.Literal(node.type, 0.0), state)
         if isinstance(node.type, value_types.StringType):
@@ -522,21 +531,21 @@ class FormTerms:
             raise UnknownError(f"a zero of type {node.type}")
         return self._whole_number(0, node.type)
 
-    def _read(self, node: nodes.Read, state: State) -> Any:
+    def _read(self, node: nodes.Read, state: State) -> Value:
         own, shared = (self._frame, node.name), ("shared", node.name)
         value = state.slots.get(own if own in state.slots else shared)
-        if value is None or value is MIXED:
+        if not isinstance(value, Term | TextTerm | _View):
             raise UnknownError(f"a variable of type {node.type}")
         return value if own in state.slots else self._kept(value, node.type, state)
 
-    def _kept(self, value: Any, kind: Type, state: State) -> Any:
+    def _kept(self, value: Value, kind: Type, state: State) -> Value:
         if isinstance(value, _View) and kept_size(kind):
             value = TextTerm(AT + z3.Extract(31, 0, value.start), value.count)
         if isinstance(value, TextTerm):
             self._leave_to_python(state, z3.UGT(value.count, most_kept(kind)))
         return value
 
-    def _assign(self, node: nodes.Assign, state: State) -> Any:
+    def _assign(self, node: nodes.Assign, state: State) -> Value:
         value = self._value(node.value, state)
         where: int | str = "shared" if node.name in self._shared else self._frame
         if where == "shared" and node.name not in self._beginning.variables:
@@ -544,8 +553,8 @@ class FormTerms:
         state.slots[where, node.name] = self._kept(value, node.type, state) if where == "shared" else value
         return value
 
-    def _convert(self, node: nodes.Convert, state: State) -> Any:
-        return self._converted(self._value(node.value, state), node.value.type, node.type)
+    def _convert(self, node: nodes.Convert, state: State) -> Value:
+        return self._converted(self._term(node.value, state), node.value.type, node.type)
 
     def _converted(self, value: Term, source: Type, target: Type) -> Term:
         if isinstance(target, value_types.BoolType):
@@ -580,8 +589,8 @@ class FormTerms:
             result = z3.If(result > target.most, integer(target.most, 32), result)
         return result
 
-    def _arithmetic(self, node: nodes.Arithmetic, state: State) -> Any:
-        left, right = self._value(node.left, state), self._value(node.right, state)
+    def _arithmetic(self, node: nodes.Arithmetic, state: State) -> Value:
+        left, right = self._term(node.left, state), self._term(node.right, state)
         kind, operator = node.type, node.operator
         if isinstance(kind, value_types.FloatingType):
             return _OF_FLOATS[operator](NEAREST, left, right)
@@ -607,8 +616,8 @@ class FormTerms:
             result = _OF_INTEGERS[operator](left, right)
         return wrapped(result, kind)
 
-    def _unary(self, node: nodes.Unary, state: State) -> Any:
-        value = self._value(node.value, state)
+    def _unary(self, node: nodes.Unary, state: State) -> Value:
+        value = self._term(node.value, state)
         if isinstance(node.type, value_types.FloatingType):
             return z3.fpAbs(value) if node.operator == "abs" else z3.fpNeg(value)
         if node.operator == "~":
@@ -619,12 +628,12 @@ class FormTerms:
             result = z3.If(value < 0, -value, value) if is_signed(node.type) else value
         return wrapped(result, node.type) if isinstance(node.type, value_types.IntegerType) else result
 
-    def _moment(self, node: nodes.Moment, state: State) -> Any:
-        left, right = self._value(node.left, state), self._value(node.right, state)
+    def _moment(self, node: nodes.Moment, state: State) -> Value:
+        left, right = self._term(node.left, state), self._term(node.right, state)
         return self._limited(node.type, left + right if node.operator == "+" else left - right, state)
 
-    def _moment_of(self, node: nodes.MomentOf, state: State) -> Any:
-        seconds, rest = self._value(node.seconds, state), self._value(node.nanoseconds, state)
+    def _moment_of(self, node: nodes.MomentOf, state: State) -> Value:
+        seconds, rest = self._term(node.seconds, state), self._term(node.nanoseconds, state)
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
@@ -647,14 +656,14 @@ class FormTerms:
         self._leave_to_python(state, either(moment < limits[0], moment > limits[1]))
         return moment
 
-    def _compare(self, node: nodes.Compare, state: State) -> Any:
+    def _compare(self, node: nodes.Compare, state: State) -> Value:
         kind = node.left.type
         if isinstance(kind, value_types.VectorType | value_types.RecordType):
             raise UnknownError(f"a comparison of values of type {kind}")
-        left, right = self._value(node.left, state), self._value(node.right, state)
+        left, right = self._term(node.left, state), self._term(node.right, state)
         return _compared(node.operator, left, right, kind)
 
-    def _compare_texts(self, node: nodes.CompareTexts, state: State) -> Any:
+    def _compare_texts(self, node: nodes.CompareTexts, state: State) -> Value:
         given, known = (
             (node.right, node.left) if isinstance(node.left, nodes.Literal) else (node.left, node.right)
         )
@@ -678,7 +687,7 @@ class FormTerms:
         if not isinstance(one, TextTerm) or not isinstance(other, TextTerm):
             raise UnknownError("a comparison of strings")
         if not node.short:
-            long = z3.UGT(one.count, integer(nodes.SHORT, 64))
+            long: Term = z3.UGT(one.count, integer(nodes.SHORT, 64))
             if isinstance(node.right, nodes.Read):
                 long = both(long, z3.UGT(other.count, integer(nodes.SHORT, 64)))
             yes, no = state.where(long), state.where(opposite(long))
@@ -688,45 +697,45 @@ class FormTerms:
         same = both(one.count == other.count, z3.ZeroExt(32, first) == one.count)
         return same if node.operator == "==" else opposite(same)
 
-    def _sender(self, node: nodes.SenderName, state: State) -> Any:
+    def _sender(self, node: nodes.SenderName, state: State) -> Value:
         return self._kept(self._beginning.senders[self._context, node.part], node.type, state)
 
-    def _altered(self, _node: nodes.Altered, _state: State) -> Any:
+    def _altered(self, _node: nodes.Altered, _state: State) -> Value:
         return self._beginning.altered != integer(0, 32)
 
-    def _logical(self, node: nodes.Logical, state: State) -> Any:
-        left = self._value(node.left, state)
+    def _logical(self, node: nodes.Logical, state: State) -> Value:
+        left = self._term(node.left, state)
         looked_at = left if node.operator == "and" else opposite(left)
         yes, no = state.where(looked_at), state.where(opposite(looked_at))
-        right = self._value(node.right, yes)
+        right = self._term(node.right, yes)
         state.join(looked_at, yes, no)
         return both(left, right) if node.operator == "and" else either(left, right)
 
-    def _not(self, node: nodes.Not, state: State) -> Any:
-        return opposite(self._value(node.value, state))
+    def _not(self, node: nodes.Not, state: State) -> Value:
+        return opposite(self._term(node.value, state))
 
-    def _conditional(self, node: nodes.Conditional, state: State) -> Any:
-        test = self._value(node.test, state)
+    def _conditional(self, node: nodes.Conditional, state: State) -> Value:
+        test = self._term(node.test, state)
         yes, no = state.where(test), state.where(opposite(test))
         one, other = self._value(node.yes, yes), self._value(node.no, no)
         state.join(test, yes, no)
         return choice(test, one, other)
 
-    def _sequence(self, node: nodes.Sequence, state: State) -> Any:
+    def _sequence(self, node: nodes.Sequence, state: State) -> Value:
         return [self._value(item, state) for item in node.items][node.chosen]
 
     def _discard(self, node: nodes.Discard, state: State) -> None:
         self._value(node.value, state)
 
-    def _now(self, _node: nodes.Now, _state: State) -> Any:
+    def _now(self, _node: nodes.Now, _state: State) -> Value:
         return self._beginning.now
 
-    def _throttle(self, node: nodes.Throttle, state: State) -> Any:
+    def _throttle(self, node: nodes.Throttle, state: State) -> Value:
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
             raise UnknownError("output with a rate limit")
         seconds = self._converted(
-            self._value(node.seconds, state), node.seconds.type, value_types.FloatingType(64)
+            self._term(node.seconds, state), node.seconds.type, value_types.FloatingType(64)
         )
         more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
         until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
@@ -737,14 +746,14 @@ class FormTerms:
         self._leave_to_python(state, opposite(both(last <= now, now < first)))
         return z3.BoolVal(False)
 
-    def _item(self, node: nodes.Item, state: State) -> Any:
+    def _item(self, node: nodes.Item, state: State) -> Value:
         view = self._value(node.base, state)
         if not isinstance(view, _View) or not isinstance(node.base.type, value_types.RecordType):
             raise UnknownError("a part of a value")
         before = self._values.fields(node.base.type)[: node.number]
         return self._part(view, sum(map(self._size, before)), node.type)
 
-    def _part(self, view: _View, offset: Term | int, kind: Type) -> Any:
+    def _part(self, view: _View, offset: Term | int, kind: Type) -> Value:
         start = view.start + offset
         if isinstance(kind, value_types.RecordType):
             return _View(view.message, start, integer(1, 64))
@@ -752,7 +761,7 @@ class FormTerms:
             return _View(view.message, start, integer(kind.length, 64))
         return self._number(view.message, z3.Extract(31, 0, start), kind)
 
-    def _copy(self, node: nodes.Copy, state: State) -> Any:
+    def _copy(self, node: nodes.Copy, state: State) -> Value:
         view, kind = self._value(node.value, state), node.type
         if not isinstance(view, _View | TextTerm):
             raise UnknownError(f"a copy of type {kind}")
@@ -764,7 +773,7 @@ class FormTerms:
             raise UnknownError(f"a copy of type {kind}")
         return view
 
-    def _call(self, node: nodes.Call, state: State) -> Any:
+    def _call(self, node: nodes.Call, state: State) -> Value:
         name, arguments = node.function, node.arguments
         if name == "a_part":
             return self._with_part(node, state)
@@ -775,38 +784,37 @@ class FormTerms:
         if name in _OF_VIEWS and isinstance(values[0], _View | TextTerm):
             return _OF_VIEWS[name](values[0].count)
         if name == "l_element" and isinstance(values[0], _View | TextTerm):
-            return self._element(values[0], kind, values[1], state)
+            return self._element(values[0], kind, _known(values[1], arguments[1].type), state)
+        terms = _terms(values, name)
         rounded = name.removesuffix("f") if kind == value_types.FloatingType(32) else name
         if (
             isinstance(kind, value_types.FloatingType)
             and rounded in _ROUNDED
             and (rounded != name) == (kind.bits == 32)
         ):
-            return _ROUNDED[rounded](values[0])
+            return _ROUNDED[rounded](terms[0])
         if isinstance(kind, value_types.FloatingType) and name in _QUESTIONS:
-            return _QUESTIONS[name](values[0])
+            return _QUESTIONS[name](terms[0])
         if name in ("h_copysign", "h_copysignf"):
-            none = _QUESTIONS["h_isnan"](values[1])
+            none = _QUESTIONS["h_isnan"](terms[1])
             self._ignore(state.where(none), "the sign of a NaN")
             state.require(opposite(none))
-            return with_sign(*values)
+            return with_sign(*terms)
         if name in ("h_min", "h_max"):
-            return self._chosen(
-                _compared("<" if name == "h_min" else ">", values[1], values[0], kind), values
-            )
+            return self._chosen(_compared("<" if name == "h_min" else ">", terms[1], terms[0], kind), terms)
         if name in ("h_fmin", "h_fmax") and kind == value_types.FloatingType(64):
-            less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(values[1], values[0])
-            return self._chosen(either(z3.fpIsNaN(values[0]), less), values)
+            less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(terms[1], terms[0])
+            return self._chosen(either(z3.fpIsNaN(terms[0]), less), terms)
         if name in _OF_MOMENTS:
-            value = _OF_MOMENTS[name](self, values[0])
+            value = _OF_MOMENTS[name](self, terms[0])
             if isinstance(node.type, value_types.IntegerType) and width(node.type) == 32:
                 return z3.Extract(31, 0, value)
             return value
         if name in ("k_after", "k_before"):
-            return values[0] + values[1] if name == "k_after" else values[0] - values[1]
+            return terms[0] + terms[1] if name == "k_after" else terms[0] - terms[1]
         raise UnknownError(name.partition("_")[2])
 
-    def _element(self, values: _View | TextTerm, kind: Type, index: Term, state: State) -> Any:
+    def _element(self, values: _View | TextTerm, kind: Type, index: Term, state: State) -> Value:
         if not isinstance(kind, value_types.VectorType):
             raise UnknownError(f"an element of type {kind}")
         self._leave_to_python(state, z3.UGE(index, values.count))
@@ -821,13 +829,13 @@ class FormTerms:
     def _with_part(self, node: nodes.Call, state: State) -> Term:
         moment, part, new = node.arguments
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
-        old = self._value(moment, state)
-        value = self._converted(self._value(new, state), new.type, _LONG)
+        old = self._term(moment, state)
+        value = self._converted(self._term(new, state), new.type, _LONG)
         seconds, rest = self._parts(old)
         one, other = (value, rest) if part.value == b"sec" else (seconds, value)
         return self._of_parts(node.type, one, other, state)
 
-    def _invoke(self, node: nodes.Invoke, state: State) -> Any:
+    def _invoke(self, node: nodes.Invoke, state: State) -> Value:
         if node.depth is not None:
             raise UnknownError("recursion")
         function = self._functions[node.function]
@@ -842,7 +850,7 @@ class FormTerms:
         inner = state.where(z3.BoolVal(True))
         try:
             self._block(function.body, inner)
-            ends = [*self._returned, (inner, None)]
+            ends: list[tuple[State, Value]] = [*self._returned, (inner, None)]
         finally:
             self._frame, self._shared, self._returned, self._context = outer
         ends = [(end, value) for end, value in ends if not z3.is_false(end.alive)]
@@ -855,6 +863,19 @@ class FormTerms:
             end = State(either(before.alive, end.alive), merged(before.alive, before, end))
         state.alive, state.slots = end.alive, end.slots
         return result
+
+
+def _known(value: Value, kind: Type) -> Term:
+    if not isinstance(value, Term):
+        raise UnknownError(f"a value of type {kind}")
+    return value
+
+
+def _terms(values: Sequence[Value], function: str) -> Sequence[Term]:
+    terms = [value for value in values if isinstance(value, Term)]
+    if len(terms) < len(values):
+        raise UnknownError(function.partition("_")[2])
+    return terms
 
 
 def _bits(value: Term) -> int:
@@ -962,7 +983,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], None
         }
     )
 )
-EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], Any] | nodes.Left] = (
+EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], Value] | nodes.Left] = (
     MappingProxyType(
         {
             nodes.Literal: FormTerms._literal,

@@ -16,16 +16,18 @@ a difference in `unrolled` loops.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Protocol
 
 import z3
 
 from rosmop.prove.terms import (
     MIXED,
+    Mixed,
     NotProvedError,
     State,
     Term,
     as_bits,
+    as_term,
     both,
     either,
     merged,
@@ -35,7 +37,15 @@ from rosmop.runtime.action_context import BUDGET
 
 BUDGET_SLOT = "budget"
 
-Head = Callable[[int, Any, Any], Any]
+
+class Log(Protocol):
+    """A list that grows during the translation, and whose last entries can be removed."""
+
+    def __len__(self) -> int: ...
+    def __delitem__(self, entries: slice, /) -> None: ...
+
+
+Head = Callable[[int, object, object], object]
 """Takes the loop's number, the slot's name and its value before the loop; returns the value at the head of the loop."""
 
 
@@ -50,9 +60,9 @@ class Cut:
     frame: int
     reached: Term
     again: Term
-    entry: Mapping[Any, Any]
-    head: Mapping[Any, Any]
-    back: Mapping[Any, Any]
+    entry: Mapping[object, object]
+    head: Mapping[object, object]
+    back: Mapping[object, object]
 
 
 @dataclass
@@ -76,7 +86,7 @@ class Loops:
         body: Callable[[State], tuple[Sequence[State], Sequence[State]]],
         frame: int,
         head: Head,
-        logs: Sequence[list[Any]],
+        logs: Sequence[Log],
     ) -> None:
         """Advance `state` to the end of the loop. A repeated translation removes its earlier entries from `logs`.
 
@@ -99,9 +109,9 @@ class Loops:
         body: Callable[[State], tuple[Sequence[State], Sequence[State]]],
         frame: int,
         head: Head,
-        logs: Sequence[list[Any]],
+        logs: Sequence[Log],
     ) -> Sequence[State]:
-        number, constants = len(self.cuts), dict[Any, Any]()
+        number, constants = len(self.cuts), dict[object, object]()
         nothing = z3.BoolVal(False)
         self.cuts.append(
             Cut(frame, nothing, nothing, {}, {}, {})
@@ -153,59 +163,59 @@ def loop_conditions(
             if not z3.is_false(one.again):
                 raise NotProvedError("not loop-free: it has a loop that costs nothing")
             continue
-        rest = one.back[BUDGET_SLOT]
-        yield f"the budget before {name}", both(one.reached, opposite(is_budget(one.entry[BUDGET_SLOT])))
-        less = both(is_budget(rest), rest < one.head[BUDGET_SLOT])
+        entry, head, rest = (as_term(slots[BUDGET_SLOT]) for slots in (one.entry, one.head, one.back))
+        yield f"the budget before {name}", both(one.reached, opposite(is_budget(entry)))
+        less = both(is_budget(rest), rest < head)
         yield f"the budget after an iteration of {name}", both(one.again, opposite(less))
-        for (_, begin, turned), (key, entry, back) in _pairs(one, other):
-            yield f"a variable before {name} ({key})", both(one.reached, other.reached, _differ(begin, entry))
+        for match, key in _pairs(one, other):
+            yield (
+                f"a variable before {name} ({key})",
+                both(one.reached, other.reached, _differ(one.entry[match], other.entry[key])),
+            )
             yield (
                 f"a variable after an iteration of {name} ({key})",
-                both(one.again, other.again, _differ(turned, back)),
+                both(one.again, other.again, _differ(one.back[match], other.back[key])),
             )
 
 
 def assumed(form: Sequence[Cut]) -> Sequence[Term]:
     """Return the assumption that the budget at the head of each loop is at most the budget before the loop."""
-    return [
-        both(
-            is_budget(cut.head[BUDGET_SLOT]),
-            either(opposite(cut.reached), cut.head[BUDGET_SLOT] <= cut.entry[BUDGET_SLOT]),
-        )
-        for cut in form
-        if BUDGET_SLOT in cut.head
-    ]
+    bounds = []
+    for cut in form:
+        if BUDGET_SLOT in cut.head:
+            entry, head = (as_term(slots[BUDGET_SLOT]) for slots in (cut.entry, cut.head))
+            bounds.append(both(is_budget(head), either(opposite(cut.reached), head <= entry)))
+    return bounds
 
 
 def is_budget(value: Term) -> Term:
     return both(value >= 0, value <= BUDGET)
 
 
-def _pairs(one: Cut, other: Cut) -> Iterator[tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
-    known = {value.get_id(): key for key, value in one.head.items() if value is not MIXED}
+def _pairs(one: Cut, other: Cut) -> Iterator[tuple[object, object]]:
+    """Yield the names of the slots that have the same constant at the heads of both loops."""
+    known = {value.get_id(): key for key, value in one.head.items() if isinstance(value, Term)}
     for key, value in other.head.items():
-        match = None if value is MIXED else known.get(value.get_id())
+        match = known.get(value.get_id()) if isinstance(value, Term) else None
         if match is not None:
-            yield (match, one.entry[match], one.back[match]), (key, other.entry[key], other.back[key])
+            yield match, key
 
 
-def _differ(one: Any, other: Any) -> Term:
-    if not isinstance(one, z3.ExprRef) or not isinstance(other, z3.ExprRef):
+def _differ(one: object, other: object) -> Term:
+    if not isinstance(one, Term) or not isinstance(other, Term):
         return z3.BoolVal(True)
     if z3.is_bool(one) != z3.is_bool(other):
         one, other = (as_bits(value) if z3.is_bool(value) else value for value in (one, other))
     return opposite(one == other)
 
 
-def constant_for(key: Any, value: Any) -> Any:
-    if not isinstance(value, z3.ExprRef):
-        return MIXED
-    return z3.FreshConst(value.sort(), f"{key} at the head")
+def constant_for(key: object, value: object) -> Term | Mixed:
+    return z3.FreshConst(value.sort(), f"{key} at the head") if isinstance(value, Term) else MIXED
 
 
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, z3.ExprRef) and isinstance(other, z3.ExprRef):
-        return bool(one.eq(other))
+def _same(one: object, other: object) -> bool:
+    if isinstance(one, Term) and isinstance(other, Term):
+        return one.eq(other)
     return type(one) is type(other) and bool(one == other)
 
 

@@ -7,47 +7,44 @@ accordingly.
 import math
 import struct
 from collections.abc import Mapping
-from typing import Any
 
 import z3
 
 from rosmop.fast.abi import kept_size, most_kept
 from rosmop.prove.concrete_runs import EventState
-from rosmop.prove.terms import DOUBLE, MEMORY, MISMATCH, StartTerms, Term, TextTerm, integer
+from rosmop.prove.terms import DOUBLE, MEMORY, MISMATCH, Model, StartTerms, Term, TextTerm, integer
 from rosmop.runtime.values import struct_code
 from rosmop.types import value_types
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 _ADDRESSES = 0xFFFFFFFF
 
 
-def state_of(model: Any, begin: StartTerms, kinds: Mapping[str, Type], context: str) -> EventState:
+def state_of(model: Model, begin: StartTerms, kinds: Mapping[str, Type], context: str) -> EventState:
     """Return the state of a model, for an event of a specification."""
     reader = _ModelReader(model, begin)
-    size = reader.number(begin.size, value_types.UINT)
+    size = reader.whole(begin.size, value_types.UINT)
     host, caller = (
-        reader.value(begin.senders[context, part], value_types.STRING)
-        if (context, part) in begin.senders
-        else b""
+        reader.text(begin.senders[context, part]) if (context, part) in begin.senders else b""
         for part in ("host", "caller")
     )
     return EventState(
         reader.bytes_of(begin.message, integer(0, 32), size),
-        reader.number(begin.now),
+        reader.whole(begin.now),
         {name: reader.value(term, kinds[name]) for name, term in begin.variables.items()},
-        reader.number(begin.budgets[context]),
-        {key: reader.number(term) for key, term in begin.throttles.items()},
+        reader.whole(begin.budgets[context]),
+        {key: reader.whole(term) for key, term in begin.throttles.items()},
         (host, caller),
         bool(reader.number(begin.altered, value_types.UINT)),
     )
 
 
 class _ModelReader:
-    def __init__(self, model: Any, begin: StartTerms) -> None:
+    def __init__(self, model: Model, begin: StartTerms) -> None:
         self._model = model
         self._texts = [(integer(at, 32), raw) for raw, at in begin.constants.items()]
 
-    def number(self, term: Term, kind: Type = value_types.LONG) -> Any:
+    def number(self, term: Term, kind: Type = value_types.LONG) -> float:
         value = self._model.eval(term, model_completion=True)
         if z3.is_bool(value):
             return z3.is_true(value)
@@ -58,6 +55,9 @@ class _ModelReader:
             return math.nan if is_nan else struct.unpack(code, bits.as_long().to_bytes(size, "little"))[0]
         is_signed = not isinstance(kind, value_types.IntegerType) or kind.signed
         return value.as_signed_long() if is_signed else value.as_long()
+
+    def whole(self, term: Term, kind: Type = value_types.LONG) -> int:
+        return int(self.number(term, kind))
 
     def bytes_of(self, array: Term, begin: Term, size: int) -> bytes:
         """Return bytes of an array from an address on."""
@@ -75,21 +75,23 @@ class _ModelReader:
             for place in places
         )
 
-    def value(self, term: Any, kind: Type) -> Any:
+    def value(self, term: Term | TextTerm, kind: Type) -> Value:
         if not isinstance(term, TextTerm):
             return self.number(term, kind)
-        count = self.number(term.count)
-        is_text = isinstance(kind, value_types.StringType)
+        if isinstance(kind, value_types.StringType):
+            return self.text(term)
+        count = self.whole(term.count)
         if count > most_kept(kind):
-            return bytes(most_kept(kind) + 1) if is_text else [0] * (most_kept(kind) + 1)
-        if is_text:
-            return self._text(term.place, count)
+            return [0] * (most_kept(kind) + 1)
         assert isinstance(kind, value_types.VectorType)  # noqa: S101  only these two are kept
         raw = self.bytes_of(MEMORY, term.place, count * kept_size(kind))
         return [*struct.unpack(f"<{count}{struct_code(kind.element)}", raw)]
 
-    def _text(self, place: Term, count: int) -> bytes:
+    def text(self, term: TextTerm) -> bytes:
         """Return an earlier string of the same length if the model has no difference between the two."""
+        place, count = term.place, self.whole(term.count)
+        if count > most_kept(value_types.STRING):
+            return bytes(most_kept(value_types.STRING) + 1)
         length = integer(count, 32)
         for other, raw in self._texts:
             pairs = (MISMATCH(place, other, length), MISMATCH(other, place, length))

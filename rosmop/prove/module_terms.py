@@ -17,12 +17,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any
 
 import z3
 
 from rosmop.prove.decoding import Code, WasmInstruction
-from rosmop.prove.loops import Cut, Loops, become, constant_for
+from rosmop.prove.loops import Cut, Log, Loops, become, constant_for
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
@@ -32,10 +31,13 @@ from rosmop.prove.terms import (
     NEAREST,
     SINGLE,
     DiffersError,
+    Mixed,
     NotProvedError,
+    Sort,
     State,
     Term,
     as_bits,
+    as_term,
     both,
     choice,
     either,
@@ -52,7 +54,7 @@ POSITION, UNDO, SAID = 0, 8, 12
 
 _ENTRY = 16  # bytes of an entry: address, size (4 bytes each), old bytes
 _MESSAGE, _NOTE, _LINES = "message", "note", "lines"
-_SORTS: Mapping[str, Any] = MappingProxyType(
+_SORTS: Mapping[str, Sort] = MappingProxyType(
     {"i32": z3.BitVecSort(32), "i64": z3.BitVecSort(64), "f32": SINGLE, "f64": DOUBLE}
 )
 
@@ -63,6 +65,10 @@ class Pointer:
 
     place: str
     offset: Term
+
+
+Value = Term | Pointer | Mixed
+"""A value on the stack of the module."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,7 @@ class LoopGuess:
     """Names of variables on both sides, and the form's loops, to guess equal values at the head of a loop."""
 
     cuts: Sequence[Cut]
-    variables: Mapping[int, Any]
+    variables: Mapping[int, object]
     names: Sequence[Sequence[str]]
     unrolled: int = 0
 
@@ -102,7 +108,7 @@ class ModuleResult:
     outside: Term
     bits: Term
     message: Term
-    cells: Mapping[int, Term]
+    cells: Mapping[int, object]
     stored: frozenset[int]
     lines: Term
     said: Term
@@ -124,7 +130,7 @@ class ModuleExecution:
         size: Term,
         cells: Mapping[int, Term],
         strings: Sequence[range],
-        routines: Mapping[int, Any],
+        routines: Mapping[int, Callable[..., Term]],
         spans: Sequence[ReadableBytes],
         guess: LoopGuess,
     ) -> None:
@@ -142,8 +148,8 @@ class ModuleExecution:
         self._stored: set[int] = set()
         self._frames = 0
         self._frame = 0
-        self._returned: list[tuple[State, Term]] = []
-        slots: dict[Any, Any] = {
+        self._returned: list[tuple[State, Value]] = []
+        slots: dict[object, object] = {
             _MESSAGE: message,
             _LINES: z3.Array("lines", z3.BitVecSort(32), z3.BitVecSort(8)),
         }
@@ -165,11 +171,11 @@ class ModuleExecution:
             if isinstance(key, tuple) and key[0] == "cell" and key[1] not in (POSITION, UNDO, SAID)
         }
         return ModuleResult(
-            either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
-            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset, self._loops,
+            either(*self._trapped), either(*self._outside), bits, state.term(_MESSAGE), cells,
+            frozenset(self._stored), state.term(_LINES), _pointer(state, SAID).offset, self._loops,
         )  # fmt: skip
 
-    def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
+    def _call(self, number: int, arguments: Sequence[Value], state: State) -> Value:
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned, self._function, self._labels
@@ -178,7 +184,7 @@ class ModuleExecution:
                  for kind in code.made]  # fmt: skip
         inner = state.where(z3.BoolVal(True))
         inner.slots |= {(self._frame, place): value for place, value in enumerate([*arguments, *zeros])}
-        stack: list[Any] = []
+        stack: list[Value] = []
         self._run(code.body, inner, stack)
         ends = [*self._returned, *([] if z3.is_false(inner.alive) else [(inner, stack[-1])])]
         self._frame, self._returned, self._function, self._labels = outer
@@ -192,7 +198,7 @@ class ModuleExecution:
         state.alive, state.slots = end.alive, end.slots
         return result
 
-    def _run(self, instructions: Sequence[WasmInstruction], state: State, stack: list[Any]) -> None:
+    def _run(self, instructions: Sequence[WasmInstruction], state: State, stack: list[Value]) -> None:
         for instruction in instructions:
             if z3.is_false(state.alive):
                 return
@@ -210,9 +216,9 @@ class ModuleExecution:
                     self._divides(rest, state, stack)
                 stack.append(_calculated(family, rest, instruction.operands, stack))
 
-    def _divides(self, name: str, state: State, stack: Sequence[Any]) -> None:
+    def _divides(self, name: str, state: State, stack: Sequence[Value]) -> None:
         left, right = _bits(stack[-2]), _bits(stack[-1])
-        traps = right == 0
+        traps: Term = right == 0
         if name == "div_s":
             traps = either(traps, both(right == -1, left == 1 << left.size() - 1))
         self._trapped.append(both(state.alive, traps))
@@ -220,11 +226,11 @@ class ModuleExecution:
 
     # Control
 
-    def _if(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _if(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         test = _truth(stack.pop())
         yes, no = state.where(test), state.where(opposite(test))
-        one: list[Any] = []
-        other: list[Any] = []
+        one: list[Value] = []
+        other: list[Value] = []
         self._labels.append([])
         self._run(instruction.body, yes, one)
         self._run(instruction.otherwise, no, other)
@@ -236,12 +242,12 @@ class ModuleExecution:
         if any(value is not None for value in values):
             stack.append(choice(test, *values))
 
-    def _block(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _block(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         self._labels.append([])
         self._run(instruction.body, state, [])
         become(state, [*self._labels.pop(), state])
 
-    def _loop(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _loop(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         def body(state: State) -> tuple[Sequence[State], Sequence[State]]:
             self._labels.append([])
             try:
@@ -250,15 +256,16 @@ class ModuleExecution:
                 again = self._labels.pop()
             return again, [state]
 
-        logs = [self._trapped, self._outside, self._returned, *self._labels]
+        logs: list[Log] = [self._trapped, self._outside, self._returned, *self._labels]
         self._loops.run(state, body, self._frame, self._at_head, logs)
 
-    def _at_head(self, number: int, key: Any, value: Any) -> Any:
+    def _at_head(self, number: int, key: object, value: object) -> Term | Mixed:
         if key in (_MESSAGE, _LINES, _NOTE, ("cell", SAID), ("cell", UNDO)):
             raise NotProvedError("not loop-free: a loop changes the message or prints")
         cut = self._guess.cuts[number] if number < len(self._guess.cuts) else None
         if cut is None:
             raise NotProvedError("not loop-free: it compares or copies strings, byte by byte")
+        assert isinstance(key, tuple)  # noqa: S101  a cell, a part of a note, or a variable of a call
         kind, place = key
         if kind == "cell":
             name = self._guess.variables.get(place)
@@ -266,28 +273,28 @@ class ModuleExecution:
             name = self._guess.names[self._function][place] if kind == self._frame else None
         for known in ((cut.frame, name), name):
             meant = cut.head.get(known)
-            if isinstance(meant, z3.ExprRef) and isinstance(value, z3.ExprRef) and _same_sort(meant, value):
+            if isinstance(meant, Term) and isinstance(value, Term) and _same_sort(meant, value):
                 return meant
         return constant_for(key, value)
 
-    def _branch(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _branch(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         self._labels[-1 - int(instruction.operands[0])].append(state.where(z3.BoolVal(True)))
         state.alive = z3.BoolVal(False)
 
-    def _branch_if(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _branch_if(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         test = _truth(stack.pop())
         self._labels[-1 - int(instruction.operands[0])].append(state.where(test))
         state.require(opposite(test))
 
-    def _unreachable(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _unreachable(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         self._trapped.append(state.alive)
         state.alive = z3.BoolVal(False)
 
-    def _return(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _return(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         self._returned.append((state.where(z3.BoolVal(True)), stack[-1]))
         state.alive = z3.BoolVal(False)
 
-    def _called(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _called(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         number = int(instruction.operands[0])
         count = len(self._functions[number].parameters)
         arguments = stack[len(stack) - count :]
@@ -299,42 +306,40 @@ class ModuleExecution:
             return
         stack.append(self._call(number, arguments, state))
 
-    def _drop(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _drop(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         stack.pop()
 
-    def _select(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _select(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         test, no, yes = _truth(stack.pop()), stack.pop(), stack.pop()
         stack.append(choice(test, yes, no))
 
-    def _get(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
-        value = state.slots[self._frame, instruction.operands[0]]
-        if value is MIXED:
-            raise NotProvedError("uses a variable for an address and a number")
-        stack.append(value)
+    def _get(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
+        stack.append(_number_or_address(state.slots[self._frame, instruction.operands[0]]))
 
-    def _set(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+    def _set(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         state.slots[self._frame, instruction.operands[0]] = stack.pop()
 
     # Memory
 
-    def _load(self, family: str, how: str, offset: float, address: Any, state: State) -> Any:
+    def _load(self, family: str, how: str, offset: float, address: Value, state: State) -> Value:
         bits = int(family[1:])
         if isinstance(address, Pointer):
             if address.place != "message":
                 raise DiffersError("it reads its own log")
             size = int(how.partition("_")[0] or bits) // 8
-            value = number_at(state.slots[_MESSAGE], self._within(address, int(offset), size, state), size)
-            return _loaded(value, family, how)
+            number = number_at(state.term(_MESSAGE), self._within(address, int(offset), size, state), size)
+            return _loaded(number, family, how)
         span = self._span(address)
         if span is not None:
             size = int(how.partition("_")[0] or bits) // 8
             return _loaded(
-                number_at(MEMORY, self._in_span(address, int(offset), size, span, state), size), family, how
+                number_at(MEMORY, self._in_span(as_term(address), int(offset), size, span, state), size),
+                family,
+                how,
             )
         place = self._cell(address, int(offset))
-        value = state.slots.get(("cell", place))
-        if value is MIXED:
-            raise NotProvedError("uses a variable for an address and a number")
+        known = state.slots.get(("cell", place))
+        value = None if known is None else _number_or_address(known)
         if (family, how) == ("i64", "32_u") and value is not None and _fits(value, "i32"):
             if isinstance(value, Pointer):
                 raise DiffersError("it calculates with an address")
@@ -344,12 +349,12 @@ class ModuleExecution:
         return value
 
     def _store(  # noqa: PLR0917  the operands of the instruction
-        self, family: str, how: str, offset: float, address: Any, value: Any, state: State
+        self, family: str, how: str, offset: float, address: Value, value: Value, state: State
     ) -> None:
         size = int(how or family[1:]) // 8
         if isinstance(address, Pointer) and address.place == "lines":
-            place = address.offset + integer(int(offset), 32)
-            state.slots[_LINES] = with_number(state.slots[_LINES], place, _stored(value, size))
+            begin = address.offset + integer(int(offset), 32)
+            state.slots[_LINES] = with_number(state.term(_LINES), begin, _stored(value, size))
             return
         if isinstance(address, Pointer):
             (self._write if address.place == "message" else self._note)(
@@ -360,7 +365,8 @@ class ModuleExecution:
         if place == UNDO and not how:
             self._add_note(value, state)
             return
-        before = state.slots.get(("cell", place))
+        known = state.slots.get(("cell", place))
+        before = None if known is None else _number_or_address(known)
         if isinstance(value, Pointer) and value.place == "message" and z3.is_bv(before):
             value = AT + value.offset
         if how or before is None or not _fits(before, family):
@@ -373,7 +379,7 @@ class ModuleExecution:
         if place != SAID:
             self._stored.add(place)
 
-    def _cell(self, address: Any, offset: int) -> int:
+    def _cell(self, address: Value, offset: int) -> int:
         number = z3.simplify(_bits(address))
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
@@ -383,8 +389,8 @@ class ModuleExecution:
             raise DiffersError("it reads an address outside the message")
         return place
 
-    def _span(self, address: Any) -> ReadableBytes | None:
-        if not isinstance(address, z3.ExprRef):
+    def _span(self, address: Value) -> ReadableBytes | None:
+        if not isinstance(address, Term):
             return None
         return next((one for one in self._spans for part in _summands(address) if part.eq(one.begin)), None)
 
@@ -399,12 +405,12 @@ class ModuleExecution:
         self._outside.append(both(state.alive, z3.UGT(end, z3.ZeroExt(32, self._size))))
         return pointer.offset + integer(offset, 32) if offset else pointer.offset
 
-    def _write(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
+    def _write(self, pointer: Pointer, offset: int, size: int, value: Value, state: State) -> None:
         position = self._within(pointer, offset, size, state)
-        note, message = state.slots.get(_NOTE), state.slots[_MESSAGE]
+        note, message = state.slots.get(_NOTE), state.term(_MESSAGE)
         old = number_at(message, position, size)
         if (
-            note is None
+            not isinstance(note, _Note)
             or not note.alive.eq(state.alive)
             or note.size != size
             or not _same(note.position, position)
@@ -413,30 +419,41 @@ class ModuleExecution:
             raise DiffersError("it writes bytes of the message that were not logged before")
         state.slots[_MESSAGE] = with_number(message, position, z3.Extract(8 * size - 1, 0, _bits(value)))
 
-    def _note(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
-        begin = state.slots["cell", UNDO].offset
+    def _note(self, pointer: Pointer, offset: int, size: int, value: Value, state: State) -> None:
+        begin = _pointer(state, UNDO).offset
         part = z3.simplify(pointer.offset + offset - begin)
         if not z3.is_bv_value(part) or (part.as_long(), size) not in ((0, 4), (4, 4), (8, 8)):
             raise DiffersError("it writes outside the next entry of the log")
         state.slots["part", part.as_long()] = value
 
-    def _add_note(self, value: Any, state: State) -> None:
-        begin = state.slots["cell", UNDO].offset
+    def _add_note(self, value: Value, state: State) -> None:
+        begin = _pointer(state, UNDO).offset
         address, size, old = (state.slots.get(("part", part)) for part in (0, 4, 8))
-        size = size if size is None else z3.simplify(_bits(size))
+        size = size if size is None else z3.simplify(_bits(_number_or_address(size)))
         if (
             not isinstance(value, Pointer)
             or not _same(value.offset, begin + _ENTRY)
             or not isinstance(address, Pointer)
-            or size is None
+            or not isinstance(size, Term)
             or not z3.is_bv_value(size)
-            or old is None
+            or not isinstance(old, Term)
         ):
             raise DiffersError("the end of the log is set where no entry ends")
         state.slots[_NOTE] = _Note(state.alive, address.offset, size.as_long(), old)
         state.slots["cell", UNDO] = value
         for part in (0, 4, 8):
             del state.slots["part", part]
+
+
+def _pointer(state: State, cell: int) -> Pointer:
+    pointer = state.slots["cell", cell]
+    if not isinstance(pointer, Pointer):
+        raise NotProvedError("uses a variable for an address and a number")
+    return pointer
+
+
+def _number_or_address(value: object) -> Term | Pointer:
+    return value if isinstance(value, Pointer) else as_term(value)
 
 
 def _summands(term: Term) -> Iterator[Term]:
@@ -459,13 +476,13 @@ def _loaded(value: Term, family: str, how: str) -> Term:
     return value if not missing else (z3.SignExt if how.endswith("_s") else z3.ZeroExt)(missing, value)
 
 
-def _stored(value: Any, size: int) -> Term:
+def _stored(value: Value, size: int) -> Term:
     if isinstance(value, Pointer):
         if value.place != "message":
             raise DiffersError("it logs an address outside the message")
         value = AT + value.offset
     elif z3.is_fp(value):
-        value = z3.fpToIEEEBV(value)
+        value = z3.fpToIEEEBV(as_term(value))
     return z3.Extract(8 * size - 1, 0, _bits(value))
 
 
@@ -478,34 +495,40 @@ def _same(one: Term, other: Term) -> bool:
     return bool(z3.is_bv_value(rest) and rest.as_long() == 0)
 
 
-def _fits(value: Any, family: str) -> bool:
-    return (
-        family == "i32" if isinstance(value, Pointer) or z3.is_bool(value) else value.sort() == _SORTS[family]
-    )
+def _fits(value: Term | Pointer, family: str) -> bool:
+    if isinstance(value, Pointer) or z3.is_bool(value):
+        return family == "i32"
+    return value.sort() == _SORTS[family]
 
 
-def _bits(value: Any) -> Term:
+def _operand(value: Value) -> Term:
     if isinstance(value, Pointer):
         raise DiffersError("it calculates with an address")
-    return as_bits(value) if z3.is_bool(value) else value
+    return as_term(value)
 
 
-def _truth(value: Any) -> Term:
-    return value if z3.is_bool(value) else opposite(_bits(value) == 0)
+def _bits(value: Value) -> Term:
+    term = _operand(value)
+    return as_bits(term) if z3.is_bool(term) else term
 
 
-def _calculated(family: str, name: str, operands: Sequence[float], stack: list[Any]) -> Any:
+def _truth(value: Value) -> Term:
+    return as_term(value) if z3.is_bool(value) else opposite(_bits(value) == 0)
+
+
+def _calculated(family: str, name: str, operands: Sequence[float], stack: list[Value]) -> Value:
     if name == "const":
         bits = int(family[1:])
         return integer(int(operands[0]), bits) if family[0] == "i" else floating(operands[0], bits)
     right = stack.pop()
     unary = _UNARY.get(f"{family}.{name}") or _UNARY.get(name)
     if unary is not None and (family[0] == "f" or name not in _FLOATS_ALONE):
-        return unary(right)
+        return unary(_operand(right))
     left = stack.pop()
-    if family == "i32" and name == "add" and (isinstance(left, Pointer) or isinstance(right, Pointer)):
-        pointer, more = (left, right) if isinstance(left, Pointer) else (right, left)
-        return Pointer(pointer.place, pointer.offset + _bits(more))
+    if family == "i32" and name == "add":
+        pointer, more = (right, left) if isinstance(right, Pointer) else (left, right)
+        if isinstance(pointer, Pointer):
+            return Pointer(pointer.place, pointer.offset + _bits(more))
     if name == "gt_u" and isinstance(left, Pointer) and left.place == "lines":
         return z3.FreshBool("full")
     if family == "i32" and z3.is_bool(left) and z3.is_bool(right) and name in ("and", "or"):
@@ -525,7 +548,7 @@ def _cut(value: Term, bits: int, *, signed: bool) -> Term:
     return z3.If(z3.fpIsNaN(value), integer(0, bits), fitting)
 
 
-def _converting(to: Callable[..., Term], sort: Any) -> Callable[[Any], Term]:
+def _converting(to: Callable[..., Term], sort: Sort) -> Callable[[Term], Term]:
     return lambda value: to(NEAREST, _bits(value), sort)
 
 
@@ -533,7 +556,7 @@ def _shifted(operation: Callable[[Term, Term], Term]) -> Callable[[Term, Term], 
     return lambda value, amount: operation(value, amount & (amount.size() - 1))
 
 
-_CONTROL: Mapping[str, Callable[[ModuleExecution, WasmInstruction, State, list[Any]], None]] = (
+_CONTROL: Mapping[str, Callable[[ModuleExecution, WasmInstruction, State, list[Value]], None]] = (
     MappingProxyType(
         {
             "if": ModuleExecution._if,
@@ -553,7 +576,7 @@ _CONTROL: Mapping[str, Callable[[ModuleExecution, WasmInstruction, State, list[A
 )
 
 _FLOATS_ALONE = frozenset({"abs", "neg", "ceil", "floor", "trunc", "nearest", "sqrt"})
-_UNARY: Mapping[str, Callable[[Any], Term]] = MappingProxyType(
+_UNARY: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
     {
         "eqz": lambda value: opposite(_truth(value)),
         "wrap_i64": lambda value: z3.Extract(31, 0, value),

@@ -1,12 +1,11 @@
 """Ask z3 about one event: costly operations on numbers get their meaning only if the answer depends on it."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
 
 import z3
 
 from rosmop.prove.concrete_runs import READS_BEYOND
-from rosmop.prove.terms import Abstraction, DiffersError, Term, either
+from rosmop.prove.terms import Abstraction, DiffersError, Model, Term, either
 
 _A_SECOND = 6_500_000
 """The effort of z3, in its own unit, that took a second of a processor for the events of the presets, on average."""
@@ -31,7 +30,7 @@ class Effort:
         self._patience = patience
         self._left = int(patience * _A_SECOND)
 
-    def check(self, conditions: Sequence[Term], *, most: int = 0) -> tuple[Any, Any]:
+    def check(self, conditions: Sequence[Term], *, most: int = 0) -> tuple[z3.CheckSatResult, Model | None]:
         """Return whether the conditions are satisfiable, and a model, with the effort that is left, or with `most`."""
         if self._left <= 0:
             return z3.unknown, None
@@ -63,7 +62,9 @@ class Questions:
         answer, _ = self._effort.check(self._abstractions[0].of(question), most=_TOGETHER)
         return bool(answer == z3.unsat)
 
-    def decide(self, condition: Term, replay: Callable[[Any], None] = lambda _: None) -> tuple[Any, Any]:
+    def decide(
+        self, condition: Term, replay: Callable[[Model], None] = lambda _: None
+    ) -> tuple[z3.CheckSatResult, Model | None]:
         """Return whether the condition is satisfiable, and a model. Formulas without costly operations are tried
         first. `replay` gets each model, also of such a formula.
         """
@@ -83,7 +84,7 @@ class Questions:
 
 
 def first_difference(
-    questions: Questions, wrong: Mapping[str, Term], replay: Callable[[Any], None], *, in_induction: bool
+    questions: Questions, wrong: Mapping[str, Term], replay: Callable[[Model], None], *, in_induction: bool
 ) -> str | None:
     """Return why the two are not known to be equal, or None. Raises `DiffersError` for a difference that a run shows,
     and for a read beyond the message, whose effect a run may not show. Raises `MayDifferError` for any other
@@ -106,7 +107,7 @@ def first_difference(
     return unknown
 
 
-def _holds(conditions: Sequence[Term], guess: Any) -> bool:
+def _holds(conditions: Sequence[Term], guess: Model) -> bool:
     values = [
         (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
     ]
@@ -118,7 +119,7 @@ def _holds(conditions: Sequence[Term], guess: Any) -> bool:
     return all(z3.is_true(z3.simplify(z3.substitute(condition, *known))) for condition in conditions)
 
 
-def _example(model: Any) -> str:
+def _example(model: Model) -> str:
     return ", ".join(
         f"{declaration} = {model[declaration]}" for declaration in model.decls() if declaration.arity() == 0
     )

@@ -12,7 +12,6 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from random import Random
-from typing import Any
 
 from rosmop.fast.abi import most_kept
 from rosmop.fast.batch_codegen import WasmModule
@@ -23,7 +22,7 @@ from rosmop.runtime.action_context import BUDGET
 from rosmop.runtime.times import MAX_TIME
 from rosmop.runtime.values import ValueCodec, struct_code
 from rosmop.types import value_types
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 STATES = 4000
 """The number of states for each event."""
@@ -62,7 +61,7 @@ class RandomStates:
         self._zeros = 0.0
         """The fraction of a message's numbers that are 0, as in the messages of a standing base."""
         self._is_tame = self._is_exact = False
-        self._fields: Any = None
+        self._fields: Value = []
 
     def following(self, runs: ConcreteRuns, event: EventPair) -> Iterator[EventState]:
         """Yield the states, in half of which the variables have the values after the state before."""
@@ -99,7 +98,7 @@ class RandomStates:
         names, altered = (self._text(), self._text()), random.random() < 0.25
         return EventState(self._message(), self._now, variables, budget, throttled, names, altered)
 
-    def _next(self, state: EventState, after: Mapping[str, Any]) -> EventState:
+    def _next(self, state: EventState, after: Mapping[str, Value]) -> EventState:
         random = self._random
         if random.random() < 0.4:
             message = self._message()
@@ -135,7 +134,7 @@ class RandomStates:
         self._values.encoder(self._kind)(self._fields, raw)
         return bytes(raw)
 
-    def _changed(self, value: Any, kind: Type) -> Any:
+    def _changed(self, value: Value, kind: Type) -> Value:
         """Return a copy of a value in which one number or string is drawn again."""
         random = self._random
         if isinstance(kind, value_types.FloatingType) and random.random() < 0.3:
@@ -151,7 +150,7 @@ class RandomStates:
             inner = kind.element
         return [*value[:place], self._changed(value[place], inner), *value[place + 1 :]]
 
-    def _value(self, kind: Type) -> Any:
+    def _value(self, kind: Type) -> Value:
         random = self._random
         if isinstance(kind, value_types.RecordType):
             return [self._value(field) for field in self._values.fields(kind)]
@@ -164,7 +163,7 @@ class RandomStates:
             return some if len(some) == length else random.choices(some, k=length)
         return self._text() if isinstance(kind, value_types.StringType) else self._number(kind)
 
-    def _number(self, kind: Type) -> Any:
+    def _number(self, kind: Type) -> float:
         random = self._random
         if self._zeros and random.random() < self._zeros:
             return 0

@@ -7,12 +7,18 @@ extended by their sign or by zeros. There is only one NaN, and its bits cannot b
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar, overload
 
 import z3
 
-Term = Any
-"""A term of z3, which has no Python types."""
+if TYPE_CHECKING:
+    from rosmop.prove.loops import Loops
+
+
+Term = z3.ExprRef
+Sort = z3.SortRef
+Model = z3.ModelRef
+_T = TypeVar("_T")
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
@@ -37,11 +43,11 @@ class NotProvedError(Exception):
     """An event about which nothing is known; the message gives the reason."""
 
 
-class _Mixed:
+class Mixed:
     """Marks a slot that has different kinds of values in two branches, and must not be read."""
 
 
-MIXED = _Mixed()
+MIXED = Mixed()
 
 
 class DiffersError(Exception):
@@ -78,7 +84,21 @@ def opposite(condition: Term) -> Term:
     return z3.BoolVal(z3.is_false(condition)) if known else z3.Not(condition)
 
 
-def choice(test: Term, yes: Term, no: Term) -> Term:
+def as_term(value: object) -> Term:
+    if not isinstance(value, Term):
+        raise NotProvedError("uses a variable for an address and a number")
+    return value
+
+
+@overload
+def choice(test: Term, yes: Term, no: Term) -> Term: ...
+
+
+@overload
+def choice(test: Term, yes: _T | None, no: _T | None) -> _T | Mixed: ...
+
+
+def choice(test: Term, yes: object, no: object) -> object:
     """`test ? yes : no` for terms or structures of terms. A part that only one of them has is used as it is."""
     if z3.is_true(test) or no is None or yes is no:
         return yes
@@ -92,7 +112,7 @@ def choice(test: Term, yes: Term, no: Term) -> Term:
             for field in fields(yes)
         }
         return replace(yes, **parts)
-    if isinstance(yes, z3.ExprRef) and isinstance(no, z3.ExprRef):
+    if isinstance(yes, Term) and isinstance(no, Term):
         if z3.is_bool(yes) != z3.is_bool(no):
             yes, no = (as_bits(truth) if z3.is_bool(truth) else truth for truth in (yes, no))
         if yes.sort() == no.sort():
@@ -128,7 +148,11 @@ class State:
     """A point of a function: the condition under which it is reached (`alive`), and values."""
 
     alive: Term
-    slots: dict[Any, Any]
+    slots: dict[object, object]
+
+    def term(self, slot: object) -> Term:
+        """Return the value of a slot that has a term."""
+        return as_term(self.slots[slot])
 
     def where(self, condition: Term) -> "State":
         return State(both(self.alive, condition), dict(self.slots))
@@ -142,7 +166,7 @@ class State:
         self.slots = merged(test, yes, no)
 
 
-def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
+def merged(test: Term, yes: State, no: State) -> dict[object, object]:
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):
@@ -161,7 +185,7 @@ class StartTerms:
     message: Term
     size: Term
     now: Term
-    variables: Mapping[str, Any]
+    variables: Mapping[str, Term | TextTerm]
     budgets: Mapping[str, Term]
     throttles: Mapping[tuple[str, int], Term]
     senders: Mapping[tuple[str, str], TextTerm]
@@ -192,12 +216,11 @@ class FormResult:
     replaced: Term
     changed: Term
     message: Term
-    variables: Mapping[str, Any]
+    variables: Mapping[str, object]
     budgets: Mapping[str, Term]
     said: Term
     noted: Sequence[LineTerm]
-    loops: Any
-    """A `loops.Loops`, whose module imports this module."""
+    loops: "Loops"
 
 
 _SMALL = 1 << 10

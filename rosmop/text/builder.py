@@ -3,10 +3,10 @@
 # Each method handles the rule of the grammar that has its name.
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from lark import Token, Transformer_NonRecursive, v_args
 from lark.tree import Meta
@@ -33,6 +33,10 @@ MAX_PERIOD_NS = 10**18
 
 
 _Parameters = tuple[tree.ParameterDeclaration, ...]
+_Bindings = list[tree.Binding]
+_Path = tuple[tree.PathStep, ...]
+_Expressions = tuple[tree.Expression, ...]
+_Given = tree.GivenValue | tree.TopicDeclaration | tree.TypedTopic | tree.GivenList
 _TYPED = tree.TypedTopic | tree.GivenList | tree.TypedEvent | tree.TypedSafe
 
 
@@ -54,23 +58,28 @@ def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:
 
 
 def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
-    def build(self: "TreeBuilder", meta: Meta, *children: Any) -> _T:
+    def build(self: "TreeBuilder", meta: Meta, *children: object) -> _T:
         given = (str(child) if isinstance(child, Token) else child for child in children[first:])
         return kind(self.at(meta), *given, **more)
 
     return build
 
 
-def _all(_builder: "TreeBuilder", _: Meta, *children: Any) -> tuple[Any, ...]:
+def _all(_builder: "TreeBuilder", _: Meta, *children: object) -> tuple[object, ...]:
     return children
 
 
-def _unsaid(_builder: "TreeBuilder", _: Meta, *_children: Any) -> _Unsaid:
+def _unsaid(_builder: "TreeBuilder", _: Meta, *_children: object) -> _Unsaid:
     return _Unsaid()
 
 
+def _child(children: Iterable[object], kind: type[_T]) -> _T:
+    """Return the child of a kind, which the grammar requires."""
+    return next(child for child in children if isinstance(child, kind))
+
+
 @v_args(inline=True, meta=True)
-class TreeBuilder(Transformer_NonRecursive[Token, Any]):
+class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     """Builds the tree; `findings` lists the invalid literals."""
 
     def __init__(self, file: str, text: str) -> None:
@@ -91,7 +100,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
 
     # Files and specifications
 
-    def file(self, _: Meta, *children: Any) -> tree.TypedFile:
+    def file(self, _: Meta, *children: object) -> tree.TypedFile:
         def items(kind: type[_T]) -> tuple[_T, ...]:
             return tuple(child for child in children if isinstance(child, kind))
 
@@ -118,12 +127,19 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     ) -> tree.RoleDeclaration:
         return tree.RoleDeclaration(self.at(meta), str(name), parameters or (), str(base or ""), rows)
 
-    def row(self, meta: Meta, kind: Token, *parts: Any) -> tree.RoleRow:
-        parameters, pattern, cancels, action = (*parts, None)[:4]
+    def row(  # noqa: PLR0917  the children of the rule
+        self,
+        meta: Meta,
+        kind: Token,
+        parameters: _Parameters | None,
+        pattern: tuple[tree.Binding, ...],
+        cancels: Token | None,
+        action: tree.Block | None = None,
+    ) -> tree.RoleRow:
         name = "" if kind.type == "DEFAULT" else str(kind).replace("::", "/")
         return tree.RoleRow(self.at(meta), name, parameters or (), pattern, cancels is not None, action)
 
-    def order(self, meta: Meta, _word: Token, *names: Any) -> tree.OrderStatement:
+    def order(self, meta: Meta, _word: Token, *names: Token) -> tree.OrderStatement:
         return tree.OrderStatement(
             self.at(meta), tuple(tree.Name(self.at(name), (str(name),)) for name in names)
         )
@@ -133,7 +149,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def nothing(self, meta: Meta) -> tree.Statement:
         return tree.Block(self.at(meta), ())
 
-    def specification(self, meta: Meta, *children: Any) -> tree.Specification | tree.TypedSpecification:
+    def specification(self, meta: Meta, *children: object) -> tree.Specification | tree.TypedSpecification:
         names = [
             child for child in children if isinstance(child, Token) and child.type in ("NAME", "MODIFIER")
         ]
@@ -170,7 +186,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         )
 
     def function(
-        self, meta: Meta, kind: Any, name: Any, parameters: Any, body: Any
+        self, meta: Meta, kind: tree.TypeName, name: Token, parameters: _Parameters | None, body: tree.Block
     ) -> tree.FunctionDefinition | tree.InitBlock:
         if name == "init" and kind.name == ("void",):
             return self.init(meta, parameters, body)
@@ -179,10 +195,10 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def phase(self, meta: Meta, name: Token) -> tree.Name:
         return tree.Name(self.at(meta), (str(name),))
 
-    def given(self, _: Meta, _word: Token, *items: Any) -> list[Any]:
+    def given(self, _: Meta, _word: Token, *items: _Given) -> list[_Given]:
         return [*items]
 
-    def given_value(self, meta: Meta, *children: Any) -> tree.GivenValue:
+    def given_value(self, meta: Meta, *children: Token) -> tree.GivenValue:
         *words, name, value = children
         found = _GIVEN.fullmatch(value.strip())
         if found is None:
@@ -207,63 +223,86 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
 
     prototype = _unsaid
 
-    def procedure(self, meta: Meta, name: Any, parameters: Any, body: Any) -> tree.FunctionDefinition:
+    def procedure(
+        self, meta: Meta, name: Token, parameters: _Parameters | None, body: tree.Block
+    ) -> tree.FunctionDefinition:
         return tree.FunctionDefinition(self.at(meta), None, str(name), parameters or (), body)
 
-    def init(self, meta: Meta, parameters: Any, body: Any) -> tree.InitBlock:
+    def init(self, meta: Meta, parameters: _Parameters | None, body: tree.Block) -> tree.InitBlock:
         if parameters:
             self.refuse(meta, "`init` takes no parameters: it runs before the first message")
         return tree.InitBlock(self.at(meta), body)
 
     parameters = _all
 
-    def unnamed_parameters(self, meta: Meta, *words: Any) -> tuple[tree.ParameterDeclaration, ...]:
+    def unnamed_parameters(self, meta: Meta, *words: Token) -> _Parameters:
         if words != ("void",):
             self.refuse(meta, f"give the parameter a name: `{' '.join(words)} x`")
         return ()
 
     parameter = _made(tree.ParameterDeclaration)
 
-    def reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.ParameterDeclaration:
+    def reference_parameter(self, meta: Meta, kind: tree.TypeName, name: Token) -> tree.ParameterDeclaration:
         return tree.ParameterDeclaration(self.at(meta), _referenced(kind), str(name))
 
-    def array_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.ParameterDeclaration:
+    def array_parameter(self, meta: Meta, kind: tree.TypeName, name: Token) -> tree.ParameterDeclaration:
         array = tree.TypeName(kind.position, ("[]",), element=kind)
         return tree.ParameterDeclaration(self.at(meta), array, str(name))
 
     array_parameter_behind = array_parameter
 
-    def array_reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.ParameterDeclaration:
+    def array_reference_parameter(
+        self, meta: Meta, kind: tree.TypeName, name: Token
+    ) -> tree.ParameterDeclaration:
         vector = tree.TypeName(kind.position, ("std", "vector"), element=kind)
         return self.reference_parameter(meta, vector, name)
 
     # Events and properties
 
-    def event(self, meta: Meta, *children: Any) -> tree.EventDefinition:
-        *modifiers, name, parameters, trigger, action = children
-        words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
-        return tree.EventDefinition(self.at(meta), words, str(name), parameters or (), trigger, action)
+    def event(self, meta: Meta, *children: object) -> tree.EventDefinition:
+        *modifiers, name = (child for child in children if isinstance(child, Token))
+        parameters = next((child for child in children if isinstance(child, tuple)), ())
+        triggers = (child for child in children if isinstance(child, tree.MessageTrigger | tree.TimerTrigger))
+        words = self.names(meta, *modifiers)
+        action = _child(children, tree.Block)
+        return tree.EventDefinition(self.at(meta), words, str(name), parameters, next(triggers), action)
 
-    def typed_event(self, meta: Meta, *children: Any) -> tree.TypedEvent:
-        *modifiers, name, names, topic, when, action = children
-        words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
-        return tree.TypedEvent(self.at(meta), words, str(name), names or (), str(topic), when, action)
+    def typed_event(self, meta: Meta, *children: object) -> tree.TypedEvent:
+        *modifiers, name, topic = (child for child in children if isinstance(child, Token))
+        names = next((child for child in children if isinstance(child, tuple)), ())
+        when = next((child for child in children if isinstance(child, tree.Expression)), None)
+        words = self.names(meta, *modifiers)
+        action = _child(children, tree.Block)
+        return tree.TypedEvent(self.at(meta), words, str(name), names, str(topic), when, action)
 
     def names(self, _: Meta, *words: Token) -> tuple[tree.Name, ...]:
         return tuple(tree.Name(self.at(word), (str(word),)) for word in words)
 
-    def trigger(
-        self, meta: Meta, topic: Any, kind: Any, *rest: Any, part: str | None = None
+    def trigger(  # noqa: PLR0917  the children of the rule
+        self,
+        meta: Meta,
+        topic: Token,
+        kind: Token,
+        pattern: tuple[tree.Binding, ...],
+        when: tree.Expression | None,
+        part: str | None = None,
     ) -> tree.MessageTrigger:
         name = str(kind).replace("::", "/")
-        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), part, *rest)
+        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), part, pattern, when)
 
-    def service_trigger(
-        self, meta: Meta, _: Token, topic: Any, kind: Any, part: Any, *rest: Any
+    def service_trigger(  # noqa: PLR0917  the children of the rule
+        self,
+        meta: Meta,
+        _: Token,
+        topic: Token,
+        kind: Token,
+        part: Token,
+        pattern: tuple[tree.Binding, ...],
+        when: tree.Expression | None,
     ) -> tree.MessageTrigger:
-        return self.trigger(meta, topic, kind, *rest, part=str(part))
+        return self.trigger(meta, topic, kind, pattern, when, str(part))
 
-    def timer(self, meta: Meta, _every: Token, duration: Any) -> tree.TimerTrigger:
+    def timer(self, meta: Meta, _every: Token, duration: Token) -> tree.TimerTrigger:
         has_unit = duration.strip()[-1:].isalpha()
         return tree.TimerTrigger(self.at(meta), self._period_ns(duration), has_unit=has_unit)
 
@@ -275,7 +314,15 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             return 10**9
 
     def safe(
-        self, meta: Meta, _: Token, kind: Any, fields: Any, _on: Token, topic: Any, _every: Token, period: Any
+        self,
+        meta: Meta,
+        _: Token,
+        kind: Token,
+        fields: _Bindings | None,
+        _on: Token,
+        topic: Token,
+        _every: Token,
+        period: Token,
     ) -> tree.SafeDeclaration:
         name = str(kind).replace("::", "/")
         place = self.at(kind)
@@ -289,40 +336,38 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return tree.TypedSafe(self.at(meta), str(topic), self._period_ns(period))
 
     def withhold(
-        self, meta: Meta, _: Token, topic: Any, _from: Token, *rest: Any
+        self, meta: Meta, _: Token, topic: Token, _from: Token, *rest: Token | tree.StringLiteral
     ) -> tree.WithholdDeclaration:
-        *networks, _while, condition = rest
-        networks = [
-            tree.Name(self.at(network), (str(network),)) if isinstance(network, Token) else network
-            for network in networks
-        ]
+        *lists, _while, condition = (word for word in rest if isinstance(word, Token))
+        texts = (text for text in rest if isinstance(text, tree.StringLiteral))
+        networks: list[tree.StringLiteral | tree.Name] = [*texts, *self.names(meta, *lists)]
         return tree.WithholdDeclaration(
             self.at(meta), str(topic), tuple(networks), tree.Name(self.at(condition), (str(condition),))
         )
 
-    def pattern(self, _: Meta, _open: Token, fields: Any, _close: Token) -> tuple[tree.Binding, ...]:
+    def pattern(
+        self, _: Meta, _open: Token, fields: _Bindings | None, _close: Token
+    ) -> tuple[tree.Binding, ...]:
         return tuple(fields or ())
 
-    def fields(self, _: Meta, *groups: Any) -> list[tree.Binding]:
+    def fields(self, _: Meta, *groups: _Bindings | None) -> _Bindings:
         return [binding for group in groups if group is not None for binding in group]
 
-    def bind(self, meta: Meta, path: Any, name: Any) -> list[tree.Binding]:
+    def bind(self, meta: Meta, path: _Path, name: Token) -> _Bindings:
         if name in ("true", "false"):
             constant = tree.Name(self.at(name), (str(name),))
             return [tree.Binding(self.at(meta), path, None, constant, self.at(name))]
         return [tree.Binding(self.at(meta), path, str(name), None, self.at(name))]
 
-    def constrain(self, meta: Meta, path: Any, constant: Any) -> list[tree.Binding]:
-        if isinstance(constant, list | tuple):
-            constant = tree.Name(self.at(meta), tuple(constant))
+    def constrain(self, meta: Meta, path: _Path, constant: tree.Expression) -> _Bindings:
         return [tree.Binding(self.at(meta), path, None, constant, constant.position)]
 
-    def nest(self, _: Meta, path: Any, inner: Any) -> list[tree.Binding]:
+    def nest(self, _: Meta, path: _Path, inner: _Bindings | None) -> _Bindings:
         return [replace(binding, path=(*path, *binding.path)) for binding in inner or ()]
 
     path = _all
 
-    def path_step(self, meta: Meta, name: Any, index: Any) -> tree.PathStep:
+    def path_step(self, meta: Meta, name: Token, index: Token | None) -> tree.PathStep:
         if index is None:
             return tree.PathStep(self.at(meta), str(name), None)
         if not index.isdigit() or len(index) > 10:
@@ -330,7 +375,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             return tree.PathStep(self.at(meta), str(name), 0)
         return tree.PathStep(self.at(meta), str(name), int(index))
 
-    def property(self, meta: Meta, logic: Any, formula: Any, *handlers: Any) -> tree.Property:
+    def property(self, meta: Meta, logic: Token, formula: Token, *handlers: tree.Handler) -> tree.Property:
         stripped = formula.lstrip()
         origin = self.at(formula).within(formula, len(formula) - len(stripped))
         return tree.Property(self.at(meta), str(logic), stripped.rstrip(), origin, tuple(handlers))
@@ -339,70 +384,86 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
 
     # Types
 
-    def type(self, meta: Meta, *children: Any) -> tree.TypeName:
-        core = next(child for child in children if isinstance(child, tree.TypeName))
+    def type(self, meta: Meta, *children: str | tree.TypeName) -> tree.TypeName:
+        core = _child(children, tree.TypeName)
         constant = core.constant or "const" in children or "constexpr" in children
         static = "static" in children
         return replace(core, position=self.at(meta), constant=constant, static=static)
 
-    def qualifier(self, _: Meta, word: Any) -> str:
+    def qualifier(self, _: Meta, word: Token) -> str:
         return str(word)
 
-    def core(self, meta: Meta, *words: Any) -> tree.TypeName:
+    def core(self, meta: Meta, *words: Token | tree.TypeName) -> tree.TypeName:
         if isinstance(words[0], tree.TypeName):
             return words[0]
         return tree.TypeName(self.at(meta), tuple(map(str, words)))
 
-    def pointer(self, meta: Meta, *words: Any) -> tree.TypeName:
+    def pointer(self, meta: Meta, *words: Token) -> tree.TypeName:
         return tree.TypeName(self.at(meta), tuple(map(str, words)), pointer=True)
 
     named = _made(tree.TypeName)
 
-    def message(self, meta: Meta, name: Any) -> tree.TypeName:
+    def message(self, meta: Meta, name: Token) -> tree.TypeName:
         return tree.TypeName(self.at(meta), tuple(str(name).replace("::", "/").split("/")))
 
-    def vector(self, meta: Meta, *children: Any) -> tree.TypeName:
-        return tree.TypeName(self.at(meta), ("std", "vector"), element=children[-1])
+    def vector(self, meta: Meta, _word: Token, element: tree.TypeName) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), ("std", "vector"), element=element)
 
-    def vector_of_vectors(self, meta: Meta, *children: Any) -> tree.TypeName:
-        return self.vector(meta, self.vector(meta, *children))
+    def vector_of_vectors(
+        self, meta: Meta, word: Token, inner: Token, element: tree.TypeName
+    ) -> tree.TypeName:
+        return self.vector(meta, word, self.vector(meta, inner, element))
 
     def automatic(self, meta: Meta) -> tree.TypeName:
         return tree.TypeName(self.at(meta), ("auto",))
 
-    def scoped(self, _: Meta, *children: Any) -> tuple[str, ...]:
+    def scoped(self, _: Meta, *children: Token | None) -> tuple[str, ...]:
         return tuple(str(child) for child in children if child is not None)
 
     # Statements
 
-    def block(self, meta: Meta, *children: Any) -> tree.Block:
+    def block(self, meta: Meta, *children: tree.Statement) -> tree.Block:
         return tree.Block(self.at(meta), children)
 
     evaluate = _made(tree.ExpressionStatement)
     if_ = _made(tree.IfStatement, 1)
     while_ = _made(tree.WhileStatement, 1)
 
-    def do_(self, meta: Meta, _: Token, body: Any, condition: tree.Expression) -> tree.WhileStatement:
+    def do_(
+        self, meta: Meta, _: Token, body: tree.Statement, condition: tree.Expression
+    ) -> tree.WhileStatement:
         return tree.WhileStatement(self.at(meta), condition, body, at_end=True)
 
     def for_(
-        self, meta: Meta, _: Token, start: Any, condition: tree.Expression, step: Any, body: Any
+        self,
+        meta: Meta,
+        _: Token,
+        start: tree.Statement,
+        condition: tree.Expression | None,
+        step: tree.Expression | None,
+        body: tree.Statement,
     ) -> tree.ForStatement:
         empty = isinstance(start, tree.Block)
         return tree.ForStatement(self.at(meta), None if empty else start, condition, step, body)
 
     range_for = _made(tree.RangeForStatement, 1)
 
-    def range_for_reference(self, meta: Meta, word: Any, kind: Any, *more: Any) -> tree.RangeForStatement:
+    def range_for_reference(
+        self, meta: Meta, word: Token, kind: tree.TypeName, *more: Token | tree.SyntaxNode
+    ) -> tree.RangeForStatement:
         return self.range_for(meta, word, _referenced(kind), *more)
 
-    def switch(self, meta: Meta, _: Token, value: Any, *cases: Any) -> tree.SwitchStatement:
+    def switch(
+        self, meta: Meta, _: Token, value: tree.Expression, *cases: tree.SwitchCase
+    ) -> tree.SwitchStatement:
         return tree.SwitchStatement(self.at(meta), value, cases)
 
-    def case(self, meta: Meta, _: Token, value: Any, *statements: Any) -> tree.SwitchCase:
+    def case(
+        self, meta: Meta, _: Token, value: tree.Expression, *statements: tree.Statement
+    ) -> tree.SwitchCase:
         return tree.SwitchCase(self.at(meta), value, statements)
 
-    def default(self, meta: Meta, _: Token, *statements: Any) -> tree.SwitchCase:
+    def default(self, meta: Meta, _: Token, *statements: tree.Statement) -> tree.SwitchCase:
         return tree.SwitchCase(self.at(meta), None, statements)
 
     break_ = _made(tree.BreakStatement, 1)
@@ -412,50 +473,63 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     reset = _made(tree.ResetStatement, 1)
     return_ = _made(tree.ReturnStatement, 1)
 
-    def delete(self, meta: Meta, *children: Any) -> tree.DeleteStatement:
-        return tree.DeleteStatement(self.at(meta), children[-1])
+    def delete(self, meta: Meta, _: Token, target: tree.Expression) -> tree.DeleteStatement:
+        return tree.DeleteStatement(self.at(meta), target)
 
-    def publish(self, meta: Meta, _: Token, topic: Any, kind: Any, value: Any) -> tree.PublishStatement:
+    def publish(
+        self, meta: Meta, _: Token, topic: Token, kind: Token, value: tree.Expression
+    ) -> tree.PublishStatement:
         return tree.PublishStatement(self.at(meta), *_resource(topic, kind), self.at(kind), value)
 
-    def call_service(self, meta: Meta, _: Token, service: Any, kind: Any, value: Any) -> tree.CallStatement:
+    def call_service(
+        self, meta: Meta, _: Token, service: Token, kind: Token, value: tree.Expression
+    ) -> tree.CallStatement:
         return tree.CallStatement(self.at(meta), *_resource(service, kind), self.at(kind), value)
 
-    def declaration(self, meta: Meta, kind: Any, *declarators: Any) -> tree.Declaration:
+    def declaration(self, meta: Meta, kind: tree.TypeName, *declarators: tree.Declarator) -> tree.Declaration:
         return tree.Declaration(self.at(meta), kind, declarators)
 
     plain_declarator = _made(tree.Declarator)
     initialized = _made(tree.Declarator)
 
-    def constructed(self, meta: Meta, name: Any, arguments: Any) -> tree.Declarator:
+    def constructed(self, meta: Meta, name: Token, arguments: _Expressions) -> tree.Declarator:
         return tree.Declarator(self.at(meta), str(name), arguments=arguments)
 
-    def braced(self, meta: Meta, name: Any, items: Any) -> tree.Declarator:
-        return tree.Declarator(self.at(meta), str(name), value=self.elements_in_braces(meta, items))
+    def braced(self, meta: Meta, name: Token, items: _Expressions | None) -> tree.Declarator:
+        return tree.Declarator(self.at(meta), str(name), value=self._in_braces(meta, items))
 
-    def sized(self, meta: Meta, name: Any, size: Any, value: Any = None) -> tree.Declarator:
+    def sized(
+        self, meta: Meta, name: Token, size: tree.Expression | None, value: tree.Expression | None = None
+    ) -> tree.Declarator:
         return tree.Declarator(self.at(meta), str(name), value=value, size=size, is_array=True)
 
     sized_assigned = sized
 
-    def sized_initialized(self, meta: Meta, name: Any, size: Any, items: Any) -> tree.Declarator:
-        return self.sized(meta, name, size, self.elements_in_braces(meta, items))
+    def sized_initialized(
+        self, meta: Meta, name: Token, size: tree.Expression | None, items: _Expressions | None
+    ) -> tree.Declarator:
+        return self.sized(meta, name, size, self._in_braces(meta, items))
 
-    def elements(self, _: Meta, *items: Any) -> tuple[tree.Expression, ...]:
+    def elements(self, _: Meta, *items: tree.Expression | None) -> _Expressions:
         return tuple(item for item in items if item is not None)
 
-    def elements_in_braces(self, meta: Meta, *children: Any) -> tree.InitializerList:
-        return tree.InitializerList(self.at(meta), children[-1] or ())
+    def elements_in_braces(self, meta: Meta, _: Token, items: _Expressions | None) -> tree.InitializerList:
+        return self._in_braces(meta, items)
+
+    def _in_braces(self, meta: Meta, items: _Expressions | None) -> tree.InitializerList:
+        return tree.InitializerList(self.at(meta), items or ())
 
     # Expressions
 
-    def sequence(self, meta: Meta, *children: Any) -> tree.CommaExpression:
+    def sequence(self, meta: Meta, *children: tree.Expression) -> tree.CommaExpression:
         return tree.CommaExpression(self.at(meta), children)
 
-    def assign(self, meta: Meta, target: tree.Expression, operator: Token, value: Any) -> tree.Assignment:
+    def assign(
+        self, meta: Meta, target: tree.Expression, operator: Token, value: tree.Expression
+    ) -> tree.Assignment:
         return tree.Assignment(self.at(meta), str(operator), target, value)
 
-    def set(self, meta: Meta, target: tree.Expression, value: Any) -> tree.Assignment:
+    def set(self, meta: Meta, target: tree.Expression, value: tree.Expression) -> tree.Assignment:
         return tree.Assignment(self.at(meta), "=", target, value)
 
     conditional = _made(tree.ConditionalExpression)
@@ -487,51 +561,59 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def parenthesis(self, _: Meta, _open: Token, inner: tree.Expression) -> tree.Expression:
         return inner
 
-    def cast(self, meta: Meta, _open: Token, *children: Any) -> tree.CastExpression:
-        *words, value = children
-        if words[0].type == "FIXED":
-            words = [part.strip() for part in words[0].split("::")]
-        return tree.CastExpression(self.at(meta), tree.TypeName(self.at(meta), tuple(map(str, words))), value)
+    def cast(self, meta: Meta, _open: Token, *children: Token | tree.Expression) -> tree.CastExpression:
+        words = [child for child in children if isinstance(child, Token)]
+        fixed = words[0].type == "FIXED"
+        names = [part.strip() for part in words[0].split("::")] if fixed else [str(word) for word in words]
+        kind = tree.TypeName(self.at(meta), tuple(names))
+        return tree.CastExpression(self.at(meta), kind, _child(children, tree.Expression))
 
-    def static_cast(self, meta: Meta, *children: Any) -> tree.CastExpression:
-        return tree.CastExpression(
-            self.at(meta), *(child for child in children if not isinstance(child, Token))
-        )
+    def static_cast(
+        self, meta: Meta, _: Token, kind: tree.TypeName, value: tree.Expression
+    ) -> tree.CastExpression:
+        return tree.CastExpression(self.at(meta), kind, value)
 
-    def convert(self, meta: Meta, *children: Any) -> tree.ConstructorCall:
+    def convert(self, meta: Meta, *children: Token | _Expressions | None) -> tree.ConstructorCall:
         words = tuple(str(child) for child in children if _is_builtin(child))
-        return tree.ConstructorCall(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
+        arguments = next((child for child in children if isinstance(child, tuple)), ())
+        return tree.ConstructorCall(self.at(meta), tree.TypeName(self.at(meta), words), arguments)
 
-    def construct_vector(self, meta: Meta, kind: Any, arguments: Any) -> tree.ConstructorCall:
+    def construct_vector(
+        self, meta: Meta, kind: tree.TypeName, arguments: _Expressions | None
+    ) -> tree.ConstructorCall:
         return tree.ConstructorCall(self.at(meta), kind, arguments or ())
 
-    def construct_elements(self, meta: Meta, kind: Any, items: Any) -> tree.ConstructorCall:
-        return tree.ConstructorCall(self.at(meta), kind, (self.elements_in_braces(meta, items),))
+    def construct_elements(
+        self, meta: Meta, kind: tree.TypeName, items: _Expressions | None
+    ) -> tree.ConstructorCall:
+        return tree.ConstructorCall(self.at(meta), kind, (self._in_braces(meta, items),))
 
-    def new(self, meta: Meta, *children: Any) -> tree.NewExpression:
+    def new(self, meta: Meta, *children: Token | tree.Expression) -> tree.NewExpression:
         words = [str(child) for child in children if _is_builtin(child)]
         if words != ["char"]:
             self.refuse(
                 meta, f"`new {' '.join(words)}[…]` is not part of the language; write a `std::vector`"
             )
-        return tree.NewExpression(self.at(meta), children[-1])
+        return tree.NewExpression(self.at(meta), _child(children, tree.Expression))
 
     limit = _made(tree.NumericLimit, 1)
     index = _made(tree.IndexExpression)
     member = _made(tree.MemberAccess)
 
-    def call(self, meta: Meta, callee: Any, arguments: Any) -> tree.CallExpression:
+    def call(
+        self, meta: Meta, callee: tree.Expression, arguments: _Expressions | None
+    ) -> tree.CallExpression:
         return tree.CallExpression(self.at(meta), callee, arguments or ())
 
     arguments = _all
 
-    def number(self, meta: Meta | Token, *children: Any) -> tree.NumberLiteral:
+    def number(self, meta: Meta | Token, *children: Token) -> tree.NumberLiteral:
         return tree.NumberLiteral(self.at(meta), str(children[-1]))
 
-    def negative(self, meta: Meta, *children: Any) -> tree.UnaryExpression:
+    def negative(self, meta: Meta, *children: Token) -> tree.UnaryExpression:
         return tree.UnaryExpression(self.at(meta), "-", self.number(children[-1], children[-1]))
 
-    def name(self, meta: Meta, *children: Any) -> tree.Name:
+    def name(self, meta: Meta, *children: Token | tuple[str, ...]) -> tree.Name:
         parts = children[0] if isinstance(children[0], tuple) else tuple(map(str, children))
         if len(parts) == 1 and parts[0] in FORBIDDEN:
             self.refuse(meta, f"`{parts[0]}` is not part of the language; {FORBIDDEN[parts[0]]}")
@@ -558,7 +640,7 @@ def _referenced(kind: tree.TypeName) -> tree.TypeName:
     return replace(kind, reference=True)
 
 
-def _is_builtin(child: Any) -> bool:
+def _is_builtin(child: object) -> bool:
     return isinstance(child, Token) and child.type == "BUILTIN"
 
 
@@ -591,7 +673,7 @@ def _character_value(inner: str) -> int:
     return value[0] - 256 if value[0] > 127 else value[0]
 
 
-def _resource(name: Any, kind: Any) -> tuple[str, str]:
+def _resource(name: Token, kind: Token) -> tuple[str, str]:
     names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (name, kind)]
     return names[0], names[1].replace("::", "/")
 

@@ -527,7 +527,7 @@ class WithholdDeclaration(SyntaxNode):
     """`withhold topic from "network", … while condition;`."""
 
     topic: str
-    networks: tuple[StringLiteral, ...]
+    networks: tuple[StringLiteral | Name, ...]
     condition: Name
     given: tuple[str, ...] = field(default=(), compare=False)
     """The networks that operators set, in place of `networks`."""

@@ -120,6 +120,9 @@ class RecordType(_Kind, frozen=True):
         return self.name.replace("/", "::")
 
 
+Value = float | bytes | list["Value"]
+"""A value at run time, of any of these types; `bool` and `int` are `float` to a type checker."""
+
 Type = (
     VoidType
     | IteratorType
