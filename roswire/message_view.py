@@ -38,8 +38,8 @@ class _Reader:
         self._steps = _MOST_STEPS  # the number of values that may still be read, whether shown or not
         self._sizes: dict[str, int | None] = {}
 
-    def message(self, name: str) -> dict[str, Any]:
-        fields: dict[str, Any] = {}
+    def message(self, name: str) -> dict[str, object]:
+        fields: dict[str, object] = {}
         following = iter(self._definitions.message(name).fields)
         for field in following:
             try:
@@ -54,11 +54,11 @@ class _Reader:
                 raise _CutError(fields) from None
         return fields
 
-    def _array(self, kind: str, length: int | None) -> Any:
+    def _array(self, kind: str, length: int | None) -> object:
         count = length if length is not None else _LENGTH.unpack(self._take(4))[0]
         if kind in {"uint8", "char"}:
             return read_bytes(self._take(count))
-        values: list[Any] = []
+        values: list[object] = []
         for _ in range(min(count, MOST_ELEMENTS)):
             try:
                 values.append(self._value(kind))
@@ -99,7 +99,7 @@ class _Reader:
             self._sizes[kind] = size
         return self._sizes[kind]
 
-    def _value(self, kind: str) -> Any:
+    def _value(self, kind: str) -> object:
         self._left -= 1
         self._steps -= 1
         if self._left < 0 or self._steps < 0:

@@ -6,6 +6,7 @@ Ray's token authentication is on unless the environment switches it off (`RAY_AU
 import logging
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 from rosmop.batch.executor import Work, WorkerDeath
@@ -45,7 +46,7 @@ class RayCluster:
         self.capacity = max(processors, 1) * _AHEAD
         # `execute` tries again, as on one machine.
         self._task = ray.remote(num_cpus=1, max_retries=0)(work)
-        self._running: dict[Any, int] = {}
+        self._running: dict[object, int] = {}
 
     def submit(self, number: int, job: bytes) -> None:
         self._running[self._task.remote(job)] = number
@@ -62,7 +63,7 @@ class RayCluster:
         self._ray.shutdown()
 
 
-def _print_to_stderr(data: dict[str, Any], **_options: object) -> None:
+def _print_to_stderr(data: Mapping[str, Any], **_options: object) -> None:
     sys.stderr.writelines(f"ray: {line!a}\n" for line in data["lines"])
 
 

@@ -153,7 +153,7 @@ def joined(one: AbstractValue | None, other: AbstractValue | None) -> AbstractVa
     return AbstractValue(UNKNOWN, why, true, false, nan, inputs)
 
 
-def _same(one: Any, other: Any) -> bool:
+def _same(one: object, other: object) -> bool:
     return type(one) is type(other) and one == other
 
 

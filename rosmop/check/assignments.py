@@ -72,11 +72,11 @@ def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
 
 def mark(scope: FunctionScope, target: Value) -> str | None:
     variable = root(target)
-    scope.changes = True
+    scope.effects.changes = True
     if variable is None:
         return None
     if variable.shared:
-        scope.changes_shared.add(variable.code)
+        scope.effects.shared.add(variable.code)
     if not isinstance(target.place, VariableLvalue) or target.place.variable.alias is not None:
         require_original(target)
     variable.assigned = variable.used = True
@@ -109,4 +109,4 @@ def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) ->
 
 def _note(scope: FunctionScope, place: VariableLvalue) -> None:
     if place.variable.shared:
-        scope.written.add(place.variable.code)
+        scope.effects.written.add(place.variable.code)

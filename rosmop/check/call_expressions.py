@@ -114,7 +114,7 @@ def _helper(scope: FunctionScope, node: tree.CallExpression, function: HelperFun
             node.position,
             f"`{function.name}` takes {len(function.parameters)} argument(s), not {len(node.arguments)}",
         )
-    scope.calls.add(function.name)
+    scope.effects.calls.add(function.name)
     values = [scope.value_of(argument) for argument in node.arguments]
     _check_references(scope, function, values)
     first, values = order.arguments(scope, values)

@@ -34,7 +34,7 @@ def declare_facts(
             code, position = shared.symbols.fresh("g"), events[event].position
             variable = Variable(_name(fact, event), kind, code, position, shared=True, constant=True)
             variable.sliced = bool(names.parameters)
-            shared.declare(names, variable)
+            shared.variables.declare(names, variable)
 
 
 def first_facts(names: SpecificationNames) -> Iterator[nodes.Assign]:
@@ -49,7 +49,7 @@ def first_facts(names: SpecificationNames) -> Iterator[nodes.Assign]:
 def note_facts(scope: FunctionScope, event: str) -> bool:
     found = _variables(scope.names, event)
     for variable in found:
-        scope.written.add(variable.code)
+        scope.effects.written.add(variable.code)
         value = (
             _NOW if variable.type == value_types.LONG else nodes.SenderName(variable.name.partition("(")[0])
         )
@@ -62,7 +62,7 @@ def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Valu
     if function in SENDER:
         return _sender(scope, node, function, event)
     if function == ALTERED:
-        if event != scope.event:
+        if event != scope.handled.event:
             text = f"`altered({event})` is only known in the `when` and the action of `{event}`"
             raise SpecificationError.at(node.position, text)
         return Value(nodes.Altered(), node.position)
@@ -84,7 +84,7 @@ def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Valu
 
 
 def _sender(scope: FunctionScope, node: tree.CallExpression, function: str, event: str) -> Value:
-    if event == scope.event:
+    if event == scope.handled.event:
         return Value(nodes.SenderName(function), node.position)
     if scope.role == "function":
         text = f"a function may run before the action of `{event}` ends; give it `{function}({event})` as a parameter"

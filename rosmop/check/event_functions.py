@@ -43,7 +43,7 @@ def compile_event(
     check_topic(trigger.topic, trigger.position)
     kind = _message_type(shared, trigger)
     scope = FunctionScope(shared, names, "action")
-    scope.message_type, scope.event = kind, event.name
+    scope.handled.message_type, scope.handled.event = kind, event.name
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
     happens, is_noted = _assemble(scope, event, bound, _body(scope, event, trigger))
@@ -85,7 +85,7 @@ def _key(
     It returns False if the message does not match, otherwise True alone, or a list of True and the values.
     """
     scope = FunctionScope(shared, names, "action")
-    scope.message_type = kind
+    scope.handled.message_type = kind
     # No slice is running, so a fault has no values to show.
     site = scope.lines.site = scope.symbols.site(Site(event.position))
     bound = _bind(scope, event, trigger, kind)
@@ -109,9 +109,13 @@ def compile_acceptance(
     trigger = event.trigger
     assert isinstance(trigger, tree.MessageTrigger)  # the caller checks this
     scope = FunctionScope(shared, names, "action")
-    scope.message_type, scope.event, scope.notes = _message_type(shared, trigger), event.name, False
+    scope.handled.message_type, scope.handled.event, scope.notes = (
+        _message_type(shared, trigger),
+        event.name,
+        False,
+    )
     site = scope.lines.site = scope.symbols.site(Site(event.position))
-    bound = _bind(scope, event, trigger, scope.message_type)
+    bound = _bind(scope, event, trigger, scope.handled.message_type)
     tests_only = replace(event, action=replace(event.action, statements=()), after=())
     conditions, _, _ = _body(scope, tests_only, trigger)
     read_fields(scope, bound)
@@ -131,7 +135,7 @@ def _timer(
             event.parameters[0].position, "a timer has no message, so it takes no parameters"
         )
     scope = FunctionScope(shared, names, "timer")
-    scope.drop_refused = "a timer has no message to drop"
+    scope.handled.drop_refused = "a timer has no message to drop"
     scope.lines.site = scope.site(event)
     write(scope, event.action)
     scope.add(nodes.Leave(scope.lines.site, True))
@@ -311,8 +315,8 @@ def _assemble(
     fields = writes(scope, written)
     for field in fields:
         scope.evaluate(nodes.Assign(value_types.BOOL, field.flag, nodes.Literal(value_types.BOOL, False)))
-    if scope.pending is not None:
-        scope.add(nodes.Pending(site, scope.pending, fields))
+    if scope.handled.pending is not None:
+        scope.add(nodes.Pending(site, scope.handled.pending, fields))
     scope.lines.found += conditions
     before = len(scope.lines.found)
     scope.lines.found += action

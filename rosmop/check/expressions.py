@@ -158,7 +158,7 @@ def read(variable: Variable, node: tree.SyntaxNode) -> Value:
 
 
 def _message(scope: FunctionScope, node: tree.Expression) -> Value:
-    if scope.message_type is None:
+    if scope.handled.message_type is None:
         hint = {
             "handler": "a handler has no message; copy it in the action: `v = MESSAGE;`",
             "timer": "a timer has no message",
@@ -166,8 +166,10 @@ def _message(scope: FunctionScope, node: tree.Expression) -> Value:
             "function": "a function has no message; pass it the values it needs",
         }.get(scope.role, "there is no message here")
         raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
-    scope.pending = scope.pending or scope.symbols.fresh("u")
-    whole = nodes.Whole(value_types.RecordType(scope.message_type), scope.pending, scope.lines.site)
+    scope.handled.pending = scope.handled.pending or scope.symbols.fresh("u")
+    whole = nodes.Whole(
+        value_types.RecordType(scope.handled.message_type), scope.handled.pending, scope.lines.site
+    )
     return Value(whole, node.position)
 
 

@@ -11,7 +11,7 @@ nothing changes, and helper functions are followed into. An unknown number may b
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rosmop.check.abstract_values import (
     ANY,
@@ -136,7 +136,7 @@ class FlowAnalysis:
         made: Exits = _STATEMENTS.get(type(node), FlowAnalysis._next)(self, node, state)
         return made
 
-    def _next(self, _: Any, state: PathState) -> Exits:
+    def _next(self, _: object, state: PathState) -> Exits:
         return {Exit("next", state.fate): state}
 
     def _evaluate(self, node: nodes.Evaluate, state: PathState) -> Exits:
@@ -810,6 +810,9 @@ def _bounds(form: nodes.Expression) -> bool:
     )
 
 
-def _add(states: dict[Any, PathState], key: Any, state: PathState) -> None:
+_Key = TypeVar("_Key")
+
+
+def _add(states: dict[_Key, PathState], key: _Key, state: PathState) -> None:
     known = states.get(key)
     states[key] = state if known is None else merged((known, state))

@@ -34,7 +34,7 @@ def declare_variables(
                 shared.findings += error.findings
                 names.misdeclared.add(declarator.name)
                 continue
-            shared.declare(names, variable)
+            shared.variables.declare(names, variable)
 
 
 def _shared_variable(
@@ -109,7 +109,7 @@ def compile_start(
 
 def _start_scope(shared: CompilationContext, names: SpecificationNames) -> FunctionScope:
     scope = FunctionScope(shared, names, "init")
-    scope.drop_refused = "there is no message yet"
+    scope.handled.drop_refused = "there is no message yet"
     return scope
 
 
@@ -118,16 +118,16 @@ def _constants(
 ) -> FunctionScope:
     scope = _start_scope(shared, names)
     for parameter in names.parameters.values():
-        scope.written.add(parameter.code)
+        scope.effects.written.add(parameter.code)
         scope.evaluate(nodes.Assign(parameter.type, parameter.code, nodes.Zero(parameter.type)))
     for assignment in first_facts(names):
-        scope.written.add(assignment.name)
+        scope.effects.written.add(assignment.name)
         scope.evaluate(assignment)
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             variable = names.variables.get(declarator.name)
             if variable is not None:
-                scope.written.add(variable.code)
+                scope.effects.written.add(variable.code)
                 value = _constant(scope, declarator)
                 first: nodes.Expression = nodes.Zero(variable.type)
                 if value is not None and value_types.convertible(value.type, variable.type):
@@ -169,7 +169,7 @@ def _first_value(
 ) -> None:
     with scope.at(declarator):
         _, value = initial(scope, declaration.type, declarator)
-        scope.written.add(variable.code)
+        scope.effects.written.add(variable.code)
         scope.evaluate(nodes.Assign(variable.type, variable.code, value))
 
 
@@ -267,7 +267,7 @@ def compile_library(shared: CompilationContext, names: SpecificationNames) -> No
 def compile_function(shared: CompilationContext, names: SpecificationNames, function: HelperFunction) -> None:
     scope = FunctionScope(shared, names, "function")
     scope.notes = scope.notes and not names.is_library
-    scope.drop_refused = "a function has no message; return a `bool` and drop in the action"
+    scope.handled.drop_refused = "a function has no message; return a `bool` and drop in the action"
     scope.result, scope.references, scope.recursive = function.result, function.references, function.recursive
     for variable in function.parameters:
         scope.declare(variable)
@@ -281,7 +281,7 @@ def compile_function(shared: CompilationContext, names: SpecificationNames, func
         value = nothing if isinstance(function.result, value_types.VoidType) else nodes.Zero(function.result)
         handed = tuple(variable.code for variable in function.references)
         scope.add(nodes.Return(scope.lines.site, value, handed))
-    function.changes, function.calls = frozenset(scope.changes_shared), frozenset(scope.calls)
+    function.changes, function.calls = frozenset(scope.effects.shared), frozenset(scope.effects.calls)
     parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
     same_as = f"h_{function.name}" if names.is_library and function.name in ELEMENTARY else ""
     shared.define(scope.function(function.code, tuple(parameters), same_as=same_as))
@@ -291,7 +291,7 @@ def compile_handler(
     shared: CompilationContext, names: SpecificationNames, handler: tree.Handler, drop_refused: str | None
 ) -> str:
     scope = FunctionScope(shared, names, "handler")
-    scope.drop_refused = drop_refused
+    scope.handled.drop_refused = drop_refused
     write(scope, handler.body)
     function = shared.symbols.fresh("j")
     shared.define(scope.function(function, ("m",)))

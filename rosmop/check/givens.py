@@ -36,7 +36,7 @@ def declare_givens(
             names.misdeclared.add(node.name)
             continue
         names.givens[node.name] = given
-        shared.declare(
+        shared.variables.declare(
             names, Variable(node.name, given.type, given.code, node.position, shared=True, constant=True)
         )
 
@@ -125,7 +125,7 @@ def read_at_start(
     def is_given(name: str) -> bool:
         if name in names.variables:
             return name in names.givens
-        return any(name in other.givens for other in shared.owners.get(name, ()))
+        return any(name in other.givens for other in shared.variables.owners.get(name, ()))
 
     for start in (*specification.declarations, *specification.inits):
         waiting: list[tree.SyntaxNode] = [start]

@@ -42,7 +42,7 @@ def noted(
         constant = (side for side, operand in enumerate((left, right)) if operand.constant is not None)
         known[node] = Comparison(node.position, next(constant, None), *variables)
     comparison = known[node]
-    scope.written.update(comparison.variables)
+    scope.effects.written.update(comparison.variables)
     kind = compare.left.type
     sides = [nodes.Read(kind, scope.temporary()) for _side in range(2)]
     kept = (

@@ -49,7 +49,7 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    kind: Type = value_types.RecordType(scope.message_type or "")
+    kind: Type = value_types.RecordType(scope.handled.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
         if isinstance(kind, value_types.RecordType):
@@ -65,7 +65,7 @@ def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
 
 
 def read_fields(scope: FunctionScope, bound: list[PatternField]) -> None:
-    layout = scope.messages.definitions.layout(scope.message_type or "")
+    layout = scope.messages.definitions.layout(scope.handled.message_type or "")
     walk = MessageCursor(
         FieldLocator(scope.symbols, scope.lines.found, scope.lines.site), layout, Spot(None, 0)
     )

@@ -6,7 +6,6 @@ The result may include an unused type, if a string equals the name of a type.
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from hashlib import sha256
-from typing import Any
 
 from rosmop.text import tree
 from roswire.definitions import Definitions
@@ -34,7 +33,7 @@ def identity(node: tree.Specification) -> bytes:
     return sha256(repr(_plain(node)).encode()).digest()
 
 
-def _plain(node: Any) -> object:
+def _plain(node: object) -> object:
     if isinstance(node, tuple):
         return tuple(map(_plain, node))
     if is_dataclass(node):

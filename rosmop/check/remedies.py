@@ -47,7 +47,7 @@ class _Trial:
         self._forms = shared.functions
         contexts = {one.context: one.name for one in compiled}
         self._interpreter = Interpreter(
-            shared.functions, shared.symbols.sites, shared.types, contexts, shared.messages
+            shared.functions, shared.symbols.sites, shared.variables.types, contexts, shared.messages
         )
         self._interpreter.variables |= {given.code: given.default for one in compiled for given in one.givens}
         start = {name for one in compiled for name in one.start}

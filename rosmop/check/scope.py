@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal
 
 from rosmop.check.assignables import Value, Variable
@@ -97,33 +96,13 @@ class StatementList:
     site: int = -1
 
 
-class CompilationContext:
-    """The state that all functions share during compilation."""
+class SharedVariables:
+    """The variables of the set: `types` by the code's names, `owners` by the names in the text."""
 
-    def __init__(
-        self, messages: MessageTypes, value_of: ValueOf, *, margins: bool = False, lints: bool = True
-    ) -> None:
-        self.symbols = Symbols()
-        self.margins = margins
-        self.lints = lints
-        self.messages = messages
-        self.value_of = value_of
-        self.values = ValueCodec(messages)
-        self.functions: dict[str, nodes.Function] = {}
-        self.specifications: list[SpecificationNames] = []
+    def __init__(self) -> None:
         self.types: dict[str, Type] = {}
         self.owners: dict[str, list[SpecificationNames]] = {}
         self.unsliced: set[str] = set()
-        self.findings: list[Diagnostic] = []
-        self.publications: list[Publication] = []
-        self.calls: list[Publication] = []
-        self.bound: dict[str, Sequence[Any]] = {}
-        """The fields that the pattern of each event binds (`PatternField`), by the name of its function."""
-        self.partial = False
-        """Whether some files of the set could not be parsed. These files may declare names that seem unknown."""
-
-    def define(self, function: nodes.Function) -> None:
-        self.functions[function.name] = function
 
     def declare(self, names: SpecificationNames, variable: Variable) -> None:
         names.variables[variable.name] = variable
@@ -151,6 +130,59 @@ class CompilationContext:
         return variable, owners[0].name
 
 
+class CompilationContext:
+    """The state that all functions share during compilation."""
+
+    def __init__(
+        self, messages: MessageTypes, value_of: ValueOf, *, margins: bool = False, lints: bool = True
+    ) -> None:
+        self.symbols = Symbols()
+        self.margins = margins
+        self.lints = lints
+        self.messages = messages
+        self.value_of = value_of
+        self.values = ValueCodec(messages)
+        self.functions: dict[str, nodes.Function] = {}
+        self.specifications: list[SpecificationNames] = []
+        self.variables = SharedVariables()
+        self.findings: list[Diagnostic] = []
+        self.publications: list[Publication] = []
+        self.calls: list[Publication] = []
+        self.bound: dict[str, Sequence[Any]] = {}
+        """The fields that the pattern of each event binds (`PatternField`), by the name of its function."""
+        self.partial = False
+        """Whether some files of the set could not be parsed. These files may declare names that seem unknown."""
+
+    def define(self, function: nodes.Function) -> None:
+        self.functions[function.name] = function
+
+
+@dataclass
+class HandledEvent:
+    """The event whose action a function is, as far as it is one; `message_type` is the type of `MESSAGE`.
+
+    `pending` is the code's name for the assigned fields, if `MESSAGE` was read; `drop_refused` is why `DROP;` is not
+    allowed.
+    """
+
+    message_type: str | None = None
+    event: str | None = None
+    pending: str | None = None
+    drop_refused: str | None = None
+
+
+@dataclass
+class FunctionEffects:
+    """Effects of a function: whether it `changes` any variable, the code's names of those that it writes (`written`)
+    and of the shared ones that it assigns (`shared`), and the helper functions that it `calls`.
+    """
+
+    written: set[str] = field(default_factory=set)
+    changes: bool = False
+    shared: set[str] = field(default_factory=set)
+    calls: set[str] = field(default_factory=set)
+
+
 class FunctionScope:
     """A function during compilation."""
 
@@ -158,28 +190,36 @@ class FunctionScope:
         self.shared = shared
         self.names = names
         self.role: Role = role
-        self.symbols = shared.symbols
-        self.values = shared.values
-        self.messages = shared.messages
-        self.value_of = partial(shared.value_of, self)
-        self.context = names.context
         self.lines = StatementList()
         self.result: Type = value_types.VOID
         self.references: tuple[Variable, ...] = ()
-        self.message_type: str | None = None  # the type of `MESSAGE`
-        self.event: str | None = None  # the event whose action this is
-        self.pending: str | None = None  # the code's name for the assigned fields, if `MESSAGE` was read
-        self.drop_refused: str | None = None  # why `DROP;` is not allowed here
+        self.handled = HandledEvent()
         self.below: set[str] = set()  # shared variables that are declared later
         self.loops: list[LoopScope] = []
-        self.written: set[str] = set()
-        self.changes = False  # something was assigned
-        self.changes_shared: set[str] = set()  # the code's names of the assigned shared variables
-        self.calls: set[str] = set()  # the helper functions that are called
+        self.effects = FunctionEffects()
         self.recursive = False
         self.notes = shared.margins and role != "init"  # comparisons are noted
         self.misdeclared: set[str] = set()  # local names with rejected declarations
         self._blocks: list[dict[str, Variable]] = [{}]
+
+    @property
+    def symbols(self) -> Symbols:
+        return self.shared.symbols
+
+    @property
+    def values(self) -> ValueCodec:
+        return self.shared.values
+
+    @property
+    def messages(self) -> MessageTypes:
+        return self.shared.messages
+
+    @property
+    def context(self) -> str:
+        return self.names.context
+
+    def value_of(self, node: tree.Expression) -> Value:
+        return self.shared.value_of(self, node)
 
     # Names
 
@@ -212,7 +252,7 @@ class FunctionScope:
             )
         block[variable.name] = variable
         if variable.alias is None:
-            self.shared.types[variable.code] = variable.type
+            self.shared.variables.types[variable.code] = variable.type
 
     def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
         variable = Variable(name, kind, self.symbols.fresh("v"), position, constant=constant)
@@ -232,10 +272,11 @@ class FunctionScope:
         if name in self.below:
             raise SpecificationError.at(position, f"{shown(name)} is declared below; move its declaration up")
         own = self.names.variables.get(name)
-        return (own, None) if own is not None else self.shared.foreign(self.names, name, position)
+        return (own, None) if own is not None else self.shared.variables.foreign(self.names, name, position)
 
     def changes_anything(self) -> bool:
-        return self.changes or any(self.names.changed_by(called) for called in self.calls)
+        effects = self.effects
+        return effects.changes or any(self.names.changed_by(called) for called in effects.calls)
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
         wrong = (self.misdeclared, *(other.misdeclared for other in self.shared.specifications))
@@ -296,7 +337,7 @@ class FunctionScope:
     def function(
         self, name: str, parameters: tuple[str, ...], *, happens: int | None = None, same_as: str = ""
     ) -> nodes.Function:
-        shared = tuple(sorted(self.written))
+        shared = tuple(sorted(self.effects.written))
         return nodes.Function(
             name, self.context, parameters, tuple(self.lines.found), shared, happens, same_as
         )

@@ -48,7 +48,7 @@ def declare_parameters(
             parameter.name, kind, code, parameter.position, shared=True, constant=True, sliced=True
         )
         names.parameters[parameter.name] = variable
-        shared.declare(names, variable)
+        shared.variables.declare(names, variable)
     if len(specification.parameters) > MOST_PARAMETERS:
         text = f"a specification has at most {MOST_PARAMETERS} parameters"
         shared.findings.append(Diagnostic(specification.parameters[-1].position, "error", text))
@@ -119,7 +119,7 @@ def creates(specification: tree.Specification, event: tree.EventDefinition) -> b
 
 
 def acts(function: nodes.Function, shared: CompilationContext) -> bool:
-    if not shared.unsliced.isdisjoint(function.shared):
+    if not shared.variables.unsliced.isdisjoint(function.shared):
         return True
     return any(
         isinstance(node, _ACTS)

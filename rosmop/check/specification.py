@@ -92,7 +92,7 @@ def compile_files(
         tuple(sorted(findings, key=lambda finding: finding.position)) if lints else (),
         shared.functions,
         shared.symbols.sites,
-        shared.types,
+        shared.variables.types,
         shared.messages,
         tuple(shared.publications),
         tuple(shared.calls),

@@ -275,14 +275,16 @@ def _return_value(scope: FunctionScope, node: tree.ReturnStatement) -> None:
 
 
 def _drop(scope: FunctionScope, node: tree.Statement) -> None:
-    if scope.drop_refused is not None:
-        raise SpecificationError.at(node.position, f"`DROP;` is not allowed here: {scope.drop_refused}")
+    if scope.handled.drop_refused is not None:
+        raise SpecificationError.at(
+            node.position, f"`DROP;` is not allowed here: {scope.handled.drop_refused}"
+        )
     scope.add(nodes.Drop(scope.lines.site))
 
 
 def _stop(scope: FunctionScope, node: tree.Statement) -> None:
     if scope.role in ("function", "init"):
-        why = "a function has no message" if scope.role == "function" else scope.drop_refused
+        why = "a function has no message" if scope.role == "function" else scope.handled.drop_refused
         raise SpecificationError.at(
             node.position, f"`STOP;` is not allowed here: {why}; write it in an action, a timer or a handler"
         )

@@ -257,7 +257,7 @@ class _FunctionCodegen(StringCodegen):
         )
 
     def _routine(
-        self, parameters: tuple[int, ...], write: Callable[..., bytes], *given: Any, result: int = I32
+        self, parameters: tuple[int, ...], write: Callable[..., bytes], *given: object, result: int = I32
     ) -> bytes:
         number = self._writer.routine((write, *given), parameters, partial(write, *given), result)
         return call(number)

@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from rosmop.fast.memory_layout import MemoryLayout, NotCompiledError
 from rosmop.fast.wasm import (
@@ -59,7 +58,7 @@ class FunctionBuilder(ABC):
 
     @abstractmethod
     def _routine(
-        self, parameters: tuple[int, ...], write: Callable[..., bytes], *given: Any, result: int = I32
+        self, parameters: tuple[int, ...], write: Callable[..., bytes], *given: object, result: int = I32
     ) -> bytes:
         """Call a function with parameters of these types. `write` writes it from the arguments `given`."""
 

@@ -29,7 +29,7 @@ class _Used(msgspec.Struct):
     services: dict[str, ServiceDefinition]
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, CompiledProperty):
         kinds = LOGICS[value.logic].properties
         if type(value) not in kinds:
@@ -38,7 +38,7 @@ def _plain(value: Any) -> Any:
     raise NotImplementedError(type(value).__name__)
 
 
-def _made(kind: type, value: Any) -> Any:
+def _made(kind: type, value: object) -> object:
     if kind is CompiledProperty:
         logic, number, parts = msgspec.convert(value, tuple[str, int, Any])
         if logic not in LOGICS or not 0 <= number < len(LOGICS[logic].properties):
@@ -68,7 +68,7 @@ def encoded(compiled: Compiled) -> bytes:
         {name: definitions.service(name) for name in sorted(services)},
     )
 
-    def plain(value: Any) -> Any:
+    def plain(value: object) -> object:
         return used if value is compiled.messages else _plain(value)
 
     return msgspec.msgpack.encode(compiled, enc_hook=plain, order="deterministic")

@@ -36,7 +36,7 @@ from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, failure
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.run.explain import ClockedSteps, Exits
-from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, BatchResult, Lanes, NativeCall, NextDue
+from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, BatchResult, Lanes, NativeCall, NextDue, Pieces
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import CellNames, MonitorInstance, RunningProperty
 from rosmop.run.outcomes import FUEL_PER_SECOND, Outcome, Verdict
@@ -44,7 +44,7 @@ from rosmop.runtime.action_context import Context, LogLine
 from rosmop.runtime.values import struct_code
 from rosmop.runtime.wire import Buffer
 from rosmop.types import value_types
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 FUEL = FUEL_PER_SECOND // 1000
 """The maximum number of instructions of one call: about a millisecond.
@@ -144,7 +144,7 @@ class ModuleState:
         _PREPARED.pack_into(self._memory, self._source, *[-1] * 4)
 
     def _enter(self) -> None:
-        states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
+        states: list[int] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
         values = [self._values[name] for name in self._names]
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
@@ -230,7 +230,7 @@ def entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     return buffer | len(value) << 32
 
 
-def left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
+def left(memory: memoryview, word: int, before: Value, kind: Type) -> Value:
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
         return before
@@ -325,7 +325,7 @@ class WasmLane:
         view: memoryview,
         position: int,
         run: int,
-        pieces: list[Any],
+        pieces: Pieces,
         time_ns: int,
         prepared: BatchOptions,
         answer: int | Exception | None = None,
@@ -402,7 +402,7 @@ class WasmLane:
         view: memoryview,
         position: int,
         run: int,
-        pieces: list[Any],
+        pieces: Pieces,
         time_ns: int,
         prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,
@@ -448,7 +448,7 @@ class WasmLane:
         view: memoryview,
         position: int,
         run: int,
-        pieces: list[Any],
+        pieces: Pieces,
         time_ns: int,
         prepared: BatchOptions,
     ) -> BatchResult:

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
@@ -234,10 +233,10 @@ class _Run:
         self._state = categories[1] if len(categories) > 1 else self._state
         return categories
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[()]:
         return ()
 
-    def restore(self, saved: tuple[Any, ...]) -> None: ...
+    def restore(self, saved: tuple[()]) -> None: ...
 
 
 def _target(state: StateText, event: str) -> str:

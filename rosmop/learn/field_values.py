@@ -7,7 +7,6 @@ increments the `seq` of headers, so both are left out.
 
 import struct
 from collections.abc import Callable, Iterator
-from typing import Any
 
 from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayout, StringPart
 from roswire.message_text import PRIMITIVES
@@ -19,7 +18,8 @@ _LENGTH = struct.Struct("<I")
 _BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
 _NO_NUMBERS = frozenset({"time", "duration"})
 
-Value = Any  # float, int, bool, str, (seconds, nanoseconds), a tuple of numbers, a list of strings
+Value = float | str | bytes | tuple[float, ...] | list[str | bytes]
+"""A tuple is an array of numbers, or seconds and nanoseconds; a list is an array of strings."""
 _Part = Callable[[bytes, int, dict[str, Value]], int]
 
 

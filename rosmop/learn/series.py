@@ -48,9 +48,9 @@ class ValueSeries(msgspec.Struct):
 
     windows: dict[Any, int] = {}
     many: bool = False
-    last: dict[Any, int] = {}
+    last: dict[object, int] = {}
 
-    def add(self, value: Any, window: int) -> None:
+    def add(self, value: object, window: int) -> None:
         if self.many or self.last.get(value) == window:
             return
         self.last[value] = window

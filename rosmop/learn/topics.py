@@ -58,6 +58,10 @@ class TopicRhythm(msgspec.Struct):
         return float(max(1, round(5 * self.period)))
 
 
+Moves = dict[tuple[object, object], int]
+"""The number of windows with each move from a value to another."""
+
+
 class TopicContent(msgspec.Struct):
     """The fields of a topic's messages."""
 
@@ -65,7 +69,7 @@ class TopicContent(msgspec.Struct):
     elements: dict[str, list[Series]] = {}
     sets: dict[str, ValueSeries] = {}
     lengths: dict[str, ValueSeries] = {}
-    moves: dict[str, dict[tuple[Any, Any], int]] = {}
+    moves: dict[str, Moves] = {}
     ages: HighestValues = msgspec.field(default_factory=HighestValues)
     leads: HighestValues = msgspec.field(default_factory=HighestValues)
     counts: HighestValues = msgspec.field(default_factory=HighestValues)
@@ -99,9 +103,7 @@ def _merged_elements(one: list[Series], other: list[Series]) -> list[Series]:
     return [a.merged(b) for a, b in zip(one, other, strict=False)]
 
 
-def _merged_moves(
-    one: dict[tuple[Any, Any], int], other: dict[tuple[Any, Any], int]
-) -> dict[tuple[Any, Any], int]:
+def _merged_moves(one: Moves, other: Moves) -> Moves:
     return merged_rows(one, other, int.__add__)
 
 
@@ -114,8 +116,8 @@ class TopicContentReader:
         self._types = fields.types
         self._period = period
         self._interval = interval
-        self._before: dict[str, Any] = {}
-        self._moved: dict[tuple[str, Any, Any], int] = {}  # the last window of each move
+        self._before: dict[str, object] = {}
+        self._moved: dict[tuple[str, object, object], int] = {}  # the last window of each move
         self._stamp = -1.0
         self._opened, self._counted = 0.0, 0
 
@@ -133,7 +135,8 @@ class TopicContentReader:
 
     def add(self, data: bytes, time: int, window: int) -> None:
         seconds = time / 10**9
-        for path, value in self._fields.read(data).items():
+        values: dict[str, Any] = self._fields.read(data)  # `_types` has the types
+        for path, value in values.items():
             kind = self._types[path]
             if kind in {"string", "bool"}:
                 self._add_set(path, value, window)
@@ -159,7 +162,7 @@ class TopicContentReader:
         self._counted += 1
         self.content.counts.add(self._counted, window)
 
-    def _add_set(self, path: str, value: Any, window: int) -> None:
+    def _add_set(self, path: str, value: object, window: int) -> None:
         if path not in self.content.sets:
             self.content.sets[path] = ValueSeries()
         found = self.content.sets[path]
@@ -167,7 +170,7 @@ class TopicContentReader:
         if not found.many:
             self._add_move(path, value, window)
 
-    def _add_move(self, path: str, value: Any, window: int) -> None:
+    def _add_move(self, path: str, value: object, window: int) -> None:
         before = self._before.get(path)
         if before is not None and before != value:
             moves = self.content.moves.setdefault(path, {})

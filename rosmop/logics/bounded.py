@@ -55,10 +55,10 @@ class FormulaCell:
         if self not in self.journal:
             self.journal[self] = self.saved()
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> "_CellState":
         return self.kind, self.missing, self.operands, self.tells, [*self.users], self.value
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: "_CellState") -> None:
         self.kind, self.missing, self.operands, self.tells, self.users, self.value = saved
 
     def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
@@ -81,7 +81,8 @@ class FormulaCell:
 
 
 Value = bool | FormulaCell
-Journal = dict[FormulaCell, tuple[Any, ...]]
+_CellState = tuple[str, int, tuple[Value, ...], int, "list[FormulaCell | _Operator]", bool | None]
+Journal = dict[FormulaCell, _CellState]
 
 
 def _known(value: Value) -> bool | None:
@@ -126,10 +127,10 @@ class _Row:
     right: Value | None
     cell: FormulaCell | None
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[int, int, Value | None, Value | None, FormulaCell | None]:
         return self.place, self.time, self.left, self.right, self.cell
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[int, int, Value | None, Value | None, FormulaCell | None]) -> None:
         self.place, self.time, self.left, self.right, self.cell = saved
 
 
@@ -163,7 +164,7 @@ class _Operator(ABC):
     def deadline(self) -> int | None:
         return None
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[object, ...]:
         return (self.rows,)
 
     def restore(self, saved: tuple[Any, ...]) -> None:
@@ -347,7 +348,7 @@ class _OpenUntil(_Rows):
             del self.pending[following]
         return self.pending[following][0] + self.high if following < len(self.pending) else None
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[object, ...]:
         return (
             self.rows, self.passed, self.pending, self.holds, self.hopes, self.fails, self.doubts, self.waits,
         )  # fmt: skip
@@ -415,10 +416,10 @@ class _OpenSince(_Rows):
                 break
             self.window.step(left, right, self.drop().time)
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[deque[_Row], SinceWindow, SinceWindow, SinceWindow]:
         return self.rows, self.window, self.least, self.most
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[deque[_Row], SinceWindow, SinceWindow, SinceWindow]) -> None:
         self.rows, self.window, self.least, self.most = saved
 
 
@@ -434,10 +435,10 @@ class _OpenPreviously(_Operator):
         self.before, self.time = self.run.value(self.left), now
         _use(self.before, self)
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[deque[_Row], Value, int]:
         return self.rows, self.before, self.time
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[deque[_Row], Value, int]) -> None:
         self.rows, self.before, self.time = saved
 
 
@@ -468,10 +469,10 @@ class _Next(_Operator):
     def deadline(self) -> int | None:
         return next((row.time + self.high for row in self.before if _wanted(row)), None)
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[deque[_Row], deque[_Row]]:
         return self.rows, self.before
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[deque[_Row], deque[_Row]]) -> None:
         self.rows, self.before = saved
 
 
@@ -545,6 +546,10 @@ _KINDS: dict[str, type[_Operator]] = {
 _FORWARD = (_Until, _OpenUntil, _Next)
 
 
+_RunMark = tuple[int, list[Any], list[tuple[object, ...]]]
+"""The number of the event, the values of the part about the past, and the state of each operator."""
+
+
 class BoundedRun:
     """A run of a formula about the future."""
 
@@ -612,7 +617,7 @@ class BoundedRun:
             operator.pass_by(deadline)
         return self._tell()
 
-    def mark(self) -> tuple[Any, ...]:
+    def mark(self) -> "_RunMark":
         self.journal.clear()
         operators = [
             tuple(copy(value) if isinstance(value, _CONTAINERS) else value for value in operator.saved())
@@ -620,7 +625,7 @@ class BoundedRun:
         ]
         return self.place, list(map(copy, self._at_once)), operators
 
-    def take_back(self, mark: tuple[Any, ...]) -> None:
+    def take_back(self, mark: "_RunMark") -> None:
         self.place, self._at_once, operators = mark
         for operator, before in zip(self.operators.values(), operators, strict=True):
             operator.restore(before)
@@ -628,10 +633,10 @@ class BoundedRun:
             cell.restore(noted)
         self.journal.clear()
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[list[Any], int, int, dict[bool, int], dict[bool, int]]:
         return self._at_once, self.place, self._now, self._told, self._about
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[list[Any], int, int, dict[bool, int], dict[bool, int]]) -> None:
         self._at_once, self.place, self._now, self._told, self._about = saved
 
     def value(self, number: int) -> Value:

@@ -3,8 +3,6 @@
 If the recogniser has few states, as for a regular language, the grammar becomes a table.
 """
 
-from typing import Any
-
 from rosmop.logics.automaton import Automaton, TooManyStatesError, explore
 from rosmop.logics.cfg_grammar import Grammar, prepare, read_grammar
 from rosmop.logics.ere import with_fail
@@ -56,10 +54,10 @@ class GrammarRun(UntimedRun):
         self.frame, accepted = after
         return MATCH if accepted else UNDECIDED
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[EarleySet | None]:
         return (self.frame,)
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[EarleySet | None]) -> None:
         (self.frame,) = saved
 
 

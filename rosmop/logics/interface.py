@@ -54,7 +54,7 @@ class Run(Protocol):
     def expire(self) -> Categories:
         """Call this only while ``deadline`` is not None."""
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[object, ...]:
         """Return the values that change (`state_of_runs.py`)."""
 
     def restore(self, saved: tuple[Any, ...]) -> None:
@@ -96,7 +96,7 @@ class CompiledProperty(ABC):
 
     expiry = "deadline"
 
-    made_of: tuple[Any, ...]
+    made_of: tuple[object, ...]
 
     @property
     def suppresses(self) -> bool:
@@ -104,7 +104,7 @@ class CompiledProperty(ABC):
 
     remedy: str | None = None
 
-    def __new__(cls, *made_of: Any) -> Self:
+    def __new__(cls, *made_of: object) -> Self:
         made = super().__new__(cls)
         made.made_of = made_of
         return made
@@ -188,10 +188,10 @@ class FiniteRun(UntimedRun):
     def take_back(self, mark: int) -> None:
         self.state = mark
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[int]:
         return (self.state,)
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[int]) -> None:
         (self.state,) = saved
 
 
@@ -280,10 +280,10 @@ class ClockedRun:
     def take_back(self, mark: tuple[int, int]) -> None:
         self.state, self.since = mark
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[int, int, int]:
         return self.state, self.since, self.now
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[int, int, int]) -> None:
         self.state, self.since, self.now = saved
 
     def _move(self, move: Move) -> None:

@@ -18,7 +18,6 @@ an item, because every symbol can be completed (``grammar.prepare``).
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
@@ -63,10 +62,10 @@ class EarleySet:
         self.conts = conts
         self.depth = depth
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> "tuple[Conts, int, EarleyShape]":
         return self.conts, self.depth, self.shape
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: "tuple[Conts, int, EarleyShape]") -> None:
         self.conts, self.depth, self.shape = saved
 
     def resolve(self, references: Sequence[int]) -> "Conts":

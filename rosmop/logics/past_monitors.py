@@ -370,10 +370,10 @@ class SinceWindow:
         twin._intervals = self._intervals.copy()
         return twin
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[int, deque[tuple[int, int]], int]:
         return self._high, self._intervals, self._low
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[int, deque[tuple[int, int]], int]) -> None:
         self._high, self._intervals, self._low = saved
 
     def __len__(self) -> int:
@@ -407,10 +407,10 @@ class PastRun(UntimedRun):
     def take_back(self, mark: list[Any]) -> None:
         self.values = mark
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[int, list[Any]]:
         return self.now, self.values
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[int, list[Any]]) -> None:
         self.now, self.values = saved
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun
 from rosmop.logics.lexer import FormulaToken, TokenReader
@@ -58,10 +57,10 @@ class RewritingRun(UntimedRun):
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
 
-    def saved(self) -> tuple[Any, ...]:
+    def saved(self) -> tuple[list[int], Categories]:
         return self.string, self.verdict
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
+    def restore(self, saved: tuple[list[int], Categories]) -> None:
         self.string, self.verdict = saved
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:

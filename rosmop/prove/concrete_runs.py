@@ -26,6 +26,7 @@ from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import WireMessage
 from rosmop.types import value_types
 from rosmop.types.value_types import Type, Value
+from roswire.counted import counted
 
 HAPPENED, DROPPED, CHANGED, ELSEWHERE, REPLACED = 1, 2, 4, 8, 32
 """Bits of the result of an event's function."""
@@ -266,4 +267,4 @@ def _shown(value: Value) -> str:
     shown = repr(value)
     if len(shown) <= 100 or not isinstance(value, bytes | list):
         return shown
-    return f"{shown[:90]}… ({len(value)} elements)"
+    return f"{shown[:90]}… ({counted(len(value), 'element')})"

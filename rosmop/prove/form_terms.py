@@ -9,7 +9,7 @@ out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +19,7 @@ import z3
 from rosmop.fast.abi import kept_size, most_kept
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine
 from rosmop.form import nodes
-from rosmop.prove.loops import BUDGET_SLOT, Log, Loops, constant_for
+from rosmop.prove.loops import BUDGET_SLOT, GrowingList, Loops, constant_for
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
@@ -111,6 +111,24 @@ def _word(value: Term, kind: Type) -> Term:
     return bits if bits.size() == 64 else (z3.SignExt if is_signed(kind) else z3.ZeroExt)(32, bits)
 
 
+@dataclass(frozen=True)
+class _EventEnds:
+    """How the event ends: `left` to Python, with something `unknown` (by reason), or at `exits` (did it happen?)."""
+
+    left: list[Term] = field(default_factory=list)
+    unknown: list[tuple[str, Term]] = field(default_factory=list)
+    exits: list[tuple[State, Term]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _ActiveCall:
+    """A call that is being translated; `frame` is its number. `returned` is None for the event, which has no caller."""
+
+    frame: int
+    function: nodes.Function
+    returned: list[tuple[State, Value]] | None
+
+
 class FormTerms:
     """Translates one event on a topic. `lines` are the module's lines of output. Raises `NotProvedError`."""
 
@@ -127,7 +145,6 @@ class FormTerms:
     ) -> None:
         self._lines = lines
         self._noted: list[LineTerm] = []
-        self._context = functions[name].context
         self._functions = functions
         self._values = values
         self._beginning = beginning
@@ -137,13 +154,9 @@ class FormTerms:
         self._loops = Loops(unrolled)
         self._breaks: list[State] = []
         self._continues: list[State] = []
-        self._left: list[Term] = []
-        self._unknown: list[tuple[str, Term]] = []
-        self._exits: list[tuple[State, Term]] = []
-        self._returned: list[tuple[State, Value]] | None = None
+        self._event_ends = _EventEnds()
         self._calls = 0
-        self._frame = 0
-        self._shared: Sequence[str] = self._function.shared
+        self._active = _ActiveCall(0, self._function, None)
 
     def result(self) -> FormResult:
         begin, no = self._beginning, z3.BoolVal(False)
@@ -153,34 +166,34 @@ class FormTerms:
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
-        self._left.append(state.alive)  # every message leaves the function before its end
+        self._event_ends.left.append(state.alive)  # every message leaves the function before its end
         happened: Term = no
         end = State(no, slots)
-        for left, value in self._exits:
+        for left, value in self._event_ends.exits:
             happened = choice(left.alive, value, happened)
             end = State(no, merged(left.alive, left, State(opposite(left.alive), end.slots)))
         unknown: dict[str, Term] = {}
-        for what, condition in self._unknown:
+        for what, condition in self._event_ends.unknown:
             unknown[what] = either(unknown.get(what, no), condition)
         variables = {name: end.slots["shared", name] for name in begin.variables}
         budgets = {**begin.budgets, self._function.context: end.term(BUDGET_SLOT)}
         return FormResult(
-            either(*self._left), unknown, happened, end.term(_DROPPED), end.term(_REPLACED), end.term(_CHANGED),
-            end.term(_MESSAGE), variables, budgets, end.term(_SAID), self._noted, self._loops,
+            either(*self._event_ends.left), unknown, happened, end.term(_DROPPED), end.term(_REPLACED),
+            end.term(_CHANGED), end.term(_MESSAGE), variables, budgets, end.term(_SAID), self._noted, self._loops,
         )  # fmt: skip
 
     # Ends
 
     def _leave_to_python(self, state: State, condition: Term) -> None:
-        self._left.append(both(state.alive, condition))
+        self._event_ends.left.append(both(state.alive, condition))
         state.require(opposite(condition))
 
     def _ignore(self, state: State, what: str) -> None:
-        self._unknown.append((what, state.alive))
+        self._event_ends.unknown.append((what, state.alive))
         state.alive = z3.BoolVal(False)
 
     def _exit(self, state: State, happened: bool) -> None:
-        self._exits.append((state.where(z3.BoolVal(True)), z3.BoolVal(happened)))
+        self._event_ends.exits.append((state.where(z3.BoolVal(True)), z3.BoolVal(happened)))
         state.alive = z3.BoolVal(False)
 
     # Statements
@@ -217,8 +230,14 @@ class FormTerms:
             finally:
                 self._breaks, self._continues = outer
 
-        logs: list[Log] = [self._left, self._unknown, self._exits, self._noted, self._returned or []]
-        self._loops.run(state, body, self._frame, self._at_head, logs)
+        logs: list[GrowingList] = [
+            self._event_ends.left,
+            self._event_ends.unknown,
+            self._event_ends.exits,
+            self._noted,
+            self._active.returned or [],
+        ]
+        self._loops.run(state, body, self._active.frame, self._at_head, logs)
 
     def _at_head(self, _number: int, key: object, value: object) -> Term | Mixed:
         if key in (_MESSAGE, _SAID):
@@ -243,13 +262,13 @@ class FormTerms:
         number = integer(node.default, 32)
         for wanted, index in reversed(node.table):
             number = z3.If(value == integer(wanted, value.size()), integer(index, 32), number)
-        state.slots[self._frame, node.name] = number
+        state.slots[self._active.frame, node.name] = number
 
     def _return(self, node: nodes.Return, state: State) -> None:
-        if node.references or self._returned is None:
+        if node.references or self._active.returned is None:
             raise UnknownError("references")
         value = None if node.value.type == value_types.VOID else self._value(node.value, state)
-        self._returned.append((state.where(z3.BoolVal(True)), value))
+        self._active.returned.append((state.where(z3.BoolVal(True)), value))
         state.alive = z3.BoolVal(False)
 
     def _leave(self, node: nodes.Leave, state: State) -> None:
@@ -322,7 +341,7 @@ class FormTerms:
         numbers = [
             integer(number, 32)
             for number, line in enumerate(self._lines)
-            if line.node is node and line.context == self._context
+            if line.node is node and line.context == self._active.function.context
         ]
         self._spend(cost, state)
         begin = state.term(_SAID)
@@ -342,17 +361,21 @@ class FormTerms:
         state.require(test)
 
     def _not_past(self, node: nodes.NotPast, state: State) -> None:
-        self._leave_to_python(state, state.term((self._frame, node.count)) <= node.index)
+        self._leave_to_python(state, state.term((self._active.frame, node.count)) <= node.index)
 
     # Fields of the message
 
     def _position(self, at: nodes.Spot, state: State) -> Term:
         offset = integer(at.offset, 64)
-        return offset if at.base is None else state.term((self._frame, at.base)) + offset
+        return offset if at.base is None else state.term((self._active.frame, at.base)) + offset
 
     def _place(self, at: nodes.Spot, state: State) -> Term:
         offset = integer(at.offset, 32)
-        return offset if at.base is None else z3.Extract(31, 0, state.term((self._frame, at.base))) + offset
+        return (
+            offset
+            if at.base is None
+            else z3.Extract(31, 0, state.term((self._active.frame, at.base))) + offset
+        )
 
     def _within(self, at: nodes.Spot, size: int, state: State) -> None:
         short = z3.ULT(z3.ZeroExt(32, self._beginning.size), self._position(at.plus(size), state))
@@ -364,10 +387,10 @@ class FormTerms:
 
     def _after_text(self, node: nodes.AfterText, state: State) -> None:
         length = self._length(node.at, state)
-        state.slots[self._frame, node.name] = self._position(node.at.plus(4), state) + length
+        state.slots[self._active.frame, node.name] = self._position(node.at.plus(4), state) + length
 
     def _count(self, node: nodes.Count, state: State) -> None:
-        state.slots[self._frame, node.name] = self._counted(node.at, node.least, state)
+        state.slots[self._active.frame, node.name] = self._counted(node.at, node.least, state)
 
     def _counted(self, at: nodes.Spot, least: int, state: State) -> Term:
         count = self._length(at, state)
@@ -378,9 +401,11 @@ class FormTerms:
 
     def _after_elements(self, node: nodes.AfterElements, state: State) -> None:
         count = (
-            integer(node.count, 64) if isinstance(node.count, int) else state.term((self._frame, node.count))
+            integer(node.count, 64)
+            if isinstance(node.count, int)
+            else state.term((self._active.frame, node.count))
         )
-        state.slots[self._frame, node.name] = self._position(node.at, state) + count * node.size
+        state.slots[self._active.frame, node.name] = self._position(node.at, state) + count * node.size
 
     def _ends(self, node: nodes.Ends, state: State) -> None:
         end = self._position(node.at, state)
@@ -390,7 +415,7 @@ class FormTerms:
         self._within(node.at, max(offset + self._size(kind) for _, kind, offset in node.fields), state)
         for name, kind, offset in node.fields:
             place = self._place(node.at.plus(offset), state)
-            state.slots[self._frame, name] = self._number(state.term(_MESSAGE), place, kind)
+            state.slots[self._active.frame, name] = self._number(state.term(_MESSAGE), place, kind)
 
     def _number(self, message: Term, place: Term, kind: Type) -> Term:
         return self._decoded(number_at(message, place, self._size(kind)), kind)
@@ -435,8 +460,8 @@ class FormTerms:
             self._within(node.at, size, state)
             if isinstance(kind, value_types.VectorType):
                 count, size = integer(kind.length or 0, 64), self._size(kind.element)
-        state.slots[self._frame, node.name] = _View(state.term(_MESSAGE), start, count)
-        state.slots[self._frame, node.end] = start + count * size
+        state.slots[self._active.frame, node.name] = _View(state.term(_MESSAGE), start, count)
+        state.slots[self._active.frame, node.end] = start + count * size
 
     def _write_back(self, node: nodes.WriteBack, state: State) -> None:
         dropped = state.term(_DROPPED)
@@ -450,7 +475,7 @@ class FormTerms:
             state.require(opposite(replaced))
         puts = []
         for write in node.writes:
-            flag = state.term((self._frame, write.flag))
+            flag = state.term((self._active.frame, write.flag))
             if write.end is not None:
                 self._ignore(state.where(flag), "a string or vector that is written")
                 state.require(opposite(flag))
@@ -532,7 +557,7 @@ class FormTerms:
         return self._whole_number(0, node.type)
 
     def _read(self, node: nodes.Read, state: State) -> Value:
-        own, shared = (self._frame, node.name), ("shared", node.name)
+        own, shared = (self._active.frame, node.name), ("shared", node.name)
         value = state.slots.get(own if own in state.slots else shared)
         if not isinstance(value, Term | TextTerm | _View):
             raise UnknownError(f"a variable of type {node.type}")
@@ -547,7 +572,7 @@ class FormTerms:
 
     def _assign(self, node: nodes.Assign, state: State) -> Value:
         value = self._value(node.value, state)
-        where: int | str = "shared" if node.name in self._shared else self._frame
+        where: int | str = "shared" if node.name in self._active.function.shared else self._active.frame
         if where == "shared" and node.name not in self._beginning.variables:
             raise UnknownError(f"a variable of type {node.type}")
         state.slots[where, node.name] = self._kept(value, node.type, state) if where == "shared" else value
@@ -698,7 +723,7 @@ class FormTerms:
         return same if node.operator == "==" else opposite(same)
 
     def _sender(self, node: nodes.SenderName, state: State) -> Value:
-        return self._kept(self._beginning.senders[self._context, node.part], node.type, state)
+        return self._kept(self._beginning.senders[self._active.function.context, node.part], node.type, state)
 
     def _altered(self, _node: nodes.Altered, _state: State) -> Value:
         return self._beginning.altered != integer(0, 32)
@@ -840,19 +865,18 @@ class FormTerms:
             raise UnknownError("recursion")
         function = self._functions[node.function]
         values = [self._value(argument, state) for argument in node.arguments]
-        outer = self._frame, self._shared, self._returned, self._context
         self._calls += 1
-        self._frame, self._shared, self._returned = self._calls, function.shared, []
-        self._context = function.context
+        returned: list[tuple[State, Value]] = []
+        outer, self._active = self._active, _ActiveCall(self._calls, function, returned)
         state.slots |= {
-            (self._frame, name): value for name, value in zip(function.parameters, values, strict=False)
+            (self._calls, name): value for name, value in zip(function.parameters, values, strict=False)
         }
         inner = state.where(z3.BoolVal(True))
         try:
             self._block(function.body, inner)
-            ends: list[tuple[State, Value]] = [*self._returned, (inner, None)]
+            ends: list[tuple[State, Value]] = [*returned, (inner, None)]
         finally:
-            self._frame, self._shared, self._returned, self._context = outer
+            self._active = outer
         ends = [(end, value) for end, value in ends if not z3.is_false(end.alive)]
         if not ends:
             state.alive = z3.BoolVal(False)

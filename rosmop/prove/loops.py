@@ -38,7 +38,7 @@ from rosmop.runtime.action_context import BUDGET
 BUDGET_SLOT = "budget"
 
 
-class Log(Protocol):
+class GrowingList(Protocol):
     """A list that grows during the translation, and whose last entries can be removed."""
 
     def __len__(self) -> int: ...
@@ -86,7 +86,7 @@ class Loops:
         body: Callable[[State], tuple[Sequence[State], Sequence[State]]],
         frame: int,
         head: Head,
-        logs: Sequence[Log],
+        logs: Sequence[GrowingList],
     ) -> None:
         """Advance `state` to the end of the loop. A repeated translation removes its earlier entries from `logs`.
 
@@ -109,7 +109,7 @@ class Loops:
         body: Callable[[State], tuple[Sequence[State], Sequence[State]]],
         frame: int,
         head: Head,
-        logs: Sequence[Log],
+        logs: Sequence[GrowingList],
     ) -> Sequence[State]:
         number, constants = len(self.cuts), dict[object, object]()
         nothing = z3.BoolVal(False)

@@ -14,14 +14,14 @@ message that is left (`ELSEWHERE`): the effects are undone.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 
 import z3
 
 from rosmop.prove.decoding import Code, WasmInstruction
-from rosmop.prove.loops import Cut, Log, Loops, become, constant_for
+from rosmop.prove.loops import Cut, GrowingList, Loops, become, constant_for
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
@@ -115,6 +115,19 @@ class ModuleResult:
     loops: Loops
 
 
+@dataclass(frozen=True)
+class _ActiveCall:
+    """A call that is being translated; `frame` is its number, and `function` that of its function.
+
+    `labels` have the states that leave each block around the instruction, `returned` those that return, with the value.
+    """
+
+    frame: int
+    function: int
+    labels: list[list[State]] = field(default_factory=list)
+    returned: list[tuple[State, Value]] = field(default_factory=list)
+
+
 class ModuleExecution:
     """Executes the function of one event on these cells. Raises `DiffersError` and `NotProvedError`.
 
@@ -140,15 +153,12 @@ class ModuleExecution:
         self._spans = spans
         self._guess = guess
         self._loops = Loops(guess.unrolled)
-        self._function = number
-        self._labels: list[list[State]] = []
+        self._active = _ActiveCall(0, number)
         self._size = size
         self._trapped: list[Term] = []
         self._outside: list[Term] = []
         self._stored: set[int] = set()
         self._frames = 0
-        self._frame = 0
-        self._returned: list[tuple[State, Value]] = []
         slots: dict[object, object] = {
             _MESSAGE: message,
             _LINES: z3.Array("lines", z3.BitVecSort(32), z3.BitVecSort(8)),
@@ -178,16 +188,16 @@ class ModuleExecution:
     def _call(self, number: int, arguments: Sequence[Value], state: State) -> Value:
         code = self._functions[number]
         self._frames += 1
-        outer = self._frame, self._returned, self._function, self._labels
-        self._frame, self._returned, self._function, self._labels = self._frames, [], number, []
+        outer, self._active = self._active, _ActiveCall(self._frames, number)
+        frame = self._active.frame
         zeros = [integer(0, 32) if kind == "i32" else integer(0, 64) if kind == "i64" else floating(0.0, int(kind[1:]))
                  for kind in code.made]  # fmt: skip
         inner = state.where(z3.BoolVal(True))
-        inner.slots |= {(self._frame, place): value for place, value in enumerate([*arguments, *zeros])}
+        inner.slots |= {(frame, place): value for place, value in enumerate([*arguments, *zeros])}
         stack: list[Value] = []
         self._run(code.body, inner, stack)
-        ends = [*self._returned, *([] if z3.is_false(inner.alive) else [(inner, stack[-1])])]
-        self._frame, self._returned, self._function, self._labels = outer
+        ends = [*self._active.returned, *([] if z3.is_false(inner.alive) else [(inner, stack[-1])])]
+        self._active = outer
         if not ends:
             state.alive = z3.BoolVal(False)
             return integer(0, 32)
@@ -231,10 +241,10 @@ class ModuleExecution:
         yes, no = state.where(test), state.where(opposite(test))
         one: list[Value] = []
         other: list[Value] = []
-        self._labels.append([])
+        self._active.labels.append([])
         self._run(instruction.body, yes, one)
         self._run(instruction.otherwise, no, other)
-        if self._labels.pop():
+        if self._active.labels.pop():
             raise NotProvedError("leaves a branch before its end")
         state.join(test, yes, no)
         values = [branch[-1] if branch and not z3.is_false(end.alive) else None
@@ -243,21 +253,21 @@ class ModuleExecution:
             stack.append(choice(test, *values))
 
     def _block(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
-        self._labels.append([])
+        self._active.labels.append([])
         self._run(instruction.body, state, [])
-        become(state, [*self._labels.pop(), state])
+        become(state, [*self._active.labels.pop(), state])
 
     def _loop(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         def body(state: State) -> tuple[Sequence[State], Sequence[State]]:
-            self._labels.append([])
+            self._active.labels.append([])
             try:
                 self._run(instruction.body, state, [])
             finally:
-                again = self._labels.pop()
+                again = self._active.labels.pop()
             return again, [state]
 
-        logs: list[Log] = [self._trapped, self._outside, self._returned, *self._labels]
-        self._loops.run(state, body, self._frame, self._at_head, logs)
+        logs: list[GrowingList] = [self._trapped, self._outside, self._active.returned, *self._active.labels]
+        self._loops.run(state, body, self._active.frame, self._at_head, logs)
 
     def _at_head(self, number: int, key: object, value: object) -> Term | Mixed:
         if key in (_MESSAGE, _LINES, _NOTE, ("cell", SAID), ("cell", UNDO)):
@@ -270,7 +280,7 @@ class ModuleExecution:
         if kind == "cell":
             name = self._guess.variables.get(place)
         else:
-            name = self._guess.names[self._function][place] if kind == self._frame else None
+            name = self._guess.names[self._active.function][place] if kind == self._active.frame else None
         for known in ((cut.frame, name), name):
             meant = cut.head.get(known)
             if isinstance(meant, Term) and isinstance(value, Term) and _same_sort(meant, value):
@@ -278,12 +288,12 @@ class ModuleExecution:
         return constant_for(key, value)
 
     def _branch(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
-        self._labels[-1 - int(instruction.operands[0])].append(state.where(z3.BoolVal(True)))
+        self._active.labels[-1 - int(instruction.operands[0])].append(state.where(z3.BoolVal(True)))
         state.alive = z3.BoolVal(False)
 
     def _branch_if(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
         test = _truth(stack.pop())
-        self._labels[-1 - int(instruction.operands[0])].append(state.where(test))
+        self._active.labels[-1 - int(instruction.operands[0])].append(state.where(test))
         state.require(opposite(test))
 
     def _unreachable(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
@@ -291,7 +301,7 @@ class ModuleExecution:
         state.alive = z3.BoolVal(False)
 
     def _return(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
-        self._returned.append((state.where(z3.BoolVal(True)), stack[-1]))
+        self._active.returned.append((state.where(z3.BoolVal(True)), stack[-1]))
         state.alive = z3.BoolVal(False)
 
     def _called(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
@@ -314,10 +324,10 @@ class ModuleExecution:
         stack.append(choice(test, yes, no))
 
     def _get(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
-        stack.append(_number_or_address(state.slots[self._frame, instruction.operands[0]]))
+        stack.append(_number_or_address(state.slots[self._active.frame, instruction.operands[0]]))
 
     def _set(self, instruction: WasmInstruction, state: State, stack: list[Value]) -> None:
-        state.slots[self._frame, instruction.operands[0]] = stack.pop()
+        state.slots[self._active.frame, instruction.operands[0]] = stack.pop()
 
     # Memory
 

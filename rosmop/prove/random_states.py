@@ -10,7 +10,7 @@ differ.
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from random import Random
 
 from rosmop.fast.abi import most_kept
@@ -39,6 +39,27 @@ _SELDOM = 125
 """Two of this number of states have long arrays, which take time."""
 
 
+class _Constants:
+    """The `numbers` and `texts` of an event and of the functions that it calls, and `bounds` of its specification."""
+
+    def __init__(self, numbers: Sequence[float], texts: Sequence[bytes], bounds: Sequence[float]) -> None:
+        self.texts = texts
+        self.floats = [*_FLOATS, *numbers, *bounds]
+        self.literals = [one for one in numbers if abs(one) < _TAME] or [0.0]
+        self.integers = [int(one) for one in self.literals if one == int(one)] or [0]
+        self.longest = max((int(one) for one in self.floats if one in _LONG), default=0)
+
+
+@dataclass
+class _Traits:
+    """The common traits of the values of a state: a `few` numbers and `names`; `is_exact`: multiples of a half."""
+
+    few: Sequence[float] = ()
+    names: Sequence[bytes] = ()
+    is_tame: bool = False
+    is_exact: bool = False
+
+
 class RandomStates:
     """Draws states of one event."""
 
@@ -49,18 +70,12 @@ class RandomStates:
         givens = [given for one in compiled.specifications for given in one.givens]
         self._givens = {given.code: given.default for given in givens if given.code in self._kinds}
         self._throttles = [*module.throttles]
-        numbers, self._texts = _constants(compiled, event.name)
-        bounds = (float(one) for given in givens for one in (given.default, *(given.bounds or ())))
-        self._floats = [*_FLOATS, *numbers, *bounds]
-        self._literals = [one for one in numbers if abs(one) < _TAME] or [0.0]
-        self._integers = [int(one) for one in self._literals if one == int(one)] or [0]
-        self._longest = max((int(one) for one in self._floats if one in _LONG), default=0)
-        self._few: Sequence[float] = ()
-        self._names: Sequence[bytes] = ()
+        bounds = [float(one) for given in givens for one in (given.default, *(given.bounds or ()))]
+        self._constants = _Constants(*_constants(compiled, event.name), bounds)
+        self._traits = _Traits()
         self._now = self._length = 0
         self._zeros = 0.0
         """The fraction of a message's numbers that are 0, as in the messages of a standing base."""
-        self._is_tame = self._is_exact = False
         self._fields: Value = []
 
     def following(self, runs: ConcreteRuns, event: EventPair) -> Iterator[EventState]:
@@ -68,7 +83,11 @@ class RandomStates:
         state: EventState | None = None
         for number in range(STATES):
             turn = number % _SELDOM
-            self._length = self._longest + self._random.randrange(2) if turn < 2 and self._longest else 0
+            self._length = (
+                self._constants.longest + self._random.randrange(2)
+                if turn < 2 and self._constants.longest
+                else 0
+            )
             if state is None or turn == 0 or (turn > 1 and self._random.random() < 0.5):
                 state = self._state()
             else:
@@ -77,22 +96,22 @@ class RandomStates:
 
     def _state(self) -> EventState:
         random = self._random
-        self._is_tame = bool(self._length) or random.random() < 0.5
-        self._is_exact = self._is_tame and random.random() < 0.5
+        self._traits.is_tame = bool(self._length) or random.random() < 0.5
+        self._traits.is_exact = self._traits.is_tame and random.random() < 0.5
         self._now = random.choice(_TIMES) + random.choice((0, 0, 1, random.randrange(10**9)))
         few = [
-            *random.choices(self._floats, k=2),
+            *random.choices(self._constants.floats, k=2),
             random.choice((random.uniform(-3, 3), random.choice(_FLOATS))),
         ]
-        if self._is_tame:
+        if self._traits.is_tame:
             few = [one if abs(one) < _TAME and self._fits(one) else self._small() for one in few]
-        self._few = [*few, random.choice(_NOT_FINITE)] if self._length else few
-        self._names = random.choices(self._texts, k=2)
+        self._traits.few = [*few, random.choice(_NOT_FINITE)] if self._length else few
+        self._traits.names = random.choices(self._constants.texts, k=2)
         variables = {name: self._value(kind) for name, kind in self._kinds.items()}
-        if self._is_tame:
+        if self._traits.is_tame:
             kept = random.choice((0.5, 1))
             variables |= {name: default for name, default in self._givens.items() if random.random() < kept}
-        budget = BUDGET if self._is_tame or random.random() < 0.6 else random.randrange(2000)
+        budget = BUDGET if self._traits.is_tame or random.random() < 0.6 else random.randrange(2000)
         last = [self._now, self._now - 1, 0, self._now + 1, (1 << 63) - 1, max(self._now - 10**9, 0)]
         throttled = {key: random.choice(last[:2] * 6 + last) for key in self._throttles}
         names, altered = (self._text(), self._text()), random.random() < 0.25
@@ -172,9 +191,12 @@ class RandomStates:
         if isinstance(kind, value_types.FloatingType):
             value = self._float()
             return value if kind.bits == 64 else _single(value)
-        some = random.choice((*self._few, random.choice(self._floats)))
+        some = random.choice((*self._traits.few, random.choice(self._constants.floats)))
         if isinstance(kind, value_types.IntegerType):
-            near, literal = _whole(some) + random.choice((0, 0, 1, -1)), random.choice(self._integers)
+            near, literal = (
+                _whole(some) + random.choice((0, 0, 1, -1)),
+                random.choice(self._constants.integers),
+            )
             value = random.choice(
                 (near, near, -near, literal, literal, random.randrange(4), kind.least, kind.most)
             )
@@ -184,10 +206,10 @@ class RandomStates:
         return min(max(value, 0 if kind == value_types.TIME else -MAX_TIME // 4), MAX_TIME // 4)
 
     def _float(self) -> float:
-        random, few = self._random, self._few
+        random, few = self._random, self._traits.few
         seconds, value = self._now / 1e9, random.choice(few)
-        if self._is_tame:
-            small, literal = self._small(), random.choice(self._literals)
+        if self._traits.is_tame:
+            small, literal = self._small(), random.choice(self._constants.literals)
             return random.choice((value, value, small, small, literal, literal, seconds - value))
         chance = random.random()
         if chance < 0.45:
@@ -199,17 +221,19 @@ class RandomStates:
         if chance < 0.75:
             return random.choice((-value, value * 2, value + random.choice(few), 1 / value if value else 0.0))
         if chance < 0.85:
-            return random.choice(random.choice((_FLOATS, self._literals, self._floats)))
+            return random.choice(random.choice((_FLOATS, self._constants.literals, self._constants.floats)))
         return random.uniform(-1, 1) * 10 ** random.choice((0, 0, 0, 1, 3, -3))
 
     def _small(self) -> float:
-        return self._random.randrange(-8, 9) / 2 if self._is_exact else self._random.uniform(-3, 3)
+        return self._random.randrange(-8, 9) / 2 if self._traits.is_exact else self._random.uniform(-3, 3)
 
     def _fits(self, value: float) -> bool:
-        return not self._is_exact or value * 2 == int(value * 2)
+        return not self._traits.is_exact or value * 2 == int(value * 2)
 
     def _text(self) -> bytes:
-        return self._random.choice((*self._names, *self._names, self._random.choice(self._texts)))
+        return self._random.choice(
+            (*self._traits.names, *self._traits.names, self._random.choice(self._constants.texts))
+        )
 
 
 def _constants(compiled: Compiled, function: str) -> tuple[Sequence[float], Sequence[bytes]]:

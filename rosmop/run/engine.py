@@ -46,6 +46,7 @@ from rosmop.run.timers import Agenda, Patience
 from rosmop.runtime import safe_messages
 from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import Buffer, WireMessage
+from rosmop.types.value_types import Value
 from roswire.definitions import Definitions
 
 GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
@@ -90,7 +91,7 @@ class KeptGroup:
     def __init__(
         self,
         group: MonitorGroup,
-        variables: Mapping[str, Any],
+        variables: Mapping[str, Value],
         types: Mapping[str, bytes],
         slices: Sequence[tuple[str, SliceParts]],
     ) -> None:
@@ -607,7 +608,7 @@ class MonitorSet:
 
     def _follow(
         self,
-        known: Mapping[str, tuple[MonitorInstance, Mapping[str, Any]]],
+        known: Mapping[str, tuple[MonitorInstance, Mapping[str, Value]]],
         redefined: frozenset[str],
         time_ns: int,
     ) -> Outcome:
@@ -838,7 +839,7 @@ class MonitorSet:
     # The set
 
     def _take_over(
-        self, monitor: MonitorInstance, before: MonitorInstance, variables: Mapping[str, Any]
+        self, monitor: MonitorInstance, before: MonitorInstance, variables: Mapping[str, Value]
     ) -> None:
         for name, code in monitor.code.variables.items():
             self.interpreter.variables[code] = variables[before.code.variables[name]]

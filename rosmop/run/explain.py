@@ -64,7 +64,7 @@ class Bound(NamedTuple):
 
     event: int
     binds: tuple[int, ...]
-    key: tuple[Any, ...]
+    key: tuple[object, ...]
     time: int
     sender: MessageSender
     creates: bool
@@ -389,7 +389,7 @@ class _Trial:
 def of_slice(
     compiled: CompiledProperty,
     trail: Iterable[Bound],
-    values: Mapping[int, Any],
+    values: Mapping[int, object],
     category: str,
     passed: int | None = None,
 ) -> Explanation | None:
@@ -417,7 +417,7 @@ def of_slice(
     return why if why is not None and all(own[event] for event in why.events) else None
 
 
-def _same(one: Any, other: Any) -> bool:
+def _same(one: object, other: object) -> bool:
     return bool(one == other or (one != one and other != other))  # noqa: PLR0124  NaN
 
 

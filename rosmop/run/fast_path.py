@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from rosmop.form.compiled import Compiled
 from rosmop.run.interpreter import Interpreter
@@ -89,6 +89,12 @@ class NextDue(Protocol):
         """If `anew`, compute the time again, since a deadline may now be earlier."""
 
 
+class Pieces(Protocol):
+    """A list of parts of messages, which also takes parts of a buffer."""
+
+    def append(self, piece: memoryview, /) -> None: ...
+
+
 class FastLane(Protocol):
     """Processes the messages of one topic, or part of a service, many at a time."""
 
@@ -132,7 +138,7 @@ class FastLane(Protocol):
         view: memoryview,
         position: int,
         run: int,
-        pieces: list[Any],
+        pieces: Pieces,
         time_ns: int,
         prepared: BatchOptions,
         answer: int | Exception | None = None,
@@ -150,7 +156,7 @@ class FastLane(Protocol):
         view: memoryview,
         position: int,
         run: int,
-        pieces: list[Any],
+        pieces: Pieces,
         time_ns: int,
         prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,

@@ -82,7 +82,7 @@ class Remedy(NamedTuple):
 
     publish: Handler
     event: EventCode
-    accepts: Callable[[WireMessage], Any]
+    accepts: Callable[[WireMessage], object]
     key: Callable[[WireMessage], Any] | None
 
 

@@ -7,7 +7,7 @@ import datetime
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
@@ -16,6 +16,7 @@ from rosmop.run.subformulas import deciding
 from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.action_context import Published as Published  # noqa: PLC0414  the appliance imports it from here
 from rosmop.runtime.wire import Buffer
+from rosmop.types.value_types import Value
 
 _EACH_END = 5
 
@@ -42,7 +43,7 @@ class MessageSender(NamedTuple):
     altered: bool = False
 
 
-Who = Callable[[int], Mapping[str, Any]]
+Who = Callable[[int], Mapping[str, object]]
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
@@ -141,7 +142,7 @@ class Outcome:
     """The position of the statement, the action or the specification."""
     handling: Mapping[int, Verdict] = MappingProxyType({})
     """The verdicts whose handlers dropped the message (key `DROPPED`) or published messages (keys: their indices)."""
-    looked: Mapping[int, tuple[Any, ...]] = MappingProxyType({})
+    looked: Mapping[int, tuple[Value, ...]] = MappingProxyType({})
     """The conditions that were met, by site, with the values that they compared.
 
     They are each `when` of an event that happened, and each `if` around a statement that dropped, changed or
@@ -219,7 +220,7 @@ class Margin(NamedTuple):
         return None if self.threshold is None else (self.right, self.left)[self.threshold]
 
 
-def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
+def of_drop(outcome: Outcome, who: Who) -> dict[str, object]:
     return {
         **({"at": [str(outcome.dropped_at)]} if outcome.dropped_at is not None else {}),
         **({"values": dict(outcome.fatal.values)} if outcome.fatal is not None else {}),
@@ -227,7 +228,7 @@ def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
     }
 
 
-def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
+def of_change(outcome: Outcome, who: Who) -> dict[str, object]:
     return {
         "changed_by": list(outcome.changed_by),
         "at": [str(position) for position in outcome.changed_at],
@@ -235,13 +236,13 @@ def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
     }
 
 
-def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
+def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, object]:
     message = outcome.published[number]
     position = outcome.sites[message.site].position
     return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
 
 
-def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
+def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, object]:
     where = fault.position
     return {
         "file": where.file,
@@ -254,7 +255,7 @@ def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
     }
 
 
-def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
+def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, object]:
     return {
         "property": verdict.property,
         "logic": verdict.logic,
@@ -266,7 +267,7 @@ def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
     }
 
 
-def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
+def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, object]:
     return {
         "events": list(outcome.events),
         **({"timer": outcome.timer} if outcome.timer is not None else {}),
@@ -275,13 +276,13 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
     }
 
 
-def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
+def why_of(verdict: Verdict, who: Who) -> dict[str, dict[str, object]]:
     why = verdict.why
     if why is None:
         return {}
     events = [_event(verdict, event, who) for event in why.events]
     between = len(events) - 2 * _EACH_END
-    said: dict[str, Any] = {"events": events}
+    said: dict[str, object] = {"events": events}
     if between > 0:
         said = {"events": [*events[:_EACH_END], *events[-_EACH_END:]], "left_out": between}
     said["fewest"] = why.fewest
@@ -297,8 +298,8 @@ def moment(time_ns: int) -> str:
     return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
 
 
-def _event(verdict: Verdict, happened: EventOccurrence, who: Who) -> dict[str, Any]:
-    event: dict[str, Any] = {"event": verdict.source.events[happened.event], "time": moment(happened.time)}
+def _event(verdict: Verdict, happened: EventOccurrence, who: Who) -> dict[str, object]:
+    event: dict[str, object] = {"event": verdict.source.events[happened.event], "time": moment(happened.time)}
     event |= {"state": happened.state} if happened.state else {}
     event |= who(happened.sender.source) if happened.sender.source else {}
     return event | ({"seq": happened.sender.number} if happened.sender.kind == SEQ else {})

@@ -40,6 +40,7 @@ from rosmop.logics.interface import (
 from rosmop.run.slice_quota import Holder, HolderOf, Quota
 from rosmop.runtime.action_context import FOLDED_NS
 from rosmop.types import value_types
+from rosmop.types.value_types import Value
 
 LIMIT = 100_000
 
@@ -52,7 +53,7 @@ TOGETHER_LIMIT = 250
 MAX_BINDING = 256
 """The most bytes of all strings of a binding together."""
 
-Key = tuple[Any, ...]
+Key = tuple[Value, ...]
 """True, and the values of the bound parameters, in their order."""
 
 Binding = tuple[int, Key]
@@ -71,7 +72,7 @@ class Slice:
     domain: int
     key: Key
     runs: tuple[Run, ...]
-    values: tuple[Any, ...]
+    values: tuple[Value, ...]
     holder: Holder = None
     kept: bool = False
     gone: bool = False
@@ -104,7 +105,7 @@ class Slices:
     def __init__(
         self,
         code: SpecificationCode,
-        namespace: dict[str, Any],
+        namespace: dict[str, Value],
         limit: int,
         holder_of: HolderOf,
     ) -> None:
@@ -348,11 +349,11 @@ class Slices:
             namespace.update(zip(self._own, slice_.values, strict=True))
         return slice_.runs
 
-    def own(self) -> tuple[Any, ...]:
+    def own(self) -> tuple[Value, ...]:
         return tuple(self._namespace[name] for name in self._own)
 
     def settle(
-        self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
+        self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Value, ...], *, happened: bool
     ) -> None:
         """Store the state of a slice. A new slice is kept only if the event with which it begins `happened`."""
         slice_.runs, slice_.values = runs, values
@@ -462,8 +463,8 @@ class Slices:
 
     def restore(
         self,
-        zero: Sequence[Any],
-        values: Sequence[Any],
+        zero: Sequence[Value],
+        values: Sequence[Value],
         live: Sequence[Slice],
         ended: Sequence[tuple[Binding, Holder]],
     ) -> None:
@@ -533,7 +534,7 @@ class Slices:
         self.quota.take(slice_.holder, binding)
         self._put(*binding, slice_)
 
-    def values(self, slice_: Slice) -> Mapping[int, Any]:
+    def values(self, slice_: Slice) -> Mapping[int, Value]:
         return dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
 
     def binding(self, slice_: Slice) -> Mapping[str, object]:
@@ -616,7 +617,7 @@ def _members(domain: int) -> list[int]:
     return [number for number in range(domain.bit_length()) if domain >> number & 1]
 
 
-def _key(values: Mapping[int, Any], domain: int) -> Key:
+def _key(values: Mapping[int, Value], domain: int) -> Key:
     return (True, *(values[number] for number in _members(domain)))
 
 

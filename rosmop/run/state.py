@@ -23,7 +23,7 @@ from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
 from rosmop.run.state_of_slices import PartSnapshot, SliceSnapshot, restore_slices
 from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 MOST_BYTES = 64 << 10
 
@@ -126,7 +126,7 @@ def _with_cells(states: list[MonitorSnapshot], cells: bytes, names: CellNames) -
     return states
 
 
-def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: bytes) -> MonitorSnapshot:
+def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Value], types: bytes) -> MonitorSnapshot:
     slices = monitor.slices
     first: tuple[list[Any], list[Any]] = ([], [])
     if slices is not None:
@@ -154,7 +154,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
     )
 
 
-def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
+def shape(monitor: MonitorInstance, variables: Mapping[str, Value]) -> bytes:
     monitor.move_to_python()
     runs = [
         kept(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else kept(running.run)
@@ -169,7 +169,7 @@ def restore(
     monitor: MonitorInstance,
     state: MonitorSnapshot,
     slices: Sequence[SliceSnapshot],
-    variables: dict[str, Any],
+    variables: dict[str, Value],
     compiled: Compiled,
     *,
     time_ns: int,
@@ -219,7 +219,7 @@ _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(
 )
 
 
-def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
+def _fits(known: ValueCodec, kind: Type, value: object) -> bool:
     if isinstance(kind, value_types.VectorType):
         return (
             isinstance(value, list)

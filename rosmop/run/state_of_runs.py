@@ -31,13 +31,13 @@ class StateTooLargeError(Exception):
     """A state has too many parts or bytes."""
 
 
-def kept(run: Any) -> list[Any]:
+def kept(run: Run) -> list[list[object]]:
     if isinstance(run, FiniteRun | ClockedRun):
         return [[*run.saved()], []]
     return _Writer(run).written()
 
 
-def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
+def run_of(compiled: CompiledProperty, data: object, time_ns: int) -> Run:
     """Read the data of `kept`. Raises `ValueError`."""
     run = compiled.start(time_ns)
     try:
@@ -49,7 +49,7 @@ def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
 
 
 class _Writer:
-    def __init__(self, run: Any) -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
         self._numbers: dict[int, int] = {}
         self._parts: list[Any] = []
@@ -59,28 +59,28 @@ class _Writer:
             else {}
         )
 
-    def written(self) -> list[Any]:
+    def written(self) -> list[list[object]]:
         run = self._run
         fields = [
             *map(self._value, run.saved()),
             *([self._operators_of(run)] if isinstance(run, BoundedRun) else []),
         ]
-        parts: list[Any] = []
+        parts: list[object] = []
         for part in self._parts:  # the list grows while parts refer to other parts
             if len(parts) >= MOST_PARTS:
                 raise StateTooLargeError(f"a property has more than {MOST_PARTS} parts")
             parts.append(self._part(part))
         return [fields, parts]
 
-    def _operators_of(self, run: Any) -> list[Any]:
+    def _operators_of(self, run: BoundedRun) -> list[object]:
         return [[number, *map(self._value, operator.saved())] for number, operator in run.operators.items()]
 
-    def _part(self, part: Any) -> list[Any]:
+    def _part(self, part: Any) -> list[object]:
         if isinstance(part, EarleyShape):
             return ["shape", *map(self._value, (part.items, part.done, part.width))]
         return [_NAMES[type(part)], *map(self._value, part.saved())]
 
-    def _value(self, value: Any) -> Any:
+    def _value(self, value: Any) -> object:
         if value is None or isinstance(value, bool | float | str):
             return value
         if isinstance(value, int):
@@ -145,7 +145,7 @@ class _Reader:
         for number, *fields in entries:
             self._fill(run.operators[number], fields)
 
-    def _fill_run(self, fields: list[Any]) -> None:
+    def _fill_run(self, fields: list[object]) -> None:
         """Fill the run with values of the types that it has; only a grammar's frame may become None."""
         before = self._run.saved()
         self._fill(self._run, fields)
@@ -153,7 +153,7 @@ class _Reader:
             if not isinstance(value, type(first)) and not (value is None and isinstance(first, EarleySet)):
                 raise ValueError("a property has no such state")
 
-    def _fill(self, target: Any, fields: list[Any]) -> None:
+    def _fill(self, target: Any, fields: list[object]) -> None:
         target.restore(tuple(map(self._value, fields)))
 
     def _value(self, value: Any) -> Any:

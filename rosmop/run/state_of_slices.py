@@ -11,7 +11,7 @@ import msgspec
 from rosmop.form.compiled import SpecificationCode
 from rosmop.run.slices import Binding, Slice, Slices, of_nan
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 BUCKETS = 128
 
@@ -27,7 +27,7 @@ class SliceSnapshot(msgspec.Struct, frozen=True, array_like=True):
     key: list[Any]
     holder: str | None
     ended: bool
-    runs: list[Any] = []
+    runs: list[object] = []
     values: list[Any] = []
     due: int | None = None
     turn: int = 0
@@ -99,11 +99,11 @@ class SliceParts:
 def restore_slices(
     slices: Slices,
     code: SpecificationCode,
-    first: tuple[Sequence[Any], Sequence[Any]],
+    first: tuple[Sequence[Value], Sequence[Value]],
     records: Sequence[SliceSnapshot],
     *,
     types: Mapping[str, Type],
-    fits: Callable[[Type, Any], bool],
+    fits: Callable[[Type, object], bool],
     time_ns: int,
 ) -> None:
     """Restore slices, and the initial values (`first`) of parameters and of own variables. Raises `ValueError`."""
@@ -111,7 +111,7 @@ def restore_slices(
     parameters = [kind for _, _, kind in code.slicing.parameters]
     own = [types[name] for name in code.slicing.own]
 
-    def check(kinds: Sequence[Type], values: Sequence[Any]) -> None:
+    def check(kinds: Sequence[Type], values: Sequence[object]) -> None:
         if len(kinds) != len(values) or not all(map(fits, kinds, values)):
             raise ValueError("the values of a slice differ from those of its specification")
 

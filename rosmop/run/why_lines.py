@@ -1,10 +1,9 @@
 """Write the causes of a verdict, as records have them, for people. It imports nothing that runs specifications."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 
-def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
+def lines_of_why(why: Mapping[str, object]) -> Iterator[str]:
     events = _list(why.get("events"))
     if not why:
         return
@@ -25,7 +24,7 @@ def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
         yield f"so: {part}"
 
 
-def _named(event: Mapping[str, Any]) -> str:
+def _named(event: Mapping[str, object]) -> str:
     index = f" #{event['index']}" if "index" in event else ""
     seq = f" seq {event['seq']}" if "seq" in event else ""
     who = "".join(
@@ -37,5 +36,5 @@ def _named(event: Mapping[str, Any]) -> str:
     return f"{event.get('event')}{index} at {event.get('time')}{who}{seq}{state}"
 
 
-def _list(value: object) -> list[Any]:
+def _list(value: object) -> list[object]:
     return value if isinstance(value, list) else []

@@ -10,7 +10,9 @@ live values.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
+
+from rosmop.types.value_types import Value
 
 BUDGET = 1_000_000
 
@@ -71,6 +73,9 @@ class Published(NamedTuple):
     is_call: bool = False
 
 
+_T = TypeVar("_T")
+
+
 @dataclass(slots=True)
 class ActionState:
     """The state that all actions of one message or tick share."""
@@ -81,7 +86,7 @@ class ActionState:
     """Returns host and caller of a source (`MessageSender.source`)."""
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
-    looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
+    looked: dict[int, tuple[Value, ...]] = field(default_factory=dict)
     reset: bool = False  # set by `__RESET;` for the property whose handlers run
     clock: Callable[[], float] | None = None  # returns seconds of processor time; None: unlimited
     seconds: float = inf
@@ -111,7 +116,7 @@ class ActionState:
             " a message that took longer, the next ones have a tenth)"
         )
 
-    def exclude(self, make: Callable[[], Any]) -> Any:
+    def exclude(self, make: Callable[[], _T]) -> _T:
         if self.clock is None:
             return make()
         began = self.clock()

@@ -10,7 +10,7 @@ from rosmop.runtime import vectors, wire
 from rosmop.runtime.action_context import Context
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
-from rosmop.types.value_types import Type
+from rosmop.types.value_types import Type, Value
 
 _CODES = {
     (True, 8): "b",
@@ -156,7 +156,7 @@ class ValueCodec:
         if not isinstance(kind, value_types.RecordType):
             numbers = unpacker([struct_code(kind) or ""])
 
-            def number(buffer: wire.Buffer, start: int) -> tuple[Any, int]:
+            def number(buffer: wire.Buffer, start: int) -> tuple[float, int]:
                 (value,), end = numbers(buffer, start)
                 return value, end
 
@@ -168,7 +168,7 @@ class ValueCodec:
             for fixed, run in self._runs(kind)
         ]
 
-        def record(buffer: wire.Buffer, start: int) -> tuple[list[Any], int]:
+        def record(buffer: wire.Buffer, start: int) -> tuple[list[Value], int]:
             values: list[Any] = []
             for several, decode in parts:
                 found, start = decode(buffer, start)
@@ -262,13 +262,13 @@ def zero_of(kind: Type) -> bool | float | bytes | None:
     return b"" if isinstance(kind, value_types.StringType | value_types.CharactersType) else None
 
 
-def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
+def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[float], int]]:
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
         return lambda buffer, start: (unpack(buffer, start), start + size)
 
-    def numbers(buffer: wire.Buffer, start: int) -> tuple[Sequence[Any], int]:
+    def numbers(buffer: wire.Buffer, start: int) -> tuple[Sequence[float], int]:
         parts = iter(unpack(buffer, start))
         return [
             next(parts) * BILLION + next(parts) if len(code) == 2 else next(parts) for code in codes
@@ -277,13 +277,13 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
     return numbers
 
 
-def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
+def packer(codes: Sequence[str]) -> Callable[[Sequence[float]], bytes]:
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)
 
-    def packed(values: Sequence[Any]) -> bytes:
-        parts: list[Any] = []
+    def packed(values: Sequence[float]) -> bytes:
+        parts: list[float] = []
         for code, value in zip(codes, values, strict=True):
             parts += divmod(value, BILLION) if len(code) == 2 else (value,)
         return pack(*parts)

@@ -4,36 +4,39 @@
 """
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
+from rosmop.types.value_types import Value
 from roswire.counted import counted
 
-Values = list[Any]
+Values = list[Value]
+_T = TypeVar("_T")
+_Bytes = TypeVar("_Bytes", int, bool)
 
 LARGE = 1024  # bytes; reading a smaller value is not charged
 
 
-def element(values: Values, index: int, site: int) -> Any:
+def element(values: list[_T], index: int, site: int) -> _T:
     if 0 <= index < len(values):
         return values[index]
     raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
 
 
-def put(values: Values, index: int, value: Any, site: int) -> Any:
+def put(values: list[_T], index: int, value: _T, site: int) -> _T:
     if 0 <= index < len(values):
         values[index] = value
         return value
     raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
 
 
-def put_slot(record: Values, slot: int, value: Any) -> Any:
+def put_slot(record: list[_T], slot: int, value: _T) -> _T:
     record[slot] = value
     return value
 
 
-def append(context: Context, values: Values, value: Any, width: int, site: int) -> None:
+def append(context: Context, values: list[_T], value: _T, width: int, site: int) -> None:
     context.allocate(width, site)
     values.append(value)
 
@@ -50,12 +53,12 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
     return values
 
 
-def same(left: Any, right: Any) -> bool:
+def same(left: object, right: object) -> bool:
     """Whether two values are equal as in C++, where NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 
-def _numbers(value: Any) -> bool:
+def _numbers(value: object) -> bool:
     return all(map(_numbers, value)) if isinstance(value, list) else value == value  # noqa: PLR0124  NaN
 
 
@@ -70,40 +73,46 @@ def copied(context: Context, values: Values, width: int, site: int) -> Values:
     return values.copy()
 
 
-def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
+def copied_deep(
+    context: Context, values: Values, width: int, copy: Callable[[Context, Value, int], Value], site: int
+) -> Values:
     context.allocate(len(values) * width, site)
     return [copy(context, value, site) for value in values]
 
 
-def recast(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
+def recast(
+    context: Context, values: list[_T], convert: Callable[[list[_T]], list[_Bytes]], site: int
+) -> list[_Bytes]:
     context.allocate(len(values), site)
     return convert(values)
 
 
-def recast_each(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
+def recast_each(
+    context: Context, values: list[_T], convert: Callable[[_T], Values], site: int
+) -> list[Values]:
     context.allocate(len(values), site)
     return [convert(value) for value in values]
 
 
-def signed(values: Values) -> Values:
+def signed(values: list[int]) -> list[int]:
     return memoryview(bytes(values)).cast("b").tolist()
 
 
-def unsigned(values: Values) -> Values:
+def unsigned(values: list[int]) -> list[int]:
     return [value & 0xFF for value in values]
 
 
-def truths(values: Values) -> Values:
+def truths(values: Values) -> list[bool]:
     return list(map(bool, values))
 
 
-def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
+def filled(context: Context, count: int, make: Callable[[], Value], width: int, site: int) -> Values:
     context.allocate(count * width, site)
     context.spend(count // 4, site)
     return _made(context, count, make)
 
 
-def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
+def _made(context: Context, count: int, make: Callable[[], Value]) -> Values:
     values: Values = []
     for first in range(0, count, PART):
         context.turn.check()
@@ -112,7 +121,7 @@ def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
 
 
 def resized(  # noqa: PLR0917  the arguments are C++'s
-    context: Context, values: Values, count: int, make: Callable[[], Any], width: int, site: int
+    context: Context, values: Values, count: int, make: Callable[[], Value], width: int, site: int
 ) -> None:
     more = count - len(values)
     if more <= 0:
@@ -129,9 +138,9 @@ def assigned(values: Values, others: Values) -> Values:
 def filled_with(  # noqa: PLR0917  the arguments are C++'s
     context: Context,
     count: int,
-    value: Any,
-    copy: Callable[[Any], Any],
-    measure: Callable[[Any], int],
+    value: _T,
+    copy: Callable[[_T], Value],
+    measure: Callable[[_T], int],
     site: int,
 ) -> Values:
     context.allocate(count * max(measure(value), 1), site)
@@ -145,7 +154,7 @@ def fixed(values: Values, count: int, site: int) -> Values:
     return values
 
 
-def _check_span(values: Values, first: int, last: int, site: int) -> None:
+def _check_span(values: Sequence[object], first: int, last: int, site: int) -> None:
     if not 0 <= first <= last <= len(values):
         raise FaultError(site, f"from {first} to {last} is not within a vector of {len(values)}")
 
@@ -157,14 +166,14 @@ def erase(context: Context, values: Values, first: int, last: int | None, site: 
     del values[first:last]
 
 
-def insert(context: Context, values: Values, at: int, value: Any, width: int, site: int) -> None:  # noqa: PLR0917  the arguments are C++'s
+def insert(context: Context, values: list[_T], at: int, value: _T, width: int, site: int) -> None:  # noqa: PLR0917  the arguments are C++'s
     _check_span(values, at, len(values), site)
     context.allocate(width, site)
     context.spend(len(values) // 64, site)
     values.insert(at, value)
 
 
-def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
+def sort(context: Context, values: list[Any], first: int, last: int, site: int) -> None:
     _check_span(values, first, last, site)
     steps = (last - first).bit_length()
     context.spend((last - first) * steps, site)
@@ -179,7 +188,7 @@ def reverse(context: Context, values: Values, first: int, last: int, site: int) 
     values[first:last] = values[first:last][::-1]
 
 
-def nearest(context: Context, values: Values, first: int, last: int, site: int) -> float:
+def nearest(context: Context, values: list[float], first: int, last: int, site: int) -> float:
     """Return the smallest number from `first` to before `last`, or infinity; NaN is ignored.
 
     If `first` is after `last`, the range continues at the beginning.
@@ -200,9 +209,9 @@ def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
     first: int,
     last: int,
     site: int,
-    start: Any,
-    add: Callable[[Any, Any], Any],
-) -> Any:
+    start: _T,
+    add: Callable[[_T, Value], _T],
+) -> _T:
     _check_span(values, first, last, site)
     context.spend(last - first, site)
     for index in range(first, last):

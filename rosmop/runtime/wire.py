@@ -5,14 +5,16 @@ Positions count from the start of `buffer`. Reading past the end raises `Malform
 
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from rosmop.form.nodes import SafeMessage
 from rosmop.runtime.action_context import PART, Context, MalformedError
 from rosmop.runtime.safe_messages import HEAD, sent
 from rosmop.runtime.times import with_part
+from rosmop.types.value_types import Value
 from roswire.counted import counted
 
+_T = TypeVar("_T")
 Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
@@ -65,9 +67,9 @@ def elements(
     buffer: Buffer,
     start: int,
     number: int,
-    decode: Callable[[Buffer, int], tuple[Any, int]],
+    decode: Callable[[Buffer, int], tuple[_T, int]],
     check: Callable[[], None],
-) -> tuple[list[Any], int]:
+) -> tuple[list[_T], int]:
     if number > _MAX_DECODED:
         raise MalformedError(
             f"an array of {counted(number, 'element')}; at most {_MAX_DECODED} that are not numbers are read"
@@ -111,7 +113,7 @@ def put_text(value: bytes, out: bytearray) -> None:
     out += value
 
 
-def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
+def put_numbers(values: list[float], code: str, out: bytearray) -> None:
     out += struct.pack(f"<{len(values)}{code}", *values)
 
 
@@ -236,7 +238,7 @@ def whole(
     message: WireMessage,
     context: Context,
     decode: Callable[[Buffer, int], tuple[Any, int]],
-    pending: tuple[tuple[bool, tuple[int | str, ...], Any], ...],
+    pending: tuple[tuple[bool, tuple[int | str, ...], Value], ...],
     site: int,
 ) -> list[Any]:
     """Return the decoded message, with the fields that the action assigned: `pending` has (assigned, path, value)."""

@@ -5,7 +5,7 @@ The exit status is 3 if one of several recordings failed. If the only recording 
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +82,7 @@ class BatchSession:
             rows.append({"kind": "recording", "bag": uri, "error": failure.text})
         return rows
 
-    def keep(self, rows: Iterable[dict[str, Any]]) -> None:
+    def keep(self, rows: Iterable[Mapping[str, object]]) -> None:
         if self.options.report is not None:
             lines = "".join(json.dumps(msgspec.to_builtins(row)) + "\n" for row in rows)
             self.kept.append(lines.encode("ascii"))

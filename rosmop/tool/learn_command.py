@@ -5,7 +5,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from rosmop.batch.jobs import Failure, LearnJob, Survey, SurveyJob, definitions_by_type
 from rosmop.batch.recording_list import RecordingName
@@ -111,7 +110,7 @@ def _pass_of(steps: Sequence[AnyStep]) -> str:
 def _show(
     program: CommandContext,
     learnt: LearningResult,
-    rows: Sequence[dict[str, Any]],
+    rows: Sequence[dict[str, object]],
     recorded: Definitions,
     out: Path | None,
     *,
@@ -132,7 +131,7 @@ def _show(
             say(f"alarms on the held-out part: {widened} widened, {len(learnt.left_out)} left out")
 
 
-def _rows(learnt: LearningResult) -> Iterator[dict[str, Any]]:
+def _rows(learnt: LearningResult) -> Iterator[dict[str, object]]:
     for result, candidates in (("kept", learnt.candidates), ("left out", learnt.left_out)):
         for candidate in candidates:
             yield {

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from rich.table import Column
 
@@ -33,7 +33,7 @@ class ReplayReport:
         self._recordings: list[_Line] = []
         self._closest: dict[tuple[Position, int, bool], tuple[ClosestMargin, str]] = {}
 
-    def add(self, recording: str, result: Replayed | Failure) -> list[dict[str, Any]]:
+    def add(self, recording: str, result: Replayed | Failure) -> list[dict[str, object]]:
         rows = self._printed(_rows(recording, result))
         self._recordings.append(_Line.of(recording, result))
         if isinstance(result, Failure):
@@ -50,7 +50,7 @@ class ReplayReport:
                 self._closest[key] = margin, recording
         return rows
 
-    def show(self, texts: Mapping[str, str]) -> list[dict[str, Any]]:
+    def show(self, texts: Mapping[str, str]) -> list[dict[str, object]]:
         closest = [row for _key, row in sorted(self._closest.items())]
         rows = self._printed(_margin_row(margin, recording) for margin, recording in closest)
         if self._as_json:
@@ -63,7 +63,7 @@ class ReplayReport:
         say(f"{counted(self.messages, 'message')} of {counted(len(self._recordings), 'recording')}")
         return rows
 
-    def _printed(self, rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _printed(self, rows: Iterable[dict[str, object]]) -> list[dict[str, object]]:
         printed = list(rows)
         for row in printed if self._as_json else ():
             say_json(row)
@@ -127,7 +127,7 @@ class _Line(NamedTuple):
         return cls(recording, result.messages, counts, first, last, "")
 
 
-def _rows(recording: str, result: Replayed | Failure) -> Iterator[dict[str, Any]]:
+def _rows(recording: str, result: Replayed | Failure) -> Iterator[dict[str, object]]:
     if isinstance(result, Failure):
         yield {"kind": "recording", "bag": recording, "error": result.text}
         return
@@ -147,7 +147,7 @@ def _rows(recording: str, result: Replayed | Failure) -> Iterator[dict[str, Any]
     }  # fmt: skip
 
 
-def _margin_row(margin: ClosestMargin, recording: str) -> dict[str, Any]:
+def _margin_row(margin: ClosestMargin, recording: str) -> dict[str, object]:
     return {
         "kind": "margin", "monitor": margin.monitor, "file": margin.file, "line": margin.line, "column": margin.column,
         "holds": margin.holds, "distance": margin.distance, "left": margin.left, "right": margin.right,

@@ -8,7 +8,6 @@ import json
 import os
 import sys
 from collections.abc import Iterable
-from typing import Any
 
 import msgspec
 import typer
@@ -37,7 +36,7 @@ def say(line: str, style: str = "") -> None:
     sys.stdout.write(shown + "\n")
 
 
-def say_json(fields: Any) -> None:
+def say_json(fields: object) -> None:
     sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")
 
 
