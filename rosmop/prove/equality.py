@@ -39,7 +39,7 @@ from rosmop.prove.concrete_runs import (
     EventState,
 )
 from rosmop.prove.decoding import functions_of
-from rosmop.prove.form_terms import FormTerms, wrapped
+from rosmop.prove.form_terms import FormResult, FormTerms, wrapped
 from rosmop.prove.loops import BUDGET_SLOT, assumed, loop_conditions
 from rosmop.prove.model_states import state_of
 from rosmop.prove.module_terms import LoopGuess, ModuleExecution, ModuleResult, Pointer, ReadableBytes
@@ -51,7 +51,6 @@ from rosmop.prove.terms import (
     SECONDS,
     SINGLE,
     DiffersError,
-    FormResult,
     LineTerm,
     Model,
     NotProvedError,

@@ -30,7 +30,6 @@ from rosmop.prove.terms import (
     NEAREST,
     SECONDS,
     SINGLE,
-    FormResult,
     LineTerm,
     Mixed,
     NotProvedError,
@@ -70,6 +69,28 @@ class _View:
 
 Value = Term | TextTerm | _View | Mixed | None
 """The value of an expression; that of a procedure's call is None."""
+
+
+@dataclass(frozen=True)
+class FormResult:
+    """The result of an event, valid unless `left` (the condition of a fault) or one of `unknown` (by reason) holds.
+
+    The lines of output are `noted`, and take `said` bytes.
+    """
+
+    left: Term
+    unknown: Mapping[str, Term]
+    happened: Term
+    dropped: Term
+    replaced: Term
+    changed: Term
+    message: Term
+    variables: Mapping[str, object]
+    budgets: Mapping[str, Term]
+    said: Term
+    noted: Sequence[LineTerm]
+    loops: Loops
+
 
 _LONG = value_types.IntegerType(64, True, "long")
 

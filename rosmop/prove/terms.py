@@ -7,13 +7,9 @@ extended by their sign or by zeros. There is only one NaN, and its bits cannot b
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, TypeVar, overload
+from typing import TypeVar, overload
 
 import z3
-
-if TYPE_CHECKING:
-    from rosmop.prove.loops import Loops
-
 
 Term = z3.ExprRef
 Sort = z3.SortRef
@@ -200,27 +196,6 @@ class LineTerm:
     alive: Term
     offset: Term
     allowed: Sequence[Term]
-
-
-@dataclass(frozen=True)
-class FormResult:
-    """The result of an event, valid unless `left` (the condition of a fault) or one of `unknown` (by reason) holds.
-
-    The lines of output are `noted`, and take `said` bytes.
-    """
-
-    left: Term
-    unknown: Mapping[str, Term]
-    happened: Term
-    dropped: Term
-    replaced: Term
-    changed: Term
-    message: Term
-    variables: Mapping[str, object]
-    budgets: Mapping[str, Term]
-    said: Term
-    noted: Sequence[LineTerm]
-    loops: "Loops"
 
 
 _SMALL = 1 << 10
