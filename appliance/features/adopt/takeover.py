@@ -29,6 +29,7 @@ publisher changes nothing; only a list without it removes it.
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -171,6 +172,8 @@ class AdoptOperation:
             return await self.take()
         if not wanted and phase is not Phase.FREE:
             return await self.give()
+        if wanted:
+            await self._take_missing(facts)
         return None
 
     # --- taking over ---
@@ -194,8 +197,12 @@ class AdoptOperation:
 
     async def release(self) -> GiveBackReport:
         """Give the graph back by an order, for good. Raises `AdoptError`; `settle` then tries again."""
+        facts = await self.facts()
+        if facts.record.phase is Phase.TAKEN:
+            with suppress(AdoptError):
+                await self._take_missing(facts)  # so that they get their lists with the others
         await self.machine("want", wanted=False)
-        if (await self.facts()).record.phase is Phase.FREE:
+        if facts.record.phase is Phase.FREE:
             return GiveBackReport()
         self._who = OPERATOR
         try:
@@ -320,6 +327,34 @@ class AdoptOperation:
         until = clock.now() + _LISTS_SECONDS
         while self.waiting() and clock.now() < until:
             await asyncio.sleep(_PAUSE_SECONDS)
+
+    async def _take_missing(self, facts: MachineFacts) -> None:
+        """Take nodes over that did not answer before, for example because they hung. Raises `AdoptError`.
+
+        A name that RVMaster has by now belongs to a later node.
+        """
+        missing = {name for name in self.left.nodes if self.graph.registry.occupant(name) is None}
+        if not missing or facts.master is None or facts.foreign_master:
+            return
+        before = self.left.nodes
+        graph, places = await self._read(facts)
+        late = Places({name: place for name, place in places.found.items() if name in missing})
+        self.left.nodes = {
+            name: places.missing.get(name, why)
+            for name, why in before.items()
+            if name in graph.nodes and name not in late.found
+        }
+        if not late.found:
+            return
+        entries = frozenset(entry for entry in graph.entries if entry[2] in late.found)
+        own = MasterGraph(entries, graph.types, graph.nodes, graph.services)
+        await self._register(own, late, MasterGraph())
+        cuts = await self._cuts(own, late)
+        await self._connect(graph, late)
+        await self._tell(late)
+        await self.machine("cut", **cuts)
+        await self._tell(late)
+        await self.passed("missing nodes")
 
     async def _connect(self, graph: MasterGraph, places: Places) -> None:
         """Have the nodes connect through the appliance; until that stands, they keep their earlier connections."""

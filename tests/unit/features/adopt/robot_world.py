@@ -29,6 +29,7 @@ from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts, Told
 
 LINK = "10.111.0.1"
+_NODE_SECONDS = 2.0
 _KINDS = {"Publisher": "publication", "Subscriber": "subscription", "Service": "service"}
 
 
@@ -51,6 +52,9 @@ class RobotNode:
     """All lists that came by calls of the operation."""
     fails: int = 0
     """Lists after which the node does not connect, because its call to a publisher fails."""
+    hangs: bool = False
+    held: list[tuple[str, list[str]]] = field(default_factory=list)
+    """The lists that wait for a node that hangs: its kernel has taken them."""
     slow: bool = False
     """It is still connecting when the next list comes."""
     links: dict[str, dict[str, bool]] = field(default_factory=dict)
@@ -300,6 +304,11 @@ class RobotWorld:
         node = next((one for one in self.robot.values() if one.alive and one.port == uri.port), None)
         if node is None or ipaddress.ip_address(uri.host).is_loopback:
             raise CallFailedError(f"{uri.host}:{uri.port} refuses")
+        if node.hangs:
+            if method == "publisherUpdate":
+                self.give_list(node, str(params[0]), _texts(params[1]))
+            await asyncio.sleep(_NODE_SECONDS)
+            raise CallFailedError(f"{uri.host}:{uri.port} does not answer")
         if method == "requestTopic":
             return [1, "", ["TCPROS", "base", uri.port + 1000]]
         if method == "publisherUpdate":
@@ -313,6 +322,9 @@ class RobotWorld:
         return [1, "", node.port]
 
     def give_list(self, node: RobotNode, topic: str, uris: list[str]) -> None:
+        if node.hangs:
+            node.held.append((topic, uris))
+            return
         node.lists[topic] = uris
         node.take_list(topic, uris)
         if not node.slow:
@@ -339,12 +351,12 @@ class RobotWorld:
                 links.update(dict.fromkeys(filter(ends, links), False))
 
     def _waiting(self) -> int:
-        self._hear()
+        self.hear()
         return 0
 
     async def _passed(self, step: str) -> None:
         await self.parts.settle()
-        self._hear()
+        self.hear()
         self.steps.append(step)
         self.kept_left = copy.deepcopy(self.operation.left)
         self.kept_unasked = {*self.parts.subscribers.unasked}
@@ -354,13 +366,13 @@ class RobotWorld:
             raise KilledError
 
     def _silence(self) -> None:
-        self._hear()
+        self.hear()
         self.silent = True
 
     def _speak(self) -> None:
         self.silent = False
 
-    def _hear(self) -> None:
+    def hear(self) -> None:
         """Give the nodes the lists that control has sent; a silent control sends none."""
         for seen in self.parts.seen:
             if isinstance(seen, Told) and seen.call.method == "publisherUpdate" and not self.silent:
