@@ -158,8 +158,13 @@ def test_every_operation_of_rest_is_on_its_page() -> None:
 
 @cache
 def options_of_verbs() -> dict[str, set[str]]:
+    """Return the options in the help of each verb: a former name is not one for a page."""
     return {
-        name: {one for each in verb.params for one in (*each.opts, "--help")} for name, verb in commands()
+        name: {
+            "--help",
+            *(one for each in verb.params if not getattr(each, "hidden", False) for one in each.opts),
+        }
+        for name, verb in commands()
     }
 
 
@@ -200,13 +205,14 @@ OTHERS = {
 
 
 def test_options_that_pages_name_alone_exist() -> None:
-    options = {
-        one for _, verb in commands() for each in verb.params for one in (*each.opts, *each.secondary_opts)
-    }
+    options = set().union(*options_of_verbs().values())
     for program in (fleet_app, rosmop_app):
         for _, command, context in command_line_page.commands(("",), program):
             options |= {
-                one for each in command.get_params(context) for one in (*each.opts, *each.secondary_opts)
+                one
+                for each in command.get_params(context)
+                if not getattr(each, "hidden", False)
+                for one in (*each.opts, *each.secondary_opts)
             }
     named = {name for page in WITH_LINKS[:-1] for name in re.findall(r"`(--[a-z][a-z-]*)", page.read_text())}
     folders = ("appliance/features/standby", "benchmarks", "tests/support", "tests/world")
@@ -263,6 +269,44 @@ def test_the_quickstart_is_quick() -> None:
     words = re.sub(r"<!--.*?-->|^```.*$", "", text, flags=re.MULTILINE).split()
     denied = [step for step in steps("quickstart.md") if step.how == "fails"]
     assert (text.count("\n## "), len(denied), len(words) <= 250) == (5, 1, True), len(words)
+
+
+def test_a_robot_is_protected_with_six_pages_and_eight_verbs() -> None:
+    """The way of a newcomer: from README by each page's first link after *Next*, with the commands on the way."""
+    parts = {"quickstart.md": "", "guards.md": "## Three minutes", "close-the-ports.md": "# Close the ports"}
+    page, seen, verbs = ROOT / "README.md", ["README.md", "install.md"], set[str]()
+    options = options_of_verbs()
+    following = "docs/quickstart.md"
+    while following.rpartition("/")[2] in parts:
+        page = page.parent / following
+        seen.append(page.name)
+        text = page.read_text()
+        part = text.partition(parts[page.name])[2].partition("\n## ")[0] if parts[page.name] else text
+        calls = re.findall(r"(?:^|\$ |sudo )rosrv ([a-z][^\n`|]*)", part, re.MULTILINE)
+        verbs |= {
+            max((one for one in options if f"{call} ".startswith(f"{one} ")), key=len) for call in calls
+        }
+        following = re.findall(r"^\*\*Next\*\*.*?\]\(([^)#]+)", text, re.MULTILINE)[0]
+    assert f"({following})" in text
+    assert seen == ["README.md", "install.md", *parts]
+    assert verbs == {
+        "status", "audit search", "policy grant", "guard suggest", "guard new", "guard enforce", "monitor confirm",
+        "protect",
+    }  # fmt: skip
+
+
+def test_the_changelog_has_no_fact_twice() -> None:
+    """Two bullets with mostly the same words are one fact, as after a merge."""
+    release = (ROOT / "CHANGELOG.md").read_text().partition("## [Unreleased]")[2].partition("\n## [")[0]
+    bullets = [" ".join(one.split()) for one in re.findall(r"^- (.*(?:\n  .*)*)", release, re.MULTILINE)]
+    words = [frozenset(re.findall(r"[\w.-]+", re.sub(r"\]\([^)]*\)", "]", one.lower()))) for one in bullets]
+    twice = [
+        (bullets[first], bullets[second])
+        for first in range(len(words))
+        for second in range(first)
+        if len(words[first] & words[second]) > 0.6 * len(words[first] | words[second])
+    ]
+    assert twice == []
 
 
 def test_the_first_hour_does_not_use_the_state_of_the_service() -> None:
