@@ -5,7 +5,7 @@
    one after the system clock has been ahead for `_STANDS` of running time: then the smallest gap seen in that
    time. A system clock that is behind adds nothing until someone corrects it.
 3. The state is saved every `_SAVE`; time since the last save counts as time off.
-4. Data that was dated while a long gap did not count yet is as old as it is: `dated` adds that gap to its date.
+4. When a long gap is added later, `dated` also adds it to the dates of data that was made in between.
 """
 
 from collections.abc import Callable

@@ -11,7 +11,7 @@ _SMALL = 64 << 10
 
 
 def write_over(name: str, folder: int) -> bool:
-    """Overwrite a small regular file with one name; return False for any other. Raises `OSError`."""
+    """Overwrite a small regular file without further hard links; return False for any other. Raises `OSError`."""
     found = os.stat(name, dir_fd=folder, follow_symlinks=False)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= _SMALL:
         return False

@@ -125,7 +125,7 @@ def conditions(wanted: Filter) -> list[Condition]:
 def counted_conditions(wanted: Filter) -> list[Condition]:
     """Return the conditions of summaries that may count a wanted name; empty if the filter has no such name.
 
-    A summary of several hosts, callers or resources lacks that field, and counts the names in its details.
+    A summary of several hosts has no field `host`, and counts them in its details; likewise for callers and resources.
     """
     names = {"host": wanted.host, "caller_id": wanted.caller_id, "resource": wanted.resource}
     found = [

@@ -1,6 +1,6 @@
 """Keep the last result of `rosrv audit verify` beside the log, for reports that do not verify it themselves.
 
-The file proves nothing: who can change the log's folder can change it. A report says so.
+The file proves nothing, because any program that can change the log's folder can change it. A report says so.
 """
 
 import contextlib

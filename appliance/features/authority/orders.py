@@ -142,7 +142,7 @@ class DriveOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End each authority whose lease has expired, all of them before the first wait for a relay."""
+        """Free each group whose holder was silent for too long; all of them before the first wait for a relay."""
         groups = self._held_groups()
         if gone := self._groups.forget_others(frozenset(groups)):
             self._decide_again()

@@ -40,7 +40,7 @@ class TimeBudget:
 
 
 class TimeBudgets:
-    """The budgets of all points; hosts whose `payer` is a common one share a budget."""
+    """The budgets of all publications and clients; `payer(host)` is another text for a host that shares a budget."""
 
     def __init__(self, payer: Callable[[str], str]) -> None:
         self._payer = payer
