@@ -116,10 +116,10 @@ class _RolloutMetrics(MetricSource):
         yield from (robots, state)
         yield GaugeMetricFamily(
             "rosrv_fleet_rollouts_up", "1 while bundles are published and rollouts advance",
-            service.advancing and not service.trouble,
+            service.advancing and not service.publisher.trouble,
         )  # fmt: skip
-        if service.publication is not None:
-            left = service.publication.expires.timestamp() - clock.wall()
+        if (expires := service.publisher.expires) is not None:
+            left = expires - clock.wall()
             yield GaugeMetricFamily(
                 "rosrv_fleet_metadata_expiry_seconds", "until the signed metadata expire", left
             )

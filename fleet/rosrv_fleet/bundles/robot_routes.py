@@ -100,16 +100,16 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
     @router.get(f"/{METADATA}/timestamp.json")
     async def timestamp(request: Request, _robot: caller) -> Response:
         """Return the newest timestamp."""
-        if service.timestamp is None:
-            raise HTTPException(404, service.trouble or "nothing is published")
-        return _tagged(request, service.timestamp, "application/json")
+        if service.publisher.timestamp is None:
+            raise HTTPException(404, service.publisher.trouble or "nothing is published")
+        return _tagged(request, service.publisher.timestamp, "application/json")
 
     @router.get(f"/{METADATA}/{{name}}")
     async def metadata(name: str, _robot: caller) -> Response:
         """Return a signed metadata file."""
         if _METADATA_NAME.fullmatch(name) is None:
             raise HTTPException(404, "there are no such metadata")
-        return await _file(service.folder / "metadata" / name, "application/json")
+        return await _file(service.publisher.folder / "metadata" / name, "application/json")
 
     @router.get(f"/{TARGETS}/{{site}}/{{group}}/{{name}}")
     async def target(site: str, group: str, name: str, robot: caller) -> Response:
@@ -117,7 +117,9 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
         place = groups.of(robot, site, group)
         if _TARGET_NAME.fullmatch(name) is None:
             raise HTTPException(404, "this bundle does not exist")
-        return await _file(service.folder / "targets" / place.site / place.group / name, "application/x-tar")
+        return await _file(
+            service.publisher.folder / "targets" / place.site / place.group / name, "application/x-tar"
+        )
 
     @router.get(f"/{SELECTION}/{{site}}/{{group}}")
     async def selection(request: Request, site: str, group: str, robot: caller) -> Response:

@@ -102,7 +102,11 @@ def robots_page(collector: Collector, asked: Mapping[str, str]) -> str:
     health = health_of(collector)
     rows = robot_rows(collector, health)
     shown = [one for one in rows if _wanted(one, asked)]
-    troubles = [health.trouble, health.disk, "" if collector.bundles is None else collector.bundles.trouble]
+    troubles = [
+        health.trouble,
+        health.disk,
+        "" if collector.bundles is None else collector.bundles.publisher.trouble,
+    ]
     return (
         "<h1>Robots</h1>"
         + "".join(alert(trouble) for trouble in troubles if trouble)

@@ -48,11 +48,12 @@ _MOST_HISTORY = 20
 
 def groups_page(service: BundleService) -> str:
     groups = sorted({*service.rollouts, *service.robots})
-    trouble = alert(service.trouble) if service.trouble else ""
+    publisher = service.publisher
+    trouble = alert(publisher.trouble) if publisher.trouble else ""
     if not service.advancing:
         trouble += alert("No rollout advances; the collector's log has the reason.")
     empty = "No robot is in a group: rosrv-fleet robot group NAME SITE/GROUP"
-    expires = "" if service.publication is None else _expires(service.publication.expires.timestamp())
+    expires = "" if publisher.expires is None else _expires(publisher.expires)
     return f"<h1>Rollouts</h1>{trouble}{expires}" + table(
         "Groups", _GROUPS, (_group(group_state(service, group)) for group in groups), empty
     )

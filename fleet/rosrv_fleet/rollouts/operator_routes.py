@@ -56,9 +56,9 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
         """Return the published bundles, and the last rollout and the robots of each group."""
         groups = sorted({*service.rollouts, *service.robots})
         return {
-            "trouble": service.trouble,
-            "expires": None if service.publication is None else service.publication.expires.timestamp(),
-            "published": sorted(() if service.publication is None else service.publication.bundles),
+            "trouble": service.publisher.trouble,
+            "expires": service.publisher.expires,
+            "published": sorted(service.publisher.bundles),
             "groups": [group_state(service, group) for group in groups],
         }
 

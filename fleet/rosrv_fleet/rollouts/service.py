@@ -5,7 +5,6 @@ collector or the database was down counts neither as silence nor as health of ro
 """
 
 import asyncio
-import datetime
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,23 +12,16 @@ from typing import Literal
 
 import msgspec
 import structlog
-from tuf.api.metadata import Metadata
 
 from appliance.base import clock
 from appliance.formats.bundle_api import RobotReport
 from appliance.formats.terms import BundlePath, TermsError
-from rosrv_fleet.bundles.keys import KeyFileError, load_online_key
-from rosrv_fleet.bundles.publication import (
-    PublicationError,
-    PublishedBundles,
-    next_timestamp,
-    read_publication,
-)
 from rosrv_fleet.enrolment import EnrolmentError, RobotGroup
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.rollouts import machine
 from rosrv_fleet.rollouts.conditions import RobotCondition, conditions
 from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, OperatorAct, RobotSeen
+from rosrv_fleet.rollouts.publisher import BundlePublisher
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
 
 _log = structlog.get_logger()
@@ -39,7 +31,6 @@ _DEAF_SECONDS = 60.0  # robots report every 30 s
 _CLOCK_SECONDS = 60.0  # by which the clocks of the operator and the collector may differ
 _MOST_COUNTED = 1_000_000_000
 _MOST_ATTEMPTS = 10  # to apply an operator's order to a rollout that ticks change at the same time
-_Stamp = tuple[tuple[str, int, int], ...]
 
 
 Members = Callable[[], Mapping[str, RobotGroup]]
@@ -77,20 +68,15 @@ class BundleService:
         *,
         off: Callable[[], Collection[str]] = frozenset,
     ) -> None:
-        self.folder = folder
         self.store = store
-        self._key = key
+        self.publisher = BundlePublisher(folder, key, store, clock)
         self._members = members
         self._clock = clock
         self._off = off
         self._ticked = 0.0  # the time of the last tick that reached the database
         self._deaf = (0.0, 0.0)  # the beginning of the last time in which no robot was heard, and its seconds
-        self.publication: PublishedBundles | None = None
-        self.trouble = "the publication is not read yet"
-        self.timestamp: bytes | None = None
         self.robots: dict[RobotGroup, dict[str, RobotSeen]] = {}
         self.rollouts: dict[RobotGroup, StoredRollout] = {}
-        self._stamp: _Stamp | None = None
         self._ticking = asyncio.Lock()
         self._arrived: dict[str, StoredReport] = {}  # stored since the last tick began to read them
         self.listeners: set[SelectionListener] = set()
@@ -111,7 +97,7 @@ class BundleService:
         Ticks exclude each other: an older one would otherwise overwrite the state that a newer one has read.
         """
         async with self._ticking:
-            await self._publish()
+            await self.publisher.renew()
             members = await asyncio.to_thread(self._members)
             self._arrived.clear()
             reports = await asyncio.to_thread(self.store.reports)
@@ -135,7 +121,7 @@ class BundleService:
         if stored is None:
             return ""
         chosen = machine.selected(stored.rollout, robot, self.robots.get(group, {}).get(robot))
-        return chosen if chosen in self._signed() else ""
+        return chosen if chosen in self.publisher.bundles else ""
 
     async def report(self, robot: str, group: RobotGroup, report: RobotReport) -> None:
         seen = _checked(report, self._clock())
@@ -172,9 +158,11 @@ class BundleService:
 
     async def start(self, path: BundlePath, gates: HealthGates, who: str) -> StoredRollout:
         group = self.group(path.site, path.group)
-        terms = None if self.publication is None else self.publication.bundles.get(str(path))
+        terms = self.publisher.bundles.get(str(path))
         if terms is None:
-            signed = [name for name in self._signed() if name.startswith(f"{path.site}/{path.group}/")]
+            signed = [
+                name for name in self.publisher.bundles if name.startswith(f"{path.site}/{path.group}/")
+            ]
             raise RolloutRefusedError(f"{path} is not published; there are: {', '.join(signed) or 'none'}")
         last = (await asyncio.to_thread(self.store.latest)).get(group)
         before = "" if last is None else _in_force_after(last.rollout)
@@ -194,7 +182,7 @@ class BundleService:
             gates,
             now,
             acts=[OperatorAct(now, who, "start")],
-            kept=sorted(kept.intersection(self._signed())),
+            kept=sorted(kept.intersection(self.publisher.bundles)),
         )
         members = await asyncio.to_thread(self._members)
         fault = machine.fault_of_rings(rollout, {one for one, own in members.items() if own == group})
@@ -220,7 +208,7 @@ class BundleService:
                 raise RolloutRefusedError(
                     "there was no bundle before: add one with the former content, and roll it out"
                 )
-            if rollout.before not in self._signed():
+            if rollout.before not in self.publisher.bundles:
                 raise RolloutRefusedError(
                     f"{rollout.before} is withdrawn: add a bundle with its content, and roll that out"
                 )
@@ -287,9 +275,6 @@ class BundleService:
         for group, stored in list(self.rollouts.items()):
             await self._save(group, stored, machine.resumed(stored.rollout, now - heard), now)
 
-    def _signed(self) -> Mapping[str, object]:
-        return {} if self.publication is None else self.publication.bundles
-
     async def _change(
         self, group: RobotGroup, change: Callable[[BundleRollout], BundleRollout], number: int | None
     ) -> StoredRollout:
@@ -314,34 +299,11 @@ class BundleService:
                 return self.rollouts[group]
         raise RolloutRefusedError("the rollout has changed in the meantime: look at it, and try again")
 
-    async def _publish(self) -> None:
-        try:
-            stamp = await asyncio.to_thread(_stamp, self.folder)
-            if stamp != self._stamp or self.publication is None:
-                self.publication = await asyncio.to_thread(read_publication, self.folder)
-                self._stamp = stamp
-            last = await asyncio.to_thread(self.store.timestamp)
-            now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
-            made = next_timestamp(self.publication, last, load_online_key(self._key), now)
-        except (PublicationError, KeyFileError, OSError) as error:
-            if self.trouble != str(error):
-                _log.error("bundles cannot be published", reason=str(error))
-            self.trouble = str(error)
-            return
-        if made is not None:
-            await asyncio.to_thread(self.store.save_timestamp, Metadata.from_bytes(made).signed.version, made)
-            last = await asyncio.to_thread(self.store.timestamp)
-        self.timestamp, self.trouble = last, ""
-        if self.publication.expires <= now:
-            self.trouble = (
-                f"the signed metadata expired at {self.publication.expires:%Y-%m-%d %H:%M} UTC, so robots take nothing:"
-                " rosrv-fleet bundle sign, then bundle publish"
-            )
-
     async def _advance(self) -> None:
         now = self._clock()
         for group, stored in list(self.rollouts.items()):
-            if self.publication is not None and stored.rollout.path not in self.publication.bundles:
+            published = self.publisher.publication
+            if published is not None and stored.rollout.path not in published.bundles:
                 rollout = machine.stopped(stored.rollout, f"{stored.rollout.path} was withdrawn")
             else:
                 rollout = machine.advanced(stored.rollout, self._heard(group), now)
@@ -395,10 +357,3 @@ def _checked(report: RobotReport, now: float) -> RobotSeen:
 
 def _in_force_after(rollout: BundleRollout) -> str:
     return rollout.path if rollout.state == "done" else rollout.before
-
-
-def _stamp(folder: Path) -> _Stamp:
-    found = (
-        (path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in (folder / "metadata").iterdir()
-    )
-    return tuple(sorted(found))

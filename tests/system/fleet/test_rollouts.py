@@ -97,10 +97,10 @@ class Fleet:
 
     def start(self, path: BundlePath, **gates: Any) -> dict[str, Any]:
         def there() -> bool:
-            publication = self.collector.service.publication
+            publication = self.collector.service.publisher.publication
             return publication is not None and str(path) in publication.bundles
 
-        eventually(there, f"{path} is published: {self.collector.service.trouble}")
+        eventually(there, f"{path} is published: {self.collector.service.publisher.trouble}")
         answer = self.operator.post("/v1/rollouts", json={"bundle": str(path), "gates": QUICK | gates})
         assert answer.status_code == 200, answer.text
         return dict(answer.json())
@@ -145,7 +145,7 @@ def fleet(tmp_path: Path, database: str) -> Iterator[Fleet]:
 def test_a_rollout_reaches_all_robots_ring_by_ring(fleet: Fleet) -> None:
     fleet.add(54)
     path = fleet.publish(*RINGS)
-    eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
+    eventually(lambda: fleet.collector.service.publisher.timestamp is not None, "a timestamp")
     fleet.poll()
     fleet.start(path, share=1)
     fleet.poll(*list(fleet.robots)[2:])
@@ -159,7 +159,7 @@ def test_a_bad_canary_stops_the_rollout(fleet: Fleet) -> None:
     fleet.add(52)
     fleet.robots["r-0"].judge = lambda _bundle: "policy.ini:3:1: error: <script>"
     path = fleet.publish(*RINGS)
-    eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
+    eventually(lambda: fleet.collector.service.publisher.timestamp is not None, "a timestamp")
     fleet.poll()
     fleet.start(path)
     state = fleet.until(lambda state: state["state"] == "stopped")
@@ -176,7 +176,7 @@ def test_a_bad_canary_stops_the_rollout(fleet: Fleet) -> None:
 def test_denials_three_times_as_frequent_stop_the_rollout(fleet: Fleet) -> None:
     fleet.add(8)
     first = fleet.publish(Ring("all", [], 100))
-    eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
+    eventually(lambda: fleet.collector.service.publisher.timestamp is not None, "a timestamp")
     for robot in fleet.robots.values():
         robot.deny(5)
     fleet.poll()
@@ -211,7 +211,7 @@ def test_a_robot_speaks_for_itself_only(fleet: Fleet) -> None:
 def test_an_event_wakes_the_robot(fleet: Fleet) -> None:
     fleet.add(1)
     path = fleet.publish(Ring("all", [], 100))
-    eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
+    eventually(lambda: fleet.collector.service.publisher.timestamp is not None, "a timestamp")
     fleet.poll()
     woken = threading.Event()
     connection = fleet.site.connection(fleet.collector.url, "r-0")
@@ -244,8 +244,10 @@ def test_a_stream_ends_that_opens_while_the_collector_stops(fleet: Fleet) -> Non
 def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
     service = fleet.collector.service
     fleet.publish(Ring("all", [], 100))
-    eventually(lambda: service.timestamp is not None and not service.trouble, "a timestamp")
-    before = service.timestamp
+    eventually(
+        lambda: service.publisher.timestamp is not None and not service.publisher.trouble, "a timestamp"
+    )
+    before = service.publisher.timestamp
     hidden = fleet.folder / "hidden"
     fleet.publish(Ring("all", [], 100), policy_dot_ini="[Nodes]\n# other\n")
     archive = max(
@@ -253,9 +255,12 @@ def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
     )
     shutil.move(archive, hidden)
     fleet.site.repository.sign()
-    eventually(lambda: "publish it again" in service.trouble, lambda: service.trouble)
+    eventually(lambda: "publish it again" in service.publisher.trouble, lambda: service.publisher.trouble)
     shutil.move(hidden, archive)
-    eventually(lambda: not service.trouble and service.timestamp != before, lambda: service.trouble)
+    eventually(
+        lambda: not service.publisher.trouble and service.publisher.timestamp != before,
+        lambda: service.publisher.trouble,
+    )
 
 
 def _put(fleet: Fleet, name: str, **changes: Any) -> httpx.Response:
@@ -367,7 +372,7 @@ def test_a_restarted_collector_does_not_take_its_own_absence_for_silence(fleet: 
     with serving(made) as later:
         service = later.service
         stored = eventually(lambda: service.rollouts.get(RobotGroup(SITE, GROUP)), "the rollout is read")
-        eventually(lambda: service.timestamp is not None, "a timestamp")
+        eventually(lambda: service.publisher.timestamp is not None, "a timestamp")
         later.call(service.tick())
         stored = service.rollouts[RobotGroup(SITE, GROUP)]
         assert (stored.rollout.state, stored.rollout.ring) == ("running", 0)
@@ -419,7 +424,8 @@ def test_a_bundle_that_is_signed_in_the_future_does_not_start(fleet: Fleet) -> N
     path = fleet.site.repository.add(SITE, GROUP, bundle_files(), terms)
     service = fleet.collector.service
     eventually(
-        lambda: service.publication and str(path) in service.publication.bundles, lambda: service.trouble
+        lambda: service.publisher.publication and str(path) in service.publisher.publication.bundles,
+        lambda: service.publisher.trouble,
     )
     answer = fleet.operator.post("/v1/rollouts", json={"bundle": str(path)})
     assert answer.status_code == 409

@@ -208,7 +208,7 @@ def test_a_rollout_with_an_unknown_robot_does_not_start(
 ) -> None:
     service, path = _service(store, tmp_path, [1010.0]), "site-a/arms/3.tar"
     terms = Terms(0, [Ring("canary", ["r-0", "r-zero"]), Ring("rest", [], 100)])
-    service.publication = cast(PublishedBundles, SimpleNamespace(bundles={path: terms}))
+    service.publisher.publication = cast(PublishedBundles, SimpleNamespace(bundles={path: terms}))
     with pytest.raises(RolloutRefusedError, match="r-zero, not enrolled in site-a/arms"):
         _run(monkeypatch, _Calls(), service.start(BundlePath.parse(path), HealthGates(), "olga"))
     assert store.stored.rollout == _ROLLOUT
@@ -226,7 +226,7 @@ def test_the_next_rollout_moves_no_robot_of_a_later_ring_back(
     service = _service(store, tmp_path, [1010.0], ("r-0", "r-9"))
     terms = Terms(0, [Ring("canary", ["r-0"]), Ring("rest", [], 100)])
     paths = {f"site-a/arms/{version}.tar": terms for version in f"{signed}45"}
-    service.publication = cast(PublishedBundles, SimpleNamespace(bundles=paths))
+    service.publisher.publication = cast(PublishedBundles, SimpleNamespace(bundles=paths))
     store.seen["r-9"] = StoredReport(_GROUP, RobotSeen(1000.0, _PATH))
     store.change(state=end)
 
