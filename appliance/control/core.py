@@ -10,7 +10,6 @@
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Graph
@@ -60,9 +59,9 @@ class ControlPart:
     before an ordered end of the appliance.
     """
 
-    methods: tuple[RequestMethod[Any], ...] = ()
+    methods: tuple[RequestMethod[object], ...] = ()
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
-    status: Callable[[], Mapping[str, Any]] = dict
+    status: Callable[[], Mapping[str, object]] = dict
     close: Callable[[], Awaitable[None]] | None = None
 
 
@@ -71,15 +70,17 @@ class Links:
 
     def __init__(self, lifeline: ControlLifeline, received: Callable[[int], None]) -> None:
         self._lifeline = lifeline
-        self._links: dict[tuple[str, int], tuple[Link, Any, int]] = {}
+        self._links: dict[tuple[str, int], tuple[Link, object, int]] = {}
         self.received = received
         """Notes that another machine has all audit records up to a sequence."""
 
-    def attach(self, role: str, link: Link, accepted: Any, *, index: int = 0, longest: int = LONGEST) -> None:
+    def attach(
+        self, role: str, link: Link, accepted: object, *, index: int = 0, longest: int = LONGEST
+    ) -> None:
         """Attach control's end of the link to a process; `accepted` is the union of the messages it may send."""
         self._links[role, index] = link, accepted, longest
 
-    def of(self, role: str, index: int) -> tuple[Link, Any, int] | None:
+    def of(self, role: str, index: int) -> tuple[Link, object, int] | None:
         """Return what a feature attached, or None."""
         return self._links.get((role, index))
 
@@ -95,15 +96,15 @@ class Links:
 
     async def machine_work(self, feature: str, work: str, **terms: object) -> dict[str, object]:
         """Let the supervisor do work of a feature (`machine_side.py`). Raises `MachineWorkFailedError`."""
-        return await self._lifeline.machine_work(feature, work, **terms)
+        return await self._lifeline.questions.machine_work(feature, work, **terms)
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
         """Let the firewall reserve a network for control's own addresses; return the problem, or an empty string."""
-        return await self._lifeline.open_own_network(network, ports)
+        return await self._lifeline.questions.open_own_network(network, ports)
 
     async def endpoint(self) -> messages.EndpointFound:
         """Find the address at which hosts reach the appliance."""
-        return await self._lifeline.endpoint()
+        return await self._lifeline.questions.endpoint()
 
 
 class PolicyFacts:

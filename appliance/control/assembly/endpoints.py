@@ -121,7 +121,7 @@ def _make_addresses(base: Foundation) -> AdvertisedAddresses:
     settings = base.settings
     return AdvertisedAddresses(
         [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
-        base.lifeline.route_to if settings.isolation == "netns" else None,
+        base.lifeline.questions.route_to if settings.isolation == "netns" else None,
         base.sockets[RVMASTER].getsockname()[0],
         fixed=base.role.address,
         tunnels=settings.ipsec.pool,

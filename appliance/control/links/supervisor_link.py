@@ -7,7 +7,6 @@ import itertools
 import os
 import socket
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import structlog
 
@@ -19,7 +18,7 @@ from appliance.policy.model import Address
 
 ROUTES_AT_ONCE = 32  # the most open route queries; unknown hosts cause them, and the supervisor limits them
 
-Heard = Callable[[Any, tuple[int, ...]], None]
+Heard = Callable[[object, tuple[int, ...]], None]
 """A handler of the supervisor's messages and their descriptors."""
 
 Enclosed = Callable[[messages.TunnelsEnclosed], object]
@@ -46,6 +45,83 @@ class Surroundings:
         self.master = ""
 
 
+class SupervisorQuestions:
+    """Questions to the supervisor, each until its answer."""
+
+    def __init__(self, say: Callable[[messages.Message], None]) -> None:
+        self._say = say
+        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}
+        self._free_routes = asyncio.Semaphore(ROUTES_AT_ONCE)
+        self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
+        self._own_networks: list[asyncio.Future[str]] = []
+        self._machine_work: dict[int, asyncio.Future[messages.MachineWorkDone]] = {}
+        self._numbers = itertools.count(1)
+
+    async def route_to(self, host: str) -> str | None:
+        """Return the machine's address at which `host` reaches the appliance, or None if `host` already used it."""
+        if host not in self._routes:
+            await self._free_routes.acquire()
+            if host in self._routes:  # another call has sent the query in the meantime
+                self._free_routes.release()
+            else:
+                self._routes[host] = []
+                self._say(messages.RouteWanted(host))
+        future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
+        self._routes[host].append(future)
+        return await future
+
+    async def endpoint(self) -> messages.EndpointFound:
+        future: asyncio.Future[messages.EndpointFound] = asyncio.get_running_loop().create_future()
+        self._endpoints.append(future)
+        self._say(messages.EndpointWanted())
+        return await future
+
+    async def open_own_network(self, network: str, ports: list[int]) -> str:
+        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._own_networks.append(future)
+        self._say(messages.OwnNetworkWanted(network, ports))
+        return await future
+
+    async def machine_work(self, feature: str, work: str, **terms: object) -> dict[str, object]:
+        """Have the supervisor do a piece of a feature's work. Raises `MachineWorkFailedError` with its reason."""
+        number = next(self._numbers)
+        done: asyncio.Future[messages.MachineWorkDone] = asyncio.get_running_loop().create_future()
+        self._machine_work[number] = done
+        self._say(messages.MachineWorkWanted(number, feature, work, terms))
+        try:
+            answer = await done
+        finally:
+            self._machine_work.pop(number, None)
+        if answer.reason:
+            raise MachineWorkFailedError(answer.reason)
+        return answer.found
+
+    def answered(self, message: object) -> bool:
+        """Give an answer to those who wait for it; return False for a message that answers no question."""
+        match message:
+            case messages.MachineWorkDone(number):
+                if (asked := self._machine_work.get(number)) is not None and not asked.done():
+                    asked.set_result(message)
+            case messages.OwnNetworkOpened(reason):
+                if self._own_networks and not (waiter := self._own_networks.pop(0)).done():
+                    waiter.set_result(reason)
+            case messages.EndpointFound():
+                asked_for, self._endpoints = self._endpoints, []
+                for endpoint in asked_for:
+                    if not endpoint.done():
+                        endpoint.set_result(message)
+            case messages.RouteFound(host, address):
+                futures = self._routes.pop(host, None)
+                if futures is not None:
+                    self._free_routes.release()
+                for future in futures or ():
+                    if not future.done():
+                        future.set_result(address)
+            case _:
+                return False
+        return True
+
+
 class ControlLifeline:
     """Control's end of the lifeline.
 
@@ -58,7 +134,7 @@ class ControlLifeline:
         descriptor: int,
         stopping: asyncio.Event,
         enclosed: Enclosed,
-        links: Mapping[str, tuple[Callable[[Channel], None], Any]],
+        links: Mapping[str, tuple[Callable[[Channel], None], object]],
     ) -> None:
         self._stopping = stopping
         self._enclosed = enclosed
@@ -71,13 +147,8 @@ class ControlLifeline:
         self.restored = asyncio.Event()
         # Whether the caller that started the appliance has received `Ready` from an earlier control process.
         self.announced = False
-        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # unanswered queries
-        self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
-        self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
-        self._own_networks: list[asyncio.Future[str]] = []
-        self._machine_work: dict[int, asyncio.Future[messages.MachineWorkDone]] = {}
-        self._numbers = itertools.count(1)
-        self._early: dict[tuple[object, ...], tuple[Any, tuple[int, ...]]] = {}
+        self.questions = SupervisorQuestions(self.say)
+        self._early: dict[tuple[object, ...], tuple[object, tuple[int, ...]]] = {}
         self._heard: Heard = self.queue
 
     def attach(self) -> None:
@@ -95,7 +166,7 @@ class ControlLifeline:
     def pause(self) -> None:
         self._heard = self.queue
 
-    def queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def queue(self, message: object, descriptors: tuple[int, ...]) -> None:
         """Queue a message in place of an earlier one of its kind, because control may wait for months."""
         key: tuple[object, ...] = (type(message),)
         if isinstance(message, messages.LinkOpened | messages.ProcessDied):
@@ -126,45 +197,6 @@ class ControlLifeline:
     def drop(self, name: str) -> None:
         self.say(messages.SocketDropped(name))
 
-    async def route_to(self, host: str) -> str | None:
-        """Return the machine's address at which `host` reaches the appliance, or None if `host` already used it."""
-        if host not in self._routes:
-            await self._free_questions.acquire()
-            if host in self._routes:  # another call has sent the query in the meantime
-                self._free_questions.release()
-            else:
-                self._routes[host] = []
-                self.say(messages.RouteWanted(host))
-        future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
-        self._routes[host].append(future)
-        return await future
-
-    async def endpoint(self) -> messages.EndpointFound:
-        future: asyncio.Future[messages.EndpointFound] = asyncio.get_running_loop().create_future()
-        self._endpoints.append(future)
-        self.say(messages.EndpointWanted())
-        return await future
-
-    async def open_own_network(self, network: str, ports: list[int]) -> str:
-        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._own_networks.append(future)
-        self.say(messages.OwnNetworkWanted(network, ports))
-        return await future
-
-    async def machine_work(self, feature: str, work: str, **terms: object) -> dict[str, object]:
-        """Have the supervisor do a piece of a feature's work. Raises `MachineWorkFailedError` with its reason."""
-        number = next(self._numbers)
-        done: asyncio.Future[messages.MachineWorkDone] = asyncio.get_running_loop().create_future()
-        self._machine_work[number] = done
-        self.say(messages.MachineWorkWanted(number, feature, work, terms))
-        try:
-            answer = await done
-        finally:
-            self._machine_work.pop(number, None)
-        if answer.reason:
-            raise MachineWorkFailedError(answer.reason)
-        return answer.found
-
     def _send(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         try:
             self.channel.send(message, descriptors)
@@ -175,7 +207,7 @@ class ControlLifeline:
         _log.warning("the link to the supervisor is closed")
         self._stopping.set()
 
-    def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _received(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.Ping(number):
                 self.say(messages.Pong(number))
@@ -194,21 +226,15 @@ class ControlLifeline:
                 self.activated.set()
             case messages.FirewallReported():
                 self.surroundings.firewall = message
-            case (
-                messages.TunnelsEnclosed()
-                | messages.EndpointFound()
-                | messages.RouteFound()
-                | messages.MachineWorkDone()
-            ):
-                self._answered(message)
-            case messages.OwnNetworkOpened(reason):
-                if self._own_networks and not (waiter := self._own_networks.pop(0)).done():
-                    waiter.set_result(reason)
+            case messages.TunnelsEnclosed():
+                self._enclosed(message)
+            case _ if self.questions.answered(message):
+                pass
             case _:
                 self._note(message)
                 self._heard(message, descriptors)
 
-    def _note(self, message: Any) -> None:
+    def _note(self, message: object) -> None:
         match message:
             case messages.MachineAddresses(addresses):
                 self.surroundings.machine = tuple(map(ipaddress.ip_address, addresses))
@@ -218,29 +244,3 @@ class ControlLifeline:
                 self.surroundings.probe = reason
             case messages.ProbePassed():
                 self.surroundings.probe = "passed"
-
-    def _answered(
-        self,
-        message: messages.TunnelsEnclosed
-        | messages.EndpointFound
-        | messages.RouteFound
-        | messages.MachineWorkDone,
-    ) -> None:
-        match message:
-            case messages.MachineWorkDone(number):
-                if (asked := self._machine_work.get(number)) is not None and not asked.done():
-                    asked.set_result(message)
-            case messages.TunnelsEnclosed():
-                self._enclosed(message)
-            case messages.EndpointFound():
-                waiting, self._endpoints = self._endpoints, []
-                for waiter in waiting:
-                    if not waiter.done():
-                        waiter.set_result(message)
-            case messages.RouteFound(host, address):
-                futures = self._routes.pop(host, None)
-                if futures is not None:
-                    self._free_questions.release()
-                for future in futures or ():
-                    if not future.done():
-                        future.set_result(address)

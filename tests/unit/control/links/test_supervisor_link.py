@@ -70,11 +70,11 @@ async def ends(answers: list[TunnelsEnclosed]) -> AsyncIterator[tuple[ControlLif
 
 async def test_a_route_is_requested_once(ends: tuple[ControlLifeline, Supervisor]) -> None:
     lifeline, supervisor = ends
-    many = [asyncio.create_task(lifeline.route_to("a")) for _ in range(50)]
+    many = [asyncio.create_task(lifeline.questions.route_to("a")) for _ in range(50)]
     await supervisor.until_asked(1)
     supervisor.answer("a")
     assert set(await asyncio.gather(*many)) == {"way to a"}
-    again = asyncio.create_task(lifeline.route_to("a"))
+    again = asyncio.create_task(lifeline.questions.route_to("a"))
     await supervisor.until_asked(2)
     assert supervisor.asked == ["a", "a"]
     supervisor.answer("a")
@@ -84,7 +84,7 @@ async def test_a_route_is_requested_once(ends: tuple[ControlLifeline, Supervisor
 async def test_routes_of_many_hosts_are_requested_in_turns(ends: tuple[ControlLifeline, Supervisor]) -> None:
     lifeline, supervisor = ends
     hosts = [f"host {number}" for number in range(ROUTES_AT_ONCE * 4)]
-    tasks = {host: asyncio.create_task(lifeline.route_to(host)) for host in hosts}
+    tasks = {host: asyncio.create_task(lifeline.questions.route_to(host)) for host in hosts}
     await supervisor.until_asked(ROUTES_AT_ONCE)
     given_up = [tasks.pop(host) for host in (hosts[0], hosts[-1])]  # one asked, one in the queue
     for one in given_up:
