@@ -176,7 +176,8 @@ class ParkedRobot(FleetRobot):
         file.write_bytes(msgspec.yaml.encode(settings))
         return resolve(file, {}, {})
 
-    def _reported(self, report: ForwardingReported, _descriptors: tuple[int, ...]) -> None:
+    def _reported(self, report: messages.Message, _descriptors: tuple[int, ...]) -> None:
+        assert isinstance(report, ForwardingReported)
         self.report = report
 
     @property

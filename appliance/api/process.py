@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from ipaddress import ip_network
 from pathlib import Path
-from typing import Any
 
 import structlog
 import uvloop
@@ -188,7 +187,7 @@ class _Api:
         except ChannelClosedError:
             self._stopping.set()
 
-    def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _received(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.Ping(number):
                 self._report(messages.Pong(number))

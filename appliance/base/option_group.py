@@ -3,10 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperOption
+
+if TYPE_CHECKING:
+    from typer._click import Command, Context, Parameter
 
 T = TypeVar("T")
 
@@ -18,17 +21,21 @@ class OptionGroup(Generic[T]):
     function: Callable[..., T]
 
     @cached_property
-    def _command(self) -> Any:
+    def _command(self) -> "Command":
         app = typer.Typer(add_completion=False)
         app.command()(self.function)
         return typer.main.get_command(app)
 
     @property
-    def options(self) -> Sequence[Any]:
-        return tuple(self._command.params)
+    def options(self) -> Sequence[TyperOption]:
+        options = self._command.params
+        assert all(isinstance(option, TyperOption) for option in options)  # noqa: S101  a group has no arguments
+        return [option for option in options if isinstance(option, TyperOption)]
 
-    def value(self, given: Mapping[str, Any]) -> T:
-        made: T = self._command.callback(**{option.name: given[option.name] for option in self.options})
+    def value(self, given: Mapping[str, object]) -> T:
+        callback = self._command.callback
+        assert callback is not None  # noqa: S101  typer gives each command one
+        made: T = callback(**{name: given[name] for option in self.options if (name := option.name)})
         return made
 
 
@@ -37,16 +44,17 @@ class GroupedCommand(TyperCommand):
 
     def __init__(
         self,
-        *args: Any,
-        params: Sequence[Any] = (),
-        before: Sequence[Any] = (),
-        after: Sequence[Any] = (),
+        name: str | None = None,
+        *,
+        params: "Sequence[Parameter]" = (),
+        before: "Sequence[Parameter]" = (),
+        after: "Sequence[Parameter]" = (),
         **settings: Any,
     ) -> None:
-        super().__init__(*args, params=[*before, *params, *after], **settings)
+        super().__init__(name, params=[*before, *params, *after], **settings)
         self._own = [one.name for one in params]
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: "Context") -> object:
         assert self.callback is not None  # noqa: S101  typer gives each verb one
         return ctx.invoke(self.callback, **{name: ctx.params[name] for name in self._own})
 

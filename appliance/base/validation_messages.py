@@ -2,8 +2,11 @@
 
 import difflib
 import re
-from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 _MAXIMUM_CANDIDATES = 500
 _LONGEST_SHOWN = 100
@@ -83,17 +86,17 @@ def meant(word: str, candidates: Collection[str]) -> str:
     return f"; did you mean {found}?" if found else ""
 
 
-def must_be(error: Mapping[str, Any]) -> str:
+def must_be(error: "ErrorDetails") -> str:
     """Return the requirement on a value; `error` is one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     shown = {name: _plain(value) for name, value in context.items()}
     if "pattern" in shown:
-        shown["pattern"] = _shape(shown["pattern"])
+        shown["pattern"] = _shape(str(shown["pattern"]))
     return wanted.format(**shown)
 
 
-def refusal(error: Mapping[str, Any]) -> str:
+def refusal(error: "ErrorDetails") -> str:
     """Return the whole message; `error` is one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
@@ -138,5 +141,5 @@ def _typed(types: str) -> str:
     return " or ".join(_MUST_BE.get(one, one) for one in types.split(" | "))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return int(value) if isinstance(value, float) and value.is_integer() else value

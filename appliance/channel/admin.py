@@ -8,7 +8,6 @@ each direction. The docstring of a request with `@rest` is its description in th
 import functools
 from typing import (
     Annotated,
-    Any,
     Generic,
     Literal,
     TypeVar,
@@ -32,6 +31,7 @@ from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
 
 A = TypeVar("A")
+A_co = TypeVar("A_co", covariant=True)
 
 POLICY = Versioned("policy", "/v1/policy", "The policy in force is not the one that If-Match names.")
 MONITORS = Versioned(
@@ -66,15 +66,15 @@ OneMonitor = Annotated[
 SomeMonitors = Annotated[list[OneMonitor], parameter(name="name", min_length=1, max_length=1000)]
 
 
-class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", forbid_unknown_fields=True):
+class AdminRequest(msgspec.Struct, Generic[A_co], frozen=True, tag_field="verb", forbid_unknown_fields=True):
     """A question or an order to the running appliance, which an `A` answers."""
 
 
-class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
+class WaitingRequest(AdminRequest[A_co], Generic[A_co], frozen=True):
     """A request that waits for another process, such as charon, or for a topic's messages: others go past it."""
 
 
-def verb_of(request: AdminRequest[Any]) -> str:
+def verb_of(request: AdminRequest[object]) -> str:
     return str(type(request).__struct_config__.tag)
 
 
@@ -408,11 +408,11 @@ class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="c
     """A challenge: each order that changes something is signed with one, and each is accepted once."""
 
 
-CORE_REQUESTS: tuple[type[AdminRequest[Any]], ...] = (TokenAdd, TokenRotate, *rows())
+CORE_REQUESTS: tuple[type[AdminRequest[object]], ...] = (TokenAdd, TokenRotate, *rows())
 """The requests of the core; `channel/operations.py` adds those of features."""
 
 
-def operation_of(request: AdminRequest[Any]) -> Operation | None:
+def operation_of(request: AdminRequest[object]) -> Operation | None:
     given = msgspec.structs.asdict(request)
     for operation in rows().get(type(request), ()):
         if all(given[name] == value for name, value in operation.fixed.items()):
@@ -423,7 +423,7 @@ def operation_of(request: AdminRequest[Any]) -> Operation | None:
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed", "standby"]
 
 
-class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
+class AdminAnswer(msgspec.Struct, Generic[A_co], frozen=True):
     """The answer: `ok` with a body, or an error with its findings.
 
     `trouble` is the kind of an error: `request` (makes no sense), `refused` (the policy or name given is wrong),
@@ -433,14 +433,14 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     """
 
     ok: bool
-    body: A | None = None
+    body: A_co | None = None
     error: str = ""
     findings: list[str] = []
     trouble: Trouble = ""
     tag: str = ""
     active: str = ""
 
-    def given(self) -> A:
+    def given(self) -> A_co:
         assert self.body is not None  # noqa: S101  it has one
         return self.body
 

@@ -14,7 +14,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -46,7 +46,7 @@ class Channel:
     """One end of a link; `union` is a union of `Message` structs."""
 
     def __init__(
-        self, sock: socket.socket, union: Any, *, limit: int = 64 << 20, longest: int = 64 << 20
+        self, sock: socket.socket, union: object, *, limit: int = 64 << 20, longest: int = 64 << 20
     ) -> None:
         """`limit` bounds the unsent backlog, and `longest` each received message, in bytes."""
         sock.setblocking(False)
@@ -133,7 +133,7 @@ class Channel:
             self._outgoing.appendleft((b"".join(frames), []))
         return self._outgoing[0]
 
-    def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
+    def receive(self) -> list[tuple[Message, tuple[int, ...]]]:
         """Return all complete messages. The caller owns their descriptors.
 
         Raises `ChannelClosedError`. Raises `ValueError`, and leaves the link unusable, if a message does not belong
@@ -163,8 +163,8 @@ class Channel:
             raise ChannelClosedError("the other end closed the link")
         return messages
 
-    def _take_messages(self) -> list[tuple[Any, tuple[int, ...]]]:
-        messages: list[tuple[Any, tuple[int, ...]]] = []
+    def _take_messages(self) -> list[tuple[Message, tuple[int, ...]]]:
+        messages: list[tuple[Message, tuple[int, ...]]] = []
         position, available = 0, len(self._incoming)
         while available - position >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._incoming, position)
@@ -184,7 +184,7 @@ class Channel:
     def attach(
         self,
         loop: "asyncio.AbstractEventLoop",
-        received: Callable[[Any, tuple[int, ...]], None],
+        received: Callable[[Message, tuple[int, ...]], None],
         closed: Callable[[], None],
         refused: Callable[[str], None] | None = None,
     ) -> None:

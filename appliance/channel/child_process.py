@@ -4,7 +4,6 @@ import asyncio
 import os
 import socket
 from collections.abc import Callable
-from typing import Any
 
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
@@ -17,12 +16,12 @@ class Child:
     def __init__(
         self,
         lifeline: Channel,
-        link: Any,
+        link: object,
         *,
-        said: Callable[[Any], None],
+        said: Callable[[Message], None],
         linked: Callable[[], None] = lambda: None,
         lost: Callable[[str], None] = lambda _reason: None,
-        took: Callable[[Any, tuple[int, ...]], None] | None = None,
+        took: Callable[[Message, tuple[int, ...]], None] | None = None,
         memory_given: Callable[[MemoryGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
         """`link` is the union of the messages on the link to control.
@@ -61,7 +60,7 @@ class Child:
     def close(self) -> None:
         self._control.close()
 
-    def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _supervisor_said(self, message: Message, descriptors: tuple[int, ...]) -> None:
         match message:
             case Ping(number):
                 self._answer(Pong(number))

@@ -19,9 +19,9 @@ class Link:
 
     def __init__(
         self,
-        heard: Callable[[Any], None],
+        heard: Callable[[Message], None],
         lost: Callable[[str], None] = lambda _reason: None,
-        took: Callable[[Any, tuple[int, ...]], None] | None = None,
+        took: Callable[[Message, tuple[int, ...]], None] | None = None,
     ) -> None:
         self.channel: Channel | None = None  # None: not connected
         self._heard = heard
@@ -38,7 +38,7 @@ class Link:
         self.close()
         self.channel = channel
 
-        def received(message: Any, descriptors: tuple[int, ...]) -> None:
+        def received(message: Message, descriptors: tuple[int, ...]) -> None:
             if descriptors and self._took is not None and self.channel is channel:
                 self._took(message, descriptors)
                 return
@@ -75,7 +75,7 @@ class Link:
         finally:
             del self._asked[number]
 
-    def answered(self, number: int, answer: Any) -> None:
+    def answered(self, number: int, answer: object) -> None:
         future = self._asked.get(number)
         if future is not None and not future.done():
             future.set_result(answer)

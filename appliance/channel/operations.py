@@ -1,6 +1,6 @@
 """List the requests of the core and of all features: what the admin socket and REST accept."""
 
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Union
 
 from appliance.channel.admin import CORE_REQUESTS, AdminRequest, ChallengeWanted
 from appliance.channel.rest_operation import rows
@@ -18,12 +18,12 @@ ORDERS = CHANGES | {operation.request for operation in OPERATIONS if operation.c
 """All changes over REST, in the name of a token or of a host."""
 
 if TYPE_CHECKING:
-    RestRequest = AdminRequest[Any]
-    AnyRequest = AdminRequest[Any]
+    RestRequest = AdminRequest[object]
+    AnyRequest = AdminRequest[object]
 else:
     RestRequest = Union[tuple(operation.request for operation in OPERATIONS)]  # noqa: UP007  of any number
     AnyRequest = Union[tuple(request for request in REQUESTS if request is not ChallengeWanted)]  # noqa: UP007  as above
 
 
-def request_named(verb: str) -> type[AdminRequest[Any]] | None:
+def request_named(verb: str) -> type[AdminRequest[object]] | None:
     return next((request for request in REQUESTS if request.__struct_config__.tag == verb), None)

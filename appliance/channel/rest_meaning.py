@@ -7,7 +7,7 @@ compromised api cannot use a proof for another order. It may only fill in the fi
 import json
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple, get_origin
+from typing import NamedTuple, get_origin
 from urllib.parse import parse_qs, quote, unquote, urlencode
 
 import msgspec
@@ -37,7 +37,7 @@ class RestCall(NamedTuple):
 
     method: str
     target: str
-    body: dict[str, Any] | None
+    body: dict[str, object] | None
     match: bool
 
 
@@ -45,7 +45,7 @@ def is_dry_run(query: str) -> bool:
     return parse_qs(query, keep_blank_values=True).get("dry_run", ["0"])[-1].lower() not in _NO
 
 
-def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
+def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[object]:
     """Return the order in a request; with `dry_run`, it must be a dry run. Raises `NoOrderError`."""
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:
@@ -68,7 +68,7 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
     raise NoOrderError("this path takes no orders")
 
 
-def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminRequest[Any]:
+def filled_in(order: AdminRequest[object], given: AdminRequest[object]) -> AdminRequest[object]:
     operation = operation_of(order)
     if operation is None or type(order) is not type(given):
         return order
@@ -77,7 +77,7 @@ def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminReques
     return msgspec.structs.replace(order, **left)
 
 
-def call_of(order: AdminRequest[Any], operation: Operation) -> RestCall:
+def call_of(order: AdminRequest[object], operation: Operation) -> RestCall:
     values = msgspec.structs.asdict(order)
     path, query = operation.path, []
     for name, field in operation.fields().items():
@@ -92,7 +92,7 @@ def call_of(order: AdminRequest[Any], operation: Operation) -> RestCall:
     return RestCall(operation.method, target, body or None, operation.is_change and "expected" in values)
 
 
-def _written(value: Any) -> str:
+def _written(value: object) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
@@ -113,8 +113,8 @@ def _order(
     asked: ClientRequest,
     *,
     dry_run: bool,
-) -> AdminRequest[Any] | None:
-    fields: dict[str, Any] = dict(operation.fixed)
+) -> AdminRequest[object] | None:
+    fields: dict[str, object] = dict(operation.fixed)
     for name, field in operation.fields().items():
         if name in named:
             fields[field.name] = _read(field.type, [named[name]])
@@ -132,11 +132,11 @@ def _order(
         if any(field.required and body.get(field.name) is None for field in in_body):
             return None
         fields |= {field.name: _moment(field, body[field.name]) for field in in_body if field.name in body}
-    order: AdminRequest[Any] = msgspec.convert(fields, operation.request)
+    order: AdminRequest[object] = msgspec.convert(fields, operation.request)
     return order
 
 
-def _read(kind: Any, given: list[str]) -> Any:
+def _read(kind: object, given: list[str]) -> object:
     kind = plain(kind)
     if get_origin(kind) is list:
         return given
@@ -145,7 +145,7 @@ def _read(kind: Any, given: list[str]) -> Any:
     return kind(given[-1]) if kind in (int, float) else given[-1]
 
 
-def _moment(field: msgspec.structs.FieldInfo, value: Any) -> Any:
+def _moment(field: msgspec.structs.FieldInfo, value: object) -> object:
     kind = plain(field.type)
     if not isinstance(value, str) or kind not in (int, float):
         return value
@@ -158,7 +158,7 @@ def _moment(field: msgspec.structs.FieldInfo, value: Any) -> Any:
     return moment if kind is int else moment / _SECOND
 
 
-def _body(asked: ClientRequest) -> dict[str, Any]:
+def _body(asked: ClientRequest) -> dict[str, object]:
     kind = asked.content_type.partition(";")[0].strip().lower()
     if kind == "text/plain":
         return {"text": asked.body.decode("utf-8")}

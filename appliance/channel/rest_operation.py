@@ -28,15 +28,14 @@ def parameter(description: str = "", *, name: str = "", **rules: Any) -> Request
     return RequestParameter(name, {**({"description": description} if description else {}), **rules})
 
 
-def parameter_of(kind: Any) -> RequestParameter:
+def parameter_of(kind: object) -> RequestParameter:
     if get_origin(kind) is Annotated:
-        return next(
-            (one for one in kind.__metadata__ if isinstance(one, RequestParameter)), RequestParameter("", {})
-        )
+        rules = (one for one in get_args(kind)[1:] if isinstance(one, RequestParameter))
+        return next(rules, RequestParameter("", {}))
     return RequestParameter("", {})
 
 
-def plain(kind: Any) -> Any:
+def plain(kind: object) -> object:
     while True:
         if get_origin(kind) is Annotated:
             kind = get_args(kind)[0]
@@ -124,7 +123,7 @@ class Operation:
             if one.name not in {"expected", *self.query, *self.fixed} and f"{{{name}}}" not in self.path
         ]
 
-    def least(self, given: Mapping[str, Any], *, dry_run: bool = False) -> tuple[TokenRole, str]:
+    def least(self, given: Mapping[str, object], *, dry_run: bool = False) -> tuple[TokenRole, str]:
         for name, doing in self.admin_with.items():
             if given.get(name):
                 return "admin", f"{doing} is for admins"
@@ -135,7 +134,7 @@ class Operation:
 
 
 @functools.cache
-def _fields(request: Any) -> Mapping[str, msgspec.structs.FieldInfo]:
+def _fields(request: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
     return {parameter_of(one.type).name or one.name: one for one in msgspec.structs.fields(request)}
 
 

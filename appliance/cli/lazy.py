@@ -5,7 +5,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
-from typing import Any
+from typing import TYPE_CHECKING
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
@@ -16,6 +16,9 @@ from appliance.cli.help_panels import in_order, panel_of
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.renamed_options import renamed
 from rosmop.tool.terminal import flowed
+
+if TYPE_CHECKING:
+    from typer._click import Command, Context, Parameter
 
 _HELP_OPTIONS = ["-h", "--help"]
 _FOLDERS = ("--state", "--monitors", "--other")
@@ -37,7 +40,8 @@ def application(
     further: Callable[[], Iterable[Verbs]] = tuple,
     callback: Callable[..., None] | None = None,
     panels: bool = False,
-    **settings: Any,
+    summary: str,
+    name: str | None = None,
 ) -> typer.Typer:
     """Return an application; `further` returns more verbs, for help, completion and a name that `verbs` lacks.
 
@@ -48,7 +52,8 @@ def application(
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": _HELP_OPTIONS},
-        **settings,
+        help=summary,
+        name=name,
     )
     app.callback()(callback or _nothing)
     return app
@@ -64,11 +69,11 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
         commands = property(lambda self: self.all_commands, lambda _self, _given: None)
 
         @functools.cached_property
-        def own_commands(self) -> dict[str, Any]:
+        def own_commands(self) -> dict[str, TyperCommand | TyperGroup]:
             return {name: _command_of(verb, name, further) for name, verb in verbs.items()}
 
         @functools.cached_property
-        def all_commands(self) -> dict[str, Any]:
+        def all_commands(self) -> dict[str, TyperCommand | TyperGroup]:
             own, table = self.own_commands, joined(verbs, *further())
             found = {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
             if not panels:
@@ -77,13 +82,15 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
                 command.rich_help_panel = panel_of(name)
             return {name: found[name] for name in in_order(found)}
 
-        def get_params(self, ctx: Any) -> list[Any]:
+        def get_params(self, ctx: "Context") -> "list[Parameter]":
             return _without_type_of_flags(super().get_params(ctx))
 
-        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        def get_command(self, ctx: "Context", cmd_name: str) -> "Command | None":
             return self.own_commands.get(cmd_name) or super().get_command(ctx, cmd_name)
 
-        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        def resolve_command(
+            self, ctx: "Context", args: list[str]
+        ) -> "tuple[str | None, Command | None, list[str]]":
             name = args[0]
             if name in self.own_commands:
                 return super().resolve_command(ctx, args)
@@ -95,11 +102,13 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
     return _Lazy
 
 
-def _command_of(verb: Verb | Group, name: str, further: Callable[[], Iterable[Verbs]]) -> Any:
+def _command_of(
+    verb: Verb | Group, name: str, further: Callable[[], Iterable[Verbs]]
+) -> TyperCommand | TyperGroup:
     match verb:
         case Group(help, inner):
             more = functools.partial(_inner, further, name)
-            return _named(typer.main.get_group(application(inner, further=more, help=help)), name)
+            return _named(typer.main.get_group(application(inner, further=more, summary=help)), name)
         case Verb():
             return _Deferred(verb, name)
 
@@ -109,7 +118,7 @@ def _inner(further: Callable[[], Iterable[Verbs]], name: str) -> list[Verbs]:
     return [group.verbs for group in groups if isinstance(group, Group)]
 
 
-def _named(command: Any, name: str) -> Any:
+def _named(command: TyperGroup, name: str) -> TyperGroup:
     command.name = name
     return command
 
@@ -121,7 +130,9 @@ class _Deferred(TyperCommand):
         super().__init__(name, hidden=verb.hidden or bool(verb.now))
         self._verb = verb
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: "Context | None" = None, **extra: object
+    ) -> "Context":
         command = loaded(self._verb, str(self.name))
         if self._verb.now and not extra.get("resilient_parsing"):
             typer.echo(f"rosrv {_path_of(parent)}{info_name} is now rosrv {self._verb.now}", err=True)
@@ -135,12 +146,12 @@ class _Deferred(TyperCommand):
             raise
 
 
-def _path_of(parent: Any) -> str:
+def _path_of(parent: "Context | None") -> str:
     """Return the names of the groups around a verb, without the program's."""
     return "" if parent is None or parent.parent is None else f"{_path_of(parent.parent)}{parent.info_name} "
 
 
-def loaded(verb: Verb, name: str) -> Any:
+def loaded(verb: Verb, name: str) -> "Command":
     found = pkgutil.resolve_name(verb.path)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function, kind = (
@@ -171,7 +182,7 @@ def _metavar(option: TyperOption, kind: str) -> str | None:
     return words.get(kind.replace("list[", "").replace("]", ""))
 
 
-def _without_type_of_flags(options: list[Any]) -> list[Any]:
+def _without_type_of_flags(options: "list[Parameter]") -> "list[Parameter]":
     for option in options:
         if isinstance(option, TyperOption) and option.is_flag:
             option.metavar = ""

@@ -63,7 +63,7 @@ app = application(
     callback=_global_options,
     panels=True,
     name="rosrv",
-    help="A network-security appliance for ROS 1 robots.",
+    summary="A network-security appliance for ROS 1 robots.",
 )
 
 

@@ -1,12 +1,11 @@
 """Print the fields of a message as rostopic does."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from rosmop.tool.terminal import printable
 
 
-def lines_of(value: Any, depth: int) -> Iterator[str]:
+def lines_of(value: object, depth: int) -> Iterator[str]:
     """Yield the lines of a value, without control characters."""
     indent = "  " * depth
     if isinstance(value, Mapping):
@@ -16,7 +15,7 @@ def lines_of(value: Any, depth: int) -> Iterator[str]:
                 yield from lines_of(inner, depth + 1)
             else:
                 yield f"{indent}{printable(str(name))}: {_plain(inner)}"
-    elif _is_deep(value):
+    elif isinstance(value, list) and _is_deep(value):
         for row in value:
             first, *rest = lines_of(row, 0)
             yield f"{indent}- {first}"
@@ -25,11 +24,11 @@ def lines_of(value: Any, depth: int) -> Iterator[str]:
         yield indent + _plain(value)
 
 
-def _is_deep(value: Any) -> bool:
+def _is_deep(value: object) -> bool:
     return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_plain, value))}]"
     return printable(str(value))

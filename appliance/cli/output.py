@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from mmap import mmap
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import msgspec
 import typer
@@ -74,7 +74,7 @@ def write_new(file: Path, text: str, *, verb: str) -> None:
         made.write(text)
 
 
-def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
+def say_json(fields: msgspec.Struct | Mapping[str, object] | tuple[object, ...]) -> None:
     terminal.say_json(in_full(fields))
 
 

@@ -14,7 +14,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -70,7 +70,7 @@ def _seconds(given: str | float) -> float:
     return given if isinstance(given, float) else bounded_span("--within", given, "1s", "1h", bare="s")
 
 
-def longest_wait(end: str) -> Any:
+def longest_wait(end: str) -> object:
     """Return the option --within, in seconds, with the default `WITHIN`."""
     return typer.Option(
         "--within",

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import typer
 from rich.console import Console, Group, RenderableType
@@ -41,7 +41,7 @@ class StatusView(NamedTuple):
 
     exit_status: int
     screen: RenderableType
-    fields: Mapping[str, Any]
+    fields: Mapping[str, object]
 
 
 Look = Callable[[], StatusView]

@@ -10,7 +10,7 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import setproctitle
 import structlog
@@ -144,7 +144,7 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
-        event: dict[str, Any] = {
+        event: dict[str, object] = {
             "event": "ready",
             "master": said.master,
             "api": rest,

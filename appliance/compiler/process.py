@@ -12,7 +12,6 @@ import asyncio
 import os
 import resource
 import socket
-from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -78,7 +77,7 @@ class CompilerProcess:
     def _lost(self, _reason: str) -> None:
         os._exit(0)
 
-    def _said(self, message: Any) -> None:
+    def _said(self, message: object) -> None:
         if isinstance(message, _Question):
             self._asked.put_nowait(message)
 

@@ -30,6 +30,7 @@ from appliance.configuration.settings import SECTIONS, Settings
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
+    from pydantic_core import ErrorDetails
 
 DEFAULT_FILE = Path("appliance.yaml")
 _DEFAULT_STATE = Settings.state
@@ -85,17 +86,17 @@ def _line_of(mistake: Mistake) -> int:
     return int(line) if line.isdigit() else sys.maxsize
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> dict[str, object]:
     return _reader().json_schema()
 
 
-def read(values: Mapping[str, Any]) -> Settings:
+def read(values: object) -> Settings:
     """Return the settings in the values. Raises `pydantic.ValidationError`."""
     return _reader().validate_python(values)
 
 
-def plain(settings: Settings) -> dict[str, Any]:
-    found: dict[str, Any] = _reader().dump_python(settings, mode="json")
+def plain(settings: Settings) -> dict[str, object]:
+    found: dict[str, object] = _reader().dump_python(settings, mode="json")
     return found
 
 
@@ -104,7 +105,7 @@ def _reader() -> TypeAdapter[Settings]:
     return TypeAdapter(Settings)
 
 
-def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
+def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, object]) -> Settings:
     """Return the settings from all sources; a flag whose value is None was not given. Raises `ConfigError`."""
     gathered = _Gathered()
     chosen = _choose_file(file, environment)
@@ -127,7 +128,7 @@ class _Gathered:
     """The values read so far, with the location of each key, and all mistakes."""
 
     def __init__(self) -> None:
-        self._values: dict[str, Any] = {}
+        self._values: dict[str | int, Any] = {}
         self._places: dict[KeyPath, str] = {}
         self._mistakes: list[Mistake] = []
 
@@ -163,10 +164,10 @@ class _Gathered:
             if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION or _SERVICE_LINK.fullmatch(name):
                 continue
             path: KeyPath = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
-            value: Any = environment[name]
-            if value.startswith(("[", "{")):
+            value: object = environment[name]
+            if environment[name].startswith(("[", "{")):
                 try:
-                    value = yaml.safe_load(value)
+                    value = yaml.safe_load(environment[name])
                 except yaml.YAMLError as error:
                     problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else error
                     self._mistakes.append(Mistake(name, not_yaml(problem)))
@@ -175,7 +176,7 @@ class _Gathered:
                 path = _SHORT_NAMES[name]
             self._set(path, value, name)
 
-    def add_flags(self, flags: Mapping[str, Any]) -> None:
+    def add_flags(self, flags: Mapping[str, object]) -> None:
         for key, value in flags.items():
             if value is not None:
                 self._set((key,), value, _FLAGS.get(key, "--" + key.replace("_", "-")))
@@ -209,8 +210,8 @@ class _Gathered:
             raise ConfigError(self._mistakes)
         return _with_absolute_paths(settings)
 
-    def _set(self, path: KeyPath, value: Any, place: str) -> None:
-        table: Any = self._values
+    def _set(self, path: KeyPath, value: object, place: str) -> None:
+        table: dict[str | int, Any] = self._values
         for key in path[:-1]:
             if not isinstance(table.get(key), dict):
                 table[key] = {}
@@ -237,7 +238,7 @@ class _Gathered:
                 self._places[*path, index] = f"{file}:{value.start_mark.line + 1}"
                 self._note_places(file, value, (*path, index))
 
-    def _mistake(self, error: Mapping[str, Any]) -> Mistake:
+    def _mistake(self, error: "ErrorDetails") -> Mistake:
         kind, path, context = error["type"], error["loc"], error.get("ctx")
         if kind == "invalid_key":
             path = (*path[:-1], str(path[-1]))
@@ -264,7 +265,7 @@ class _Gathered:
             (place for known, place in self._places.items() if known[: len(path)] == path), "configuration"
         )
 
-    def _value_at(self, path: KeyPath) -> Any:
+    def _value_at(self, path: KeyPath) -> object:
         value: Any = self._values
         for key in path:
             try:
@@ -299,7 +300,7 @@ def _unknown_key(path: KeyPath) -> str:
 
 
 def _with_absolute_paths(section: _Section) -> _Section:
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     for key in (field.name for field in dataclasses.fields(section)):
         value = getattr(section, key)
         if isinstance(value, Path):
@@ -339,7 +340,7 @@ def _all_keys(section: type, path: KeyPath) -> Iterator[KeyPath]:
             yield from _all_keys(below, (*path, name))
 
 
-def _section_of(annotation: Any) -> type | None:
+def _section_of(annotation: object) -> type | None:
     inner = typing.get_args(annotation)
     if inner:
         return next(filter(None, map(_section_of, inner)), None)

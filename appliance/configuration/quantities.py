@@ -6,28 +6,29 @@ imports pydantic when pydantic reads it, because each process and each verb load
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from types import ModuleType
+from typing import Annotated, ClassVar
 
 
 @dataclass(frozen=True)
 class Metadata:
     """Metadata that pydantic takes as several, and makes with its own module when it reads them."""
 
-    make: Callable[[Any], Iterable[Any]]
+    make: Callable[[ModuleType], Iterable[object]]
     __is_annotated_types_grouped_metadata__: ClassVar[bool] = True
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[object]:
         import pydantic  # noqa: PLC0415  see the head
 
         return iter(self.make(pydantic))
 
 
-def rules(**given: Any) -> Metadata:
+def rules(**given: object) -> Metadata:
     """Return the rules of pydantic's `Field`, such as `gt=0`."""
     return Metadata(lambda pydantic: pydantic.Field(**given).metadata)
 
 
-def check(function: Callable[[Any], Any]) -> Metadata:
+def check(function: Callable[[object], object]) -> Metadata:
     """Return a check that a value has to pass; the function raises `ValueError`."""
     return Metadata(lambda pydantic: (pydantic.AfterValidator(function),))
 

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from ipaddress import IPv4Network
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from pydantic import (
@@ -21,6 +21,7 @@ from pydantic import (
     GetPydanticSchema,
     IPvAnyAddress,
     IPvAnyNetwork,
+    ValidationInfo,
 )
 
 from appliance.configuration.quantities import (
@@ -307,7 +308,7 @@ def relays_for_this_machine() -> int:
     return max(1, min(4, (os.cpu_count() or 1) // 2))
 
 
-def _clear_text_stays_here(tls: bool, info: Any) -> bool:
+def _clear_text_stays_here(tls: bool, info: ValidationInfo) -> bool:
     api = info.data.get("api", "off")
     if not tls and api != "off" and not is_loopback(split_address(api)[0]):
         raise ValueError(
@@ -316,7 +317,7 @@ def _clear_text_stays_here(tls: bool, info: Any) -> bool:
     return tls
 
 
-def _mediation_fits(mediation: str, info: Any) -> str:
+def _mediation_fits(mediation: str, info: ValidationInfo) -> str:
     if mediation == "monitored" and info.data.get("relaying") == "all":
         raise ValueError("monitored needs relaying: monitored (--relay monitored)")
     return mediation
@@ -468,7 +469,7 @@ class Settings:
                 )
 
     def of(self, kind: type[S]) -> S:
-        value: Any = self
+        value: object = self
         for name in kind.place.split("."):
             value = getattr(value, name)
         assert isinstance(value, kind)  # noqa: S101  `with_features` has added it

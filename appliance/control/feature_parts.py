@@ -1,7 +1,6 @@
 """Keep the parts of control that the features of the table add."""
 
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
@@ -22,10 +21,10 @@ class FeatureParts:
         if part is not None:
             self._parts.append(part)
 
-    def methods(self) -> tuple[RequestMethod[Any], ...]:
+    def methods(self) -> tuple[RequestMethod[object], ...]:
         return tuple(method for part in self._parts for method in part.methods)
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> dict[str, object]:
         return {field: state for part in self._parts for field, state in part.status().items()}
 
     async def close(self) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
@@ -12,11 +12,15 @@ from appliance.control.core import ControlPart
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.specifications.compiler_link import SpecificationCompiler
 
+if TYPE_CHECKING:
+    from appliance.control.assembly.assembly import Parts
+    from appliance.control.assembly.foundation import Foundation
+
 
 class StartGate:
     """Decides when control may serve."""
 
-    links: Mapping[str, tuple[Callable[[Channel], None], Any]] = {}
+    links: Mapping[str, tuple[Callable[[Channel], None], object]] = {}
 
     async def role(
         self,
@@ -30,6 +34,6 @@ class StartGate:
         del config, settings, lifeline, compiler, stopping
         return ActiveRole()
 
-    async def begin(self, base: Any, parts: Any) -> ControlPart | None:
+    async def begin(self, base: "Foundation", parts: "Parts") -> ControlPart | None:
         del base, parts
         return None

@@ -11,7 +11,6 @@ import sqlite3
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -48,7 +47,7 @@ class ReadOnlyDatabase(Database):
         del schema, failed
         self._path = path
 
-    def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
+    def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[object, ...]]:
         try:
             with contextlib.closing(sqlite3.connect(f"{self._path.as_uri()}?mode=ro", uri=True)) as reader:
                 return reader.execute(sql, parameters).fetchall()

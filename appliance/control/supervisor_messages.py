@@ -3,7 +3,6 @@
 import asyncio
 import socket
 from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any
 
 import structlog
 
@@ -41,7 +40,7 @@ class SupervisorMessages:
         self._one_reload = asyncio.Lock()
         self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
 
-    def heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def heard(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.LinkOpened(role, index):
                 self._link(role, index, socket.socket(fileno=descriptors[0]))

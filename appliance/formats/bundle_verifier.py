@@ -38,7 +38,7 @@ import zlib
 from bisect import bisect_left
 from collections import Counter, defaultdict
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import IO, Any, Callable, Iterator
 
 from appliance.signing.log_proof import (
     Checkpoint,
@@ -65,7 +65,7 @@ CHAIN = {"previous", "hash", "then", "checkpoint"}
 # fields that a packer may choose.
 ENTRY, HEADER, END = map(struct.Struct, ("<4s4B4H3L5H2L", "<4s2B4H3L2H", "<4s4H2LH"))
 FREE, LARGE = (3, 0, 0, 33, 0, 0, 0o644 << 16), 0xFFFFFFFF
-Opener = Callable[[str], Any]
+Opener = Callable[[str], IO[bytes]]
 
 
 def printable(text: str) -> str:
@@ -80,7 +80,7 @@ def unhexed(text: str) -> bytes:
     return data
 
 
-def packed(value: Any) -> bytes:
+def packed(value: bytes | str | int | None) -> bytes:
     if value is None:
         return b"\xc0"
     if isinstance(value, int):
@@ -100,7 +100,7 @@ def extra(*sizes: int) -> bytes:
     return struct.pack(f"<2H{len(sizes)}Q", 1, 8 * len(sizes), *sizes)
 
 
-def ends(file: Any, size: int, unpacked: int) -> bool:
+def ends(file: IO[bytes], size: int, unpacked: int) -> bool:
     """Return whether the compressed data that begins here has `size` bytes, with zeros in the unused bits of the last
     byte.
 
@@ -119,10 +119,11 @@ def ends(file: Any, size: int, unpacked: int) -> bool:
 
 def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
     """Yield a finding for bytes of a ZIP file outside its members, and "" if another program packed it."""
-    file: Any = archive.fp
+    file = archive.fp
+    assert file is not None  # noqa: S101  it is open
     file.seek(archive.start_dir)
     directory, at, begin, members = file.read(MOST), 0, 0, archive.infolist()
-    free: set[Any] = {FREE}  # the fields that each packer chooses
+    free: set[object] = {FREE}  # the fields that each packer chooses
     for info in members:
         name, where, packed, size = info.filename, info.header_offset, info.compress_size, info.file_size
         entry = ENTRY.unpack_from(directory, begin)
@@ -168,7 +169,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
         yield ""
 
 
-def regular(path: Path, follow: bool = True) -> Any:
+def regular(path: Path, follow: bool = True) -> IO[bytes]:
     """Open a regular file. Raise OSError for pipes and devices, which could block their reader forever."""
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
     descriptor = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
@@ -231,7 +232,7 @@ class Verifier:
         self.notes: list[str] = []
         self.manifest: dict[str, Any] = {}
         self.sums: dict[str, str] = {}  # of the members
-        self.loads: dict[str, Any] = {}  # the hash in the log of each loaded file or folder
+        self.loads: dict[str, str | None] = {}  # the hash in the log of each loaded file or folder
         self.revisions: set[int | None] = set()  # revisions of the policies that decided
         self.checkpoints = self.agreeing = 0
 

@@ -41,7 +41,7 @@ class JoinRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     certificate: _Pem
 
 
-def settings_of(invitation: Invitation) -> dict[str, Any]:
+def settings_of(invitation: Invitation) -> dict[str, object]:
     site, _, group = invitation.group.partition("/")
     section: dict[str, Any] = {
         "collector": invitation.collector, "robot": invitation.robot, "ca": AUTHORITY, "certificate": CERTIFICATE,

@@ -11,7 +11,6 @@ import os
 import socket
 import sys
 from pathlib import Path
-from typing import Any
 
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -113,12 +112,12 @@ class Signer:
         await self._child.ended.wait()
         self._child.close()
 
-    def _control_said(self, message: Any) -> None:
+    def _control_said(self, message: object) -> None:
         answer = self._answer(message)
         if answer is not None:
             self._child.tell(answer)
 
-    def _answer(self, message: Any) -> messages.Message | None:
+    def _answer(self, message: object) -> messages.Message | None:
         match message:
             case messages.SignatureWanted(number, text):
                 return self._sign(number, text)

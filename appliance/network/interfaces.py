@@ -7,9 +7,9 @@ networks have no other hosts.
 import ipaddress
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from appliance.network import netlink
 from appliance.network.namespaces import Namespace, NetworkError
@@ -21,6 +21,32 @@ _LINK_SCOPE = 253  # RT_SCOPE_LINK
 _HOST_SCOPE, _LOCAL_TABLE = 254, 255  # RT_SCOPE_HOST, RT_TABLE_LOCAL
 
 T = TypeVar("T")
+
+
+class _Entry(Protocol):
+    """A link, address or route of the kernel: numbers of its header, and attributes of several types."""
+
+    def __getitem__(self, field: str) -> int: ...
+
+    def get_attr(self, name: str) -> Any: ...
+
+
+class Netlink(Protocol):
+    """The part of pyroute2's `IPRoute` in use; the library has no types."""
+
+    def link(self, command: str, **fields: object) -> object: ...
+
+    def addr(self, command: str, **fields: object) -> object: ...
+
+    def route(self, command: str, **fields: object) -> Iterable[_Entry]: ...
+
+    def link_lookup(self, *, ifname: str) -> list[int]: ...
+
+    def get_links(self) -> Iterable[_Entry]: ...
+
+    def get_addr(self, **fields: int) -> Iterable[_Entry]: ...
+
+    def get_routes(self, **fields: int) -> Iterable[_Entry]: ...
 
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
@@ -69,7 +95,7 @@ def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
 
 
 def delete_link(namespace: Namespace, name: str) -> None:
-    def delete(route: Any) -> None:
+    def delete(route: Netlink) -> None:
         for index in route.link_lookup(ifname=name):
             route.link("del", index=index)
 
@@ -95,7 +121,7 @@ def add_address(namespace: Namespace, name: str, address: str) -> None:
 def delete_address(namespace: Namespace, name: str, address: str) -> None:
     interface = ipaddress.ip_interface(address)
 
-    def delete(route: Any) -> None:
+    def delete(route: Netlink) -> None:
         for index in route.link_lookup(ifname=name):
             if str(interface) in _held(route, index=index):
                 length = interface.network.prefixlen
@@ -149,7 +175,7 @@ def delete_local_route(namespace: Namespace, network: str) -> None:
     )
 
 
-def _local_route(route: Any, network: str) -> dict[str, Any]:
+def _local_route(route: Netlink, network: str) -> dict[str, object]:
     kind = {"type": "local", "table": _LOCAL_TABLE, "scope": _HOST_SCOPE}
     return {"family": socket.AF_INET, "dst": network, "oif": _index(route, "lo"), **kind}
 
@@ -163,7 +189,7 @@ def addresses(namespace: Namespace) -> list[str]:
 
 
 def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
-    def read(route: Any) -> dict[str, list[str]]:
+    def read(route: Netlink) -> dict[str, list[str]]:
         names = _names(route)
         held: dict[str, list[str]] = {name: [] for name in names.values()}
         for entry in route.get_addr():
@@ -185,7 +211,7 @@ class DefaultRoute:
 
 
 def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
-    def read(route: Any) -> DefaultRoute | None:
+    def read(route: Netlink) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
         names = _names(route)
         found = [
@@ -207,7 +233,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 def networks(namespace: Namespace) -> list[str]:
     """Return the networks of routes and addresses, without default routes."""
 
-    def read(route: Any) -> list[str]:
+    def read(route: Netlink) -> list[str]:
         routes = [
             f"{entry.get_attr('RTA_DST')}/{entry['dst_len']}"
             for entry in route.get_routes()
@@ -222,7 +248,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
     """Return the source address of packets to `peer`. Raises `NetworkError` without a route."""
     family = _family(peer)
 
-    def look_up(route: Any) -> str:
+    def look_up(route: Netlink) -> str:
         for answer in route.route("get", family=family, dst=peer):
             source = answer.get_attr("RTA_PREFSRC")
             if source:
@@ -232,7 +258,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
     return _netlink(namespace, f"looking up the route to {peer}", look_up)
 
 
-def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
+def _netlink(namespace: Namespace, what: str, work: Callable[[Netlink], T]) -> T:
     pyroute2 = netlink.loaded()
 
     def inside() -> T:
@@ -246,15 +272,15 @@ def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
         raise NetworkError(f"{what} in {namespace.name}: {os.strerror(error.code)}{hint}") from error
 
 
-def _names(route: Any) -> dict[int, str]:
+def _names(route: Netlink) -> dict[int, str]:
     return {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
 
 
-def _held(route: Any, **of: int) -> list[str]:
+def _held(route: Netlink, **of: int) -> list[str]:
     return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr(**of)]
 
 
-def _index(route: Any, name: str) -> int:
+def _index(route: Netlink, name: str) -> int:
     found = route.link_lookup(ifname=name)
     if not found:
         raise NetworkError(f"interface {name} does not exist")

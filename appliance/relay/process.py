@@ -10,7 +10,6 @@ import pkgutil
 import resource
 import socket
 from dataclasses import replace
-from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -68,7 +67,7 @@ class RelayProcess:
         self._lifeline.close()
         self._loop.close()
 
-    def _obey(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _obey(self, message: object, descriptors: tuple[int, ...]) -> None:
         if isinstance(message, messages.Ping):
             self._lifeline.send(messages.Pong(message.number))
         elif isinstance(message, messages.Stop):

@@ -17,7 +17,7 @@ from asyncio import _enter_task, _leave_task, _register_task  # documented, for 
 from collections import deque
 from collections.abc import Callable, Coroutine, Hashable
 from operator import itemgetter
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
@@ -28,6 +28,8 @@ _MOST_KEPT = 1024  # keys with a stored use; beyond this, only the largest debts
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
 T = TypeVar("T")
+_Awaited = asyncio.Future[object] | None
+"""The future that a step of a coroutine waits for; None: for the next turn only."""
 Work = Callable[[], None]
 
 
@@ -196,12 +198,12 @@ class HostTask(asyncio.Future[T]):
     The first step runs at once, because most requests wait for nothing; asyncio would start a task in a later turn.
     """
 
-    def __init__(self, time: ProcessorTime, host: Address, work: Coroutine[Any, Any, T]) -> None:
+    def __init__(self, time: ProcessorTime, host: Address, work: Coroutine[_Awaited, None, T]) -> None:
         super().__init__()
         self._time = time
         self._host = host
         self._work = work
-        self._awaited: asyncio.Future[Any] | None = None
+        self._awaited: _Awaited = None
         self._cancels = 0  # without those that `uncancel` has undone
         self._cancel_soon = False  # whether the next step raises `CancelledError` in the coroutine
         if time.running:
@@ -211,7 +213,7 @@ class HostTask(asyncio.Future[T]):
         if not self.done():
             _register_task(self)  # type: ignore[arg-type]  # it has the methods of a task
 
-    def cancel(self, msg: Any | None = None) -> bool:
+    def cancel(self, msg: object | None = None) -> bool:
         if self.done():
             return False
         self._cancels += 1
@@ -225,7 +227,7 @@ class HostTask(asyncio.Future[T]):
         self._cancels = max(0, self._cancels - 1)
         return self._cancels
 
-    def _go_on(self, _awaited: asyncio.Future[Any] | None = None) -> None:
+    def _go_on(self, _awaited: _Awaited = None) -> None:
         self._awaited = None
         self._time.run(self._host, self._step)
 
@@ -248,13 +250,13 @@ class HostTask(asyncio.Future[T]):
             if outer is not None:
                 _enter_task(loop, outer)
 
-    def _resume(self) -> asyncio.Future[Any] | None:
+    def _resume(self) -> _Awaited:
         if self._cancel_soon:
             self._cancel_soon = False
-            return self._work.throw(asyncio.CancelledError())  # type: ignore[no-any-return]  # a future, or None
-        return self._work.send(None)  # type: ignore[no-any-return]  # same
+            return self._work.throw(asyncio.CancelledError())
+        return self._work.send(None)
 
-    def _wait_for(self, awaited: asyncio.Future[Any] | None) -> None:
+    def _wait_for(self, awaited: _Awaited) -> None:
         if awaited is None:  # `asyncio.sleep(0)`
             self.get_loop().call_soon(self._go_on)
             return

@@ -8,7 +8,7 @@ start, while the robot waits for its takeover.
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -102,7 +102,7 @@ class SpecificationCompiler:
         if at_start:
             answer = await self._asked_once(question, messages.ContentsFound)
         else:
-            answer = await self._ordered(question)
+            answer = await self._ordered(question, messages.ContentsFound)
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(
@@ -117,6 +117,7 @@ class SpecificationCompiler:
             try:
                 answer = await self._asked(
                     _wanted(sources, broken, dry_run=True),
+                    messages.ContentsFound,
                     goes_on=lambda: not self._orders,
                 )
             finally:
@@ -127,8 +128,7 @@ class SpecificationCompiler:
         answer = await self._asked_once(
             lambda number: messages.PartsWanted(number, compiled, wanted), messages.PartsMade
         )
-        parts: list[bytes] = answer.parts
-        return parts
+        return answer.parts
 
     async def _asked_once(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
         wanted = question(0)
@@ -137,7 +137,7 @@ class SpecificationCompiler:
             return answer
         found = await asyncio.to_thread(self._find, wanted, kind)
         if found is None:
-            found = await self._ordered(question)
+            found = await self._ordered(question, kind)
             if self._store is not None:
                 await asyncio.to_thread(self._store.keep, wanted, found)
         self._kept[kind] = wanted, found
@@ -152,9 +152,9 @@ class SpecificationCompiler:
             found = self._store.find(msgspec.structs.replace(wanted, lints=True), kind)
         return found
 
-    async def _ordered(self, question: Callable[[int], messages.Message]) -> Any:
+    async def _ordered(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
         with self._order():
-            return await self._asked(question)
+            return await self._asked(question, kind)
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
@@ -170,8 +170,12 @@ class SpecificationCompiler:
                 self._no_order.set()
 
     async def _asked(
-        self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
-    ) -> Any:
+        self,
+        question: Callable[[int], messages.Message],
+        kind: type[M],
+        *,
+        goes_on: Callable[[], bool] = lambda: True,
+    ) -> M:
         """Return the answer; while `goes_on()`, ask the successor of a compiler that has just ended."""
         for _ in range(_TRIES):
             try:
@@ -192,10 +196,12 @@ class SpecificationCompiler:
                 ) from None
             if isinstance(answer, messages.CompilationRefused):
                 raise SpecificationsRefusedError(answer.findings)
+            if not isinstance(answer, kind):
+                raise TypeError(f"the compiler answered a {type(answer).__name__}, not a {kind.__name__}")
             return answer
         raise SpecificationsRefusedError([_ENDED])
 
-    async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
+    async def _answer(self, question: Callable[[int], messages.Message]) -> object:
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:
@@ -206,8 +212,9 @@ class SpecificationCompiler:
             raise
         return asking.result()
 
-    def _heard(self, message: Any) -> None:
-        self._link.answered(message.number, message)
+    def _heard(self, message: object) -> None:
+        if isinstance(message, messages.ContentsFound | messages.PartsMade | messages.CompilationRefused):
+            self._link.answered(message.number, message)
 
 
 def _wanted(

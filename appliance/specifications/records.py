@@ -42,7 +42,7 @@ class MonitorRecords:
     """
 
     trail: AuditTrail
-    fields: Callable[[str, bytes], dict[str, Any] | None]
+    fields: Callable[[str, bytes], dict[str, object] | None]
     told: list[Callable[[MonitorEvent], None]]
     keep: Callable[[str], None] = lambda _stops: None
     repetitions: Repetitions = field(default_factory=Repetitions, init=False)

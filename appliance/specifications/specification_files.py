@@ -4,7 +4,6 @@ import stat
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -108,7 +107,7 @@ class CheckedSpecifications(messages.Contents, frozen=True):
 
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
-    def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
+    def fields(self, topic: str, data: bytes) -> dict[str, object] | None:
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None

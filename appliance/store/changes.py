@@ -71,7 +71,7 @@ class _Column(NamedTuple):
     types: tuple[type, ...]
     nullable: bool
 
-    def problem(self, value: Any) -> str:
+    def problem(self, value: object) -> str:
         if value is None:
             return "" if self.nullable else "must have a value"
         if not isinstance(value, self.types):
@@ -169,7 +169,7 @@ class LeftBehind(NamedTuple):
     """The content of the file after a crash: changes, or statements (SQL) of an earlier release."""
 
     changes: list[tuple[int, Change]]
-    statements: list[tuple[str, list[Any]]]
+    statements: list[tuple[str, list[Value]]]
     goes_on: bool = False
     """Whether the database has an earlier change of the process that made these."""
 
@@ -269,7 +269,7 @@ def _after(stored: int, data: bytes) -> Iterator[tuple[int, int, bytes]]:
             yield number, previous, data[begin + _NUMBERS.size : position]
 
 
-def _earlier_statements(data: bytes) -> Iterator[tuple[str, list[Any]]]:
+def _earlier_statements(data: bytes) -> Iterator[tuple[str, list[Value]]]:
     """Yield the statements that version 0.2.0 left; omit a torn last one."""
     decoder = msgspec.msgpack.Decoder(tuple[str, list[Any]])
     position = 0

@@ -15,6 +15,7 @@ from appliance.signing.request_signing import TokenKeys
 from appliance.store import host_tables
 from appliance.store.access_tokens import TokenRow
 from appliance.store.writer_thread import Database
+from roswire.xmlrpc import Value
 
 SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS incarnation (
@@ -217,7 +218,7 @@ class StateStore:
 
     # --- parameters ---
 
-    def save_parameters(self, tree: dict[str, Any]) -> None:
+    def save_parameters(self, tree: dict[str, Value]) -> None:
         with self.database.together():  # a change that stays would undo a larger one below it
             self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
             self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
@@ -232,7 +233,7 @@ class StateStore:
     def tree_is_due(self) -> bool:
         return self._only_in_tree or len(self._noted) > _MOST_NOTED
 
-    def note_parameter(self, key: str, value: Any) -> None:
+    def note_parameter(self, key: str, value: Value) -> None:
         """Store the change of a parameter until the next tree is stored; None: it was deleted.
 
         The tree, which may be large, is stored rarely, and a value larger than `LARGEST_CHANGE` only with it.
@@ -257,7 +258,7 @@ class StateStore:
         self.database.put("parameter_change", self._parameter_changes, key, data)
         self._noted.setdefault(key, []).append(self._parameter_changes)
 
-    def parameter_changes(self) -> list[tuple[str, Any]]:
+    def parameter_changes(self) -> list[tuple[str, Value]]:
         query = "SELECT number, key, value FROM parameter_change ORDER BY number"
         rows = self.database.query(query)
         self._parameter_changes = rows[-1][0] if rows else 0
@@ -277,7 +278,7 @@ class StateStore:
     def parameter_owners(self) -> list[tuple[str, str]]:
         return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
 
-    def load_parameters(self) -> dict[str, Any]:
+    def load_parameters(self) -> dict[str, Value]:
         rows = self.database.query("SELECT tree FROM parameters WHERE id = 1")
         return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
 

@@ -15,7 +15,6 @@ import resource
 import signal
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from appliance.supervisor.users import Account
 
@@ -194,7 +193,7 @@ def prctl(option: int, first: int, second: int = 0) -> None:
     libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
-def libc_call(what: str, *arguments: Any) -> None:
+def libc_call(what: str, *arguments: object) -> None:
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

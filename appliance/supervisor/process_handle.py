@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import msgspec
 import structlog
@@ -70,7 +70,7 @@ _PROGRAM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 class ProcessCallbacks:
     """The functions to call for the events of a process."""
 
-    received: Callable[["ProcessHandle", Any, tuple[int, ...]], None]
+    received: Callable[["ProcessHandle", Message, tuple[int, ...]], None]
     violated: Callable[["ProcessHandle", str], None]
     died: Callable[["ProcessHandle", int], None]
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class ServiceGate:
     def active(self) -> bool:
         return self.epoch is not None and not self.suspended
 
-    def heard(self, message: Any) -> None: ...
+    def heard(self, message: object) -> None: ...
 
     def died(self, role: str, *, serves_robot: bool) -> None: ...
 

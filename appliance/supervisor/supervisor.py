@@ -19,7 +19,6 @@ from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import msgspec
 import structlog
@@ -316,7 +315,7 @@ class Supervisor:
 
     # --- messages of children -----------------------------------------------------------------------------
 
-    def _received(self, process: ProcessHandle, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _received(self, process: ProcessHandle, message: object, descriptors: tuple[int, ...]) -> None:
         decisive = self._gate.accepts.get(process.role, ())
         allowed = _FROM_ANY + decisive + (_FROM_CONTROL if process.role == "control" else ())
         if not isinstance(message, allowed):
@@ -423,7 +422,7 @@ class Supervisor:
         except ListenerRejectedError as error:
             log.error("socket is not kept: a restart of control would close it", reason=str(error))
 
-    def _child_ready(self, process: ProcessHandle, detail: dict[str, Any]) -> None:
+    def _child_ready(self, process: ProcessHandle, detail: dict[str, object]) -> None:
         process.ready = True
         process.note_answer()
         if process.role == "relay":
@@ -534,7 +533,7 @@ class Supervisor:
             self.is_ready = True
             process.send(messages.Announced())
 
-    def _answer(self, process: ProcessHandle, work: Coroutine[Any, Any, None]) -> None:
+    def _answer(self, process: ProcessHandle, work: Coroutine[object, object, None]) -> None:
         if self._unanswered >= _MOST_UNANSWERED:
             work.close()
             self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
@@ -586,7 +585,7 @@ class Supervisor:
                 slot.dismissed = True
                 slot.process.kill()
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _spawn(self, work: Coroutine[object, object, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._finished)
@@ -746,7 +745,7 @@ class Supervisor:
         await end_all(self.slots, self._process_died, failed=failed)
 
 
-def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
     # A defect in one callback must not stop the robot's master: log the defect and continue.
     log.critical("fault in the supervisor", fault=context["message"], exc_info=context.get("exception"))
 

@@ -1,7 +1,7 @@
 """Make audit records of events in control, and block answers while the log cannot be written."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from appliance.audit.log.events import SEVERITIES
 from appliance.audit.log.log import AuditLog
@@ -96,7 +96,7 @@ class AuditTrail:
         `asked_of` names the object of a command. `reads`: repetitions of an allowed call are only counted.
         """
         word = decision.word
-        detail: dict[str, Any] = {"call": method, **asked_of}
+        detail: dict[str, object] = {"call": method, **asked_of}
         if asker.node is not None:
             detail["node"] = asker.node
         if decision.needs:
@@ -141,10 +141,10 @@ class AuditTrail:
         resource: str | None = None,
         rule: Rule | None = None,
         decision: str | None = None,
-        more: Mapping[str, Any] | None = None,
+        more: Mapping[str, object] | None = None,
         reads: bool = False,
         whole: bool = False,
-        **detail: Any,
+        **detail: object,
     ) -> str:
         """Record an event; return the record's id.
 
@@ -178,7 +178,7 @@ class AuditTrail:
     def _completing(self, decision: str | None, severity: Severity) -> Sequence[RecordDetails]:
         return self._details if decision == "deny" or severity not in _ORDINARY else ()
 
-    def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
+    def _marked(self, host: str | None, decision: str | None, detail: dict[str, object]) -> bool:
         if (
             host is None
             or decision != "deny"

@@ -6,7 +6,7 @@ Relative paths are relative to the folder of this file.
 import os
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import yaml
@@ -141,7 +141,7 @@ def load_config(path: Path) -> FleetConfig:
     )
 
 
-def _decoded(kind: type, value: Any) -> Any:
+def _decoded(kind: type, value: object) -> object:
     if kind is Path and isinstance(value, str):
         return Path(value)
     raise TypeError(f"expected a path, got {value!r}")

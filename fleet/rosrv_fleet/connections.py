@@ -15,7 +15,6 @@ import ipaddress
 import resource
 import socket
 from collections import Counter, OrderedDict
-from typing import Any
 
 import structlog
 
@@ -211,7 +210,7 @@ class CountingListener(socket.socket):
 
     table: ClientConnections
 
-    def accept(self) -> tuple[socket.socket, Any]:
+    def accept(self) -> tuple[socket.socket, object]:
         number, address = self._accept()  # type: ignore[attr-defined]  # `socket.accept` also calls it
         connection = CountedSocket(self.family, self.type, self.proto, fileno=number)
         connection.table = self.table

@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from datetime import UTC, date, datetime, timedelta
-from typing import Any
 
 import msgspec
 import psycopg
@@ -257,7 +256,7 @@ def make_partition(database: IndexDatabase, day: date) -> None:
         )
 
 
-def rows(records: Iterable[StoredColumns], day: str, place: SegmentPlace) -> Iterator[tuple[Any, ...]]:
+def rows(records: Iterable[StoredColumns], day: str, place: SegmentPlace) -> Iterator[tuple[object, ...]]:
     """Yield the rows of the index. NUL becomes U+2400, and names that are too long for the index are cut."""
     for columns in records:
         detail = columns.detail.decode()
@@ -266,7 +265,7 @@ def rows(records: Iterable[StoredColumns], day: str, place: SegmentPlace) -> Ite
         yield (day, place.robot, place.log, *(_storable(name, value) for name, value in values.items()))
 
 
-def _storable(name: str, value: Any) -> Any:
+def _storable(name: str, value: object) -> object:
     if not isinstance(value, str):
         return value
     longest = len(value) if name in _WHOLE else _LONGEST_ID if name == "id" else _LONGEST_NAME

@@ -3,7 +3,6 @@
 import json
 import logging
 import sys
-from typing import Any
 
 import structlog
 import typer
@@ -15,7 +14,7 @@ def say(line: str) -> None:
     typer.echo(printable(line))
 
 
-def say_json(fields: dict[str, Any]) -> None:
+def say_json(fields: dict[str, object]) -> None:
     typer.echo(json.dumps(fields))
 
 

@@ -8,7 +8,6 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import structlog
 
@@ -56,7 +55,7 @@ class ControlAwayError(Exception):
 
 
 def _made(
-    number: int, request: AdminRequest[Any], bearer: Bearer | None, until: float = math.inf
+    number: int, request: AdminRequest[object], bearer: Bearer | None, until: float = math.inf
 ) -> RequestMade:
     shown = bearer.shown if bearer is not None else ""
     asked = bearer.asked if bearer is not None and type(request) in CHANGES else None
@@ -136,7 +135,7 @@ class ControlLink:
         return decode(answer, request)
 
     async def _asked(
-        self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
+        self, request: AdminRequest[object], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
         number = 0
 
@@ -209,7 +208,7 @@ class ControlLink:
     def close(self) -> None:
         self._link.close()
 
-    def _received(self, message: Any) -> None:
+    def _received(self, message: object) -> None:
         match message:
             case RequestAnswered(number, answer):
                 self._link.answered(number, answer)

@@ -24,7 +24,7 @@ class _Requires:
     def __init__(self, least: TokenRole) -> None:
         self.least = least
 
-    async def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
+    async def __call__(self, request: Request, _token: Annotated[object, Security(_SCHEME)]) -> Bearer:
         bearer: Bearer = request.scope[BEARER]
         if not may(bearer.role, self.least):
             text = f"this is for {self.least}s; the token {bearer.name} has the role {bearer.role}"

@@ -34,7 +34,7 @@ def tagged(body: A) -> Tagged[A]:
     return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # each versioned answer has a revision
 
 
-def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
+def answer(body: object, status: int = 200, tag: int | str | None = None) -> Response:
     headers = None if tag is None else {"ETag": etag(tag)}
     return Response(msgspec.json.encode(in_full(body)), status, headers, _JSON)
 
@@ -73,7 +73,7 @@ class _Body:
         self.kind = kind
         self.text = text
 
-    async def __call__(self, request: Request) -> Any:
+    async def __call__(self, request: Request) -> object:
         """Return the struct. Raises `ProblemError` (415, 422)."""
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type == "text/plain" and self.text is not None:
@@ -85,13 +85,13 @@ class _Body:
         what = f'send {self.text} as Content-Type text/plain, or as JSON {{"text": …}}'
         raise ProblemError(415, "wrong-type", what)
 
-    def _of_text(self, text: str) -> Any:
+    def _of_text(self, text: str) -> object:
         try:
             return msgspec.convert({"text": text}, self.kind)
         except msgspec.ValidationError as error:
             raise bad_input([_bad(error)]) from None
 
-    def _of_json(self, text: str) -> Any:
+    def _of_json(self, text: str) -> object:
         try:
             try:
                 return msgspec.json.decode(text, type=self.kind)
@@ -171,7 +171,7 @@ def _not_json(text: str, error: Exception) -> ProblemError:
     return ProblemError(422, "not-json", f"the body is not JSON: {error}")
 
 
-def body(kind: type, *, text: str | None = None) -> Any:
+def body(kind: type, *, text: str | None = None) -> object:
     return Depends(_Body(kind, text))
 
 
@@ -229,9 +229,9 @@ def _operations_at(request: Request) -> dict[str, Any]:
     return paths[max(fitting, key=len) + own] if fitting else {}
 
 
-def _encoded(endpoint: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Response]]:
+def _encoded(endpoint: Callable[..., Awaitable[object]]) -> Callable[..., Awaitable[Response]]:
     @functools.wraps(endpoint)
-    async def answered(*arguments: Any, **named: Any) -> Response:
+    async def answered(*arguments: object, **named: object) -> Response:
         given = await endpoint(*arguments, **named)
         return answer(given.body, tag=given.tag) if isinstance(given, Tagged) else answer(given)
 

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, ParamSpec, TypeVar
 
 from fastapi import Path
 
@@ -21,6 +21,7 @@ from appliance.audit.search.search import RecordInContext, show
 from appliance.channel.admin import PolicyWanted
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
 RECORD_REFERENCE = {"$ref": "#/components/schemas/AuditRecord"}
 UNKNOWN: Responses = {404: {"description": "There is no such record."}}
@@ -44,7 +45,9 @@ class LogReader:
         self._control = services.control
         self._searches = services.searches
 
-    async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+    async def read(
+        self, bearer: Bearer, function: Callable[_P, _T], *arguments: _P.args, **named: _P.kwargs
+    ) -> _T:
         async with self._searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
@@ -62,7 +65,7 @@ class LogReader:
             )
         return shown
 
-    async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+    async def in_thread(self, function: Callable[_P, _T], *arguments: _P.args, **named: _P.kwargs) -> _T:
         try:
             return await asyncio.to_thread(function, *arguments, **named)
         except FilterError as error:

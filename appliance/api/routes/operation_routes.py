@@ -24,7 +24,7 @@ from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
 from appliance.channel.rest_operation import Operation, parameter_of, plain
 
-Q = TypeVar("Q", bound=AdminRequest[Any])
+Q_co = TypeVar("Q_co", bound=AdminRequest[object], covariant=True)
 
 
 async def _if_match(
@@ -52,18 +52,18 @@ async def _none() -> None:
     return None
 
 
-async def _nothing() -> dict[str, Any]:
+async def _nothing() -> dict[str, object]:
     return {}
 
 
 @dataclass(frozen=True)
-class OperationCall(Generic[Q]):
+class OperationCall(Generic[Q_co]):
     """A call of an operation; `body` is the body as sent."""
 
     services: Services
     operation: Operation
     bearer: Bearer
-    order: Q
+    order: Q_co
     body: Any
     dry_run: bool
 
@@ -84,8 +84,8 @@ class OperationCall(Generic[Q]):
 class Answer:
     """A function that replaces control's answer. If it returns no struct, `success` is the answer in the contract."""
 
-    function: Callable[[OperationCall[Any]], Awaitable[Any]]
-    success: Mapping[str, Any] | None = None
+    function: Callable[[OperationCall[Any]], Awaitable[object]]
+    success: Mapping[str, object] | None = None
 
 
 class AnsweringRoutes(Routes):
@@ -132,12 +132,12 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
     async def endpoint(
         *,
         request: Request,
-        of_path: Annotated[dict[str, Any], subject],
-        of_body: Annotated[Any, sent],
+        of_path: Annotated[dict[str, object], subject],
+        of_body: Annotated[object, sent],
         bearer: Annotated[Bearer, requires(least)],
         if_match: Annotated[str | None, tag],
         dry_run: Annotated[bool | None, trial],
-        of_query: Annotated[dict[str, Any], wanted],
+        of_query: Annotated[dict[str, object], wanted],
     ) -> Any:
         _check(operation, bearer, if_match, dry_run=bool(dry_run), given=of_path | of_query)
         order = _order(bearer.asked or asked_of(request.scope, request.headers, b""), dry_run=bool(dry_run))
@@ -150,7 +150,7 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
         return tagged(done) if operation.of is not None else done
 
     has_model = given is not Response
-    options: dict[str, Any] = {"response_model": given} if has_model else {"response_class": Response}
+    options: dict[str, object] = {"response_model": given} if has_model else {"response_class": Response}
     for path in filter(None, (operation.path, operation.former)):
         router.add_api_route(
             _converted(path),
@@ -173,7 +173,7 @@ def _converted(path: str) -> str:
 
 
 def _check(
-    operation: Operation, bearer: Bearer, if_match: str | None, *, dry_run: bool, given: Mapping[str, Any]
+    operation: Operation, bearer: Bearer, if_match: str | None, *, dry_run: bool, given: Mapping[str, object]
 ) -> None:
     """Raise `ProblemError` if the bearer's role does not permit the operation, or `If-Match` is missing."""
     role, reason = operation.least(given, dry_run=dry_run)
@@ -185,7 +185,7 @@ def _check(
         raise ProblemError(428, "precondition-required", text)
 
 
-def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
+def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[object]:
     try:
         return meant(asked, dry_run=dry_run)
     except BadTagError as error:
@@ -194,7 +194,7 @@ def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
         raise ProblemError(422, "bad-input", str(error)) from None
 
 
-def _answer_type(operation: Operation, own: Answer | None) -> Any:
+def _answer_type(operation: Operation, own: Answer | None) -> object:
     if own is not None:
         return get_type_hints(own.function)["return"]
     kind = answer_to(operation.request)
@@ -211,7 +211,7 @@ def _of_path(operation: Operation) -> Any:
     kind: Any = get_args(plain(field.type))[0] if get_origin(plain(field.type)) is list else field.type
     rule = Path(alias=name, **parameter_of(kind).rules)
 
-    async def of_path(subject: Annotated[plain(kind), rule]) -> dict[str, Any]:  # type: ignore[valid-type]  # at run time
+    async def of_path(subject: Annotated[plain(kind), rule]) -> dict[str, object]:  # type: ignore[valid-type]  # at run time
         return {name: subject}
 
     return Depends(of_path)
@@ -230,7 +230,7 @@ def _of_query(operation: Operation) -> Any:
         return Depends(_nothing)
     model: Any = create_model(operation.name, **fields)
 
-    async def of_query(query: Annotated[model, Query()]) -> dict[str, Any]:
+    async def of_query(query: Annotated[model, Query()]) -> dict[str, object]:
         return dict(query)
 
     return Depends(of_query)

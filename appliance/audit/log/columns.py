@@ -106,7 +106,7 @@ def plain_record(record: AuditRecord) -> AuditRecord:
     )  # fmt: skip
 
 
-def _shortened(detail: dict[str, Any]) -> dict[str, Any]:
+def _shortened(detail: dict[str, object]) -> dict[str, object]:
     sizes = {key: len(_encoder.encode({key: value})) for key, value in detail.items()}
     kept, room = {}, LARGEST_DETAIL // 4
     for key in sorted(sizes, key=sizes.__getitem__):
@@ -127,9 +127,9 @@ def _integer(value: object) -> int | None:
     return max(-_LARGEST_INTEGER, min(int(value), _LARGEST_INTEGER))
 
 
-def _plain(value: Any, depth: int = 0) -> Any:
+def _plain(value: object, depth: int = 0) -> object:
     if value is None or isinstance(value, bool | float):
-        plain: Any = value
+        plain: object = value
     elif isinstance(value, int):
         plain = value if abs(value) <= _LARGEST_INTEGER else _text(hex(value))
     elif isinstance(value, str):
@@ -149,7 +149,7 @@ def _plain(value: Any, depth: int = 0) -> Any:
     return plain
 
 
-def _plain_dict(value: dict[Any, Any], depth: int) -> dict[str, Any]:
+def _plain_dict(value: dict[object, object], depth: int) -> dict[str, object]:
     pairs = list(value.items())[:_MOST_ITEMS]
     plain = {_text(key): _plain(item, depth + 1) for key, item in pairs}
     if len(value) > len(pairs):

@@ -63,7 +63,7 @@ def without_contents(entry: LogEntry) -> LogEntry:
     return LogEntry(entry.sequence, record)
 
 
-def without_binding(text: str, detail: Mapping[str, Any]) -> str:
+def without_binding(text: str, detail: Mapping[str, object]) -> str:
     """Return the text without the values of parameters, which come from messages."""
     found = _BOUND.search(text)
     if found is None:
@@ -86,7 +86,7 @@ def as_object(entry: LogEntry) -> dict[str, Any]:
     return head | fields | {"severity": record.severity.value, "rule": record.rule and asdict(record.rule)}
 
 
-def entry_of(fields: Any) -> LogEntry:
+def entry_of(fields: object) -> LogEntry:
     """Return the entry of a JSON object. Raises `ValueError`, `KeyError` and `TypeError`."""
     if not isinstance(fields, dict):
         raise TypeError("not an object")

@@ -8,8 +8,6 @@ A node's reads of parameters below its own name are one kind, whose summary list
 thousands of them when it starts.
 """
 
-from typing import Any
-
 import msgspec
 
 from appliance.audit.log.columns import plain_record
@@ -165,7 +163,7 @@ def storable(record: AuditRecord) -> AuditRecord:
 
 
 def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> AuditRecord:
-    detail: dict[str, Any] = {
+    detail: dict[str, object] = {
         "count": state.count, "of": state.event, "scope": state.scope, "recorded_id": state.recorded_id,
         "first_id": state.first_id, "last_id": state.last_id,
         "first_time": state.first_time, "last_time": state.last_time,
@@ -187,6 +185,6 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     )  # fmt: skip
 
 
-def repetitions(detail: dict[str, Any]) -> int:
+def repetitions(detail: dict[str, object]) -> int:
     count = detail.get("count")
     return count if type(count) is int and count > 0 else 1

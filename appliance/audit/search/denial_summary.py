@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
@@ -178,7 +178,7 @@ def _callers(record: AuditRecord, number: int) -> Iterable[tuple[str, int]]:
     return _tallied(record.detail.get("callers")) if record.host else []
 
 
-def _tallied(names: Any) -> list[tuple[str, int]]:
+def _tallied(names: object) -> list[tuple[str, int]]:
     if not isinstance(names, dict):
         return []
     return [(name, count) for name, count in names.items() if type(count) is int]

@@ -11,7 +11,7 @@ import hashlib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, rfc3339
@@ -82,7 +82,7 @@ def times(record: AuditRecord) -> int:
     return times_of(record.event, record.detail)
 
 
-def times_of(event: str, detail: dict[str, Any]) -> int:
+def times_of(event: str, detail: dict[str, object]) -> int:
     return 1 if event in _ABOUT_THE_LOG else repetitions(detail)
 
 
@@ -105,7 +105,7 @@ def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
     return rows
 
 
-def equality_of(record: AuditRecord) -> dict[str, Any]:
+def equality_of(record: AuditRecord) -> dict[str, object]:
     """Return everything that a client needs to make the rows of `grouped` itself.
 
     Equal records have equal keys, and equal reasons unless one is empty. A record joins one of the last `reach`

@@ -115,5 +115,5 @@ FILTER = OptionGroup(filter_given)
 class FilteredCommand(GroupedCommand):
     """A command whose help lists the filter options before its own; `FILTER` makes a filter from them."""
 
-    def __init__(self, *args: Any, **settings: Any) -> None:
-        super().__init__(*args, before=FILTER.options, **settings)
+    def __init__(self, name: str | None = None, **settings: Any) -> None:
+        super().__init__(name, before=FILTER.options, **settings)

@@ -2,7 +2,6 @@
 
 import socket
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -24,7 +23,7 @@ class RestProblemError(Exception):
     """REST denied or rejected a request; the first of `lines` is a summary."""
 
     def __init__(
-        self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
+        self, status: int, kind: str, lines: list[str], findings: list[dict[str, object]] | None = None
     ) -> None:
         super().__init__(lines[0])
         self.findings = findings
@@ -101,7 +100,7 @@ class AdminSocket:
         return bytes(line)
 
 
-def encoded(request: AdminRequest[Any]) -> bytes:
+def encoded(request: AdminRequest[object]) -> bytes:
     """Return the request's bytes. Raises `NotRunningError` for text that is not valid UTF-8, and for huge numbers."""
     try:
         msgspec.msgpack.encode(request)  # JSON would also take numbers of more than 64 bits

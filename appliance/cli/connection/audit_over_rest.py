@@ -131,7 +131,7 @@ class RestLog:
             return self._client.call("GET", _PATH + path, params=params, seconds=seconds)
 
     @contextmanager
-    def _lines(self, path: str, params: dict[str, Any], seconds: float) -> Iterator[Iterator[str]]:
+    def _lines(self, path: str, params: dict[str, object], seconds: float) -> Iterator[Iterator[str]]:
         with (
             self._refusals(),
             self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,
@@ -195,7 +195,7 @@ class _EndedError(NotRunningError):
     """The appliance ended the stream."""
 
 
-def _parameters(wanted: Filter) -> dict[str, Any]:
+def _parameters(wanted: Filter) -> dict[str, object]:
     fields = msgspec.structs.asdict(wanted)
     fields["looks"] = "0" if fields.pop("without_looks") else None
     params = {name: value for name, value in fields.items() if value not in (None, ())}

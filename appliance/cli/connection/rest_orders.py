@@ -1,7 +1,7 @@
 """Send admin requests as REST calls, and convert the answers to the admin socket's answers."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import msgspec
 
@@ -33,7 +33,7 @@ class RestWay:
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
     """Return the answer. Raises `NotRunningError` for a request that REST does not offer."""
-    asked: Any = request  # its kind is checked below
+    asked: object = request  # its kind is checked below
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))
     operation = operation_of(request)
@@ -63,7 +63,7 @@ _MACHINE_ONLY = (
 _UNASKED = "this cannot be asked over REST; run it with --state"
 
 
-def _line(finding: dict[str, Any]) -> str:
+def _line(finding: dict[str, object]) -> str:
     return "{file}:{line}:{column}: {severity}: {text}".format_map(finding)
 
 

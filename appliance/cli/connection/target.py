@@ -30,6 +30,8 @@ from appliance.policy.host_names import HostInWords, in_words
 from rosmop.tool.terminal import printable
 
 if TYPE_CHECKING:
+    from typer._click import Context
+
     from appliance.cli.connection.rest_orders import RestWay
     from appliance.cli.connection.rest_session import RestClient
     from appliance.policy.host_names import HostInWords
@@ -155,7 +157,12 @@ class _ApplianceCommand(GroupedCommand):
     context_class = Appliance
 
     def __init__(
-        self, *args: Any, json_help: str | None = None, over_rest: bool = True, **settings: Any
+        self,
+        name: str | None = None,
+        *,
+        json_help: str | None = None,
+        over_rest: bool = True,
+        **settings: Any,
     ) -> None:
         after = tuple(map(copy, _CHOICE.options))
         for option in after:
@@ -163,10 +170,10 @@ class _ApplianceCommand(GroupedCommand):
                 option.help = json_help or option.help
             elif option.name != "state":
                 option.hidden = not over_rest
-        super().__init__(*args, after=after, **settings)
+        super().__init__(name, after=after, **settings)
 
-    def invoke(self, ctx: Any) -> Any:
-        assert ctx.way  # noqa: S101  options that exclude each other end the call before the verb acts
+    def invoke(self, ctx: "Context") -> object:
+        assert isinstance(ctx, Appliance) and ctx.way  # noqa: S101  options that exclude each other end the call before the verb acts
         return super().invoke(ctx)
 
 
@@ -182,9 +189,9 @@ def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb
 def speaks_with(
     json_help: str, group: OptionGroup[Any] | None = None
 ) -> Callable[[Callable[Concatenate[Appliance, _P], None]], GroupedVerb]:
-    def command(*args: Any, **settings: Any) -> GroupedCommand:
+    def command(name: str | None = None, **settings: Any) -> GroupedCommand:
         before = () if group is None else group.options
-        return _ApplianceCommand(*args, before=before, json_help=json_help, **settings)
+        return _ApplianceCommand(name, before=before, json_help=json_help, **settings)
 
     return lambda verb: GroupedVerb(verb, command)
 

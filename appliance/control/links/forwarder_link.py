@@ -43,7 +43,9 @@ class ForwarderLink:
         fields = msgspec.structs.asdict(report) | {"trouble": trouble}
         return ForwardingState(**fields, to=self._to, send=self._send)
 
-    def _heard(self, report: messages.ForwardingReported) -> None:
+    def _heard(self, report: messages.Message) -> None:
+        if not isinstance(report, messages.ForwardingReported):
+            raise TypeError(f"a forwarder sent a {type(report).__name__}")
         before = self._report
         self._report = report
         self._received(report.sequence)

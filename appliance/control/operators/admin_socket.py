@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import select
 import socket
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 import structlog
@@ -52,7 +52,7 @@ class AdminServer:
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
 
-    async def answer(self, line: bytes) -> admin.AdminAnswer[Any]:
+    async def answer(self, line: bytes) -> admin.AdminAnswer[object]:
         try:
             request = self._decoder.decode(line)
         except ValueError as error:

@@ -58,7 +58,7 @@ class Administration:
     def __init__(
         self,
         queries: Queries,
-        methods: Iterable[RequestMethod[Any]],
+        methods: Iterable[RequestMethod[object]],
         *,
         durable: Callable[[], Awaitable[object]],
         require_room: Callable[[], None],

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.settings import Settings
@@ -13,6 +13,8 @@ from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.listener_limits import ListenerLimits
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
+
+Holder = TypeVar("Holder")
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def _size(file: Path) -> int:
 
 
 def _by_host(
-    resource: str, whole: int | None, setting: str, held: Mapping[Any, int], allowed: int
+    resource: str, whole: int | None, setting: str, held: Mapping[Holder, int], allowed: int
 ) -> LimitUse:
     host = max(held, key=lambda one: held[one], default=None)
     used = sum(held.values())
@@ -93,5 +95,5 @@ def _by_host(
     return LimitUse(resource, used, whole, setting, name, held[host], allowed)
 
 
-def _of_pool(resource: str, setting: str, pool: Pool[Any]) -> LimitUse:
+def _of_pool(resource: str, setting: str, pool: Pool[Holder]) -> LimitUse:
     return _by_host(resource, pool.bounds.whole, setting, dict(pool.holders()), pool.bounds.host)

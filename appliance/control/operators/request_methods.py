@@ -1,7 +1,5 @@
 """The table of the core's request methods."""
 
-from typing import Any
-
 from appliance.channel import admin
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.queries import Queries
@@ -16,7 +14,7 @@ def request_methods(
     policies: Policies,
     monitors: SpecificationManager,
     tokens: TokenOrders,
-) -> tuple[RequestMethod[Any], ...]:
+) -> tuple[RequestMethod[object], ...]:
     return (
         RequestMethod(admin.StatusWanted, queries.status, order=False),
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),

@@ -15,7 +15,6 @@ import asyncio
 import os
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import structlog
 
@@ -163,7 +162,7 @@ class RestLink:
         if channel is self._link.channel:
             self._send_answer(made.number, answer)
 
-    async def _answer(self, made: RequestMade) -> AdminAnswer[Any]:
+    async def _answer(self, made: RequestMade) -> AdminAnswer[object]:
         if type(made.request) in ORDERS and self._trail.obstacle is not None:
             return AdminAnswer(False, error=self._trail.obstacle, trouble="failed")
         try:
@@ -214,7 +213,7 @@ class RestLink:
     def state_tokens(self) -> None:
         self._send(TokensStated(self._tokens.usable(), [*map(str, self._uses.blocked())]))
 
-    def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
+    def _send_answer(self, number: int, answer: AdminAnswer[object]) -> None:
         self._withdrawn.pop(number, None)
         self._send(RequestAnswered(number, encode(answer)))
 

@@ -1,6 +1,6 @@
 """The commands `rosrv approve` and `rosrv approval refuse`."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
@@ -112,7 +112,7 @@ def _arguments(one: Approval) -> str:
     return f" {shown}{f', and {hidden} more bytes, which are not shown' if hidden else ''}"
 
 
-def _fields(service: str, data: bytes) -> tuple[dict[str, Any] | None, bytes]:
+def _fields(service: str, data: bytes) -> tuple[dict[str, object] | None, bytes]:
     """Return the fields of a request, and the bytes behind the last one; None for a type that is not known."""
     try:
         definitions = standard_definitions()

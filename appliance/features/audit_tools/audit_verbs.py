@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Protocol, TextIO, TypeVar
 
 import msgspec
 import typer
@@ -200,7 +200,15 @@ def _verified(source: AuditSource, key: Path | None, checkpoints: Path | None) -
     return result
 
 
-def _print_result(result: Any, printed: Callable[[Any], None], *, as_json_lines: bool) -> None:
+class _Result(Protocol):
+    @property
+    def ok(self) -> bool: ...
+
+
+_R = TypeVar("_R", bound=_Result)
+
+
+def _print_result(result: _R, printed: Callable[[_R], None], *, as_json_lines: bool) -> None:
     if as_json_lines:
         write(json.dumps(msgspec.to_builtins(result)))
     else:

@@ -6,7 +6,7 @@ import itertools
 import json
 import pathlib
 from collections.abc import AsyncIterator, Iterator
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 from fastapi import Depends, Header, Query, Request, Response
@@ -126,7 +126,7 @@ Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
 WithEquality = Annotated[bool, Query(description="1: also what makes equal records one row")]
 
 
-def _json(schema: dict[str, Any]) -> Responses:
+def _json(schema: dict[str, object]) -> Responses:
     return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
 
 
@@ -302,5 +302,5 @@ def _joined(lines: Iterator[str]) -> Iterator[str]:
         yield piece
 
 
-def _as_line(record: dict[str, Any]) -> str:
+def _as_line(record: dict[str, object]) -> str:
     return json.dumps(record, separators=(",", ":"))

@@ -5,7 +5,6 @@ first: only the kinds of JSON, byte strings and the typed arrays of RFC 8746 are
 """
 
 import struct
-from typing import Any
 
 import cbor2
 import msgspec
@@ -110,7 +109,7 @@ def _scan_typed_array(frame: bytes, position: int, tag: int) -> tuple[int, int]:
     return position + size, 0 if tag in _BYTE_TAGS else size // element
 
 
-def _typed_array(tag: cbor2.CBORTag, _immutable: bool) -> Any:
+def _typed_array(tag: cbor2.CBORTag, _immutable: bool) -> object:
     data: bytes = tag.value
     if tag.tag in _BYTE_TAGS:
         return data

@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 from weakref import WeakValueDictionary
 
 import msgspec
@@ -41,7 +41,7 @@ class ParameterClient(Protocol):
     def memory(self) -> ClientMemory:
         """Return the memory that is charged for the connection's requests."""
 
-    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+    def parameters(self, values: Mapping[str, object], reply_to: str | None) -> None:
         """Take the values of parameters."""
 
     def failed(self, request: ReadParameters, reason: str) -> None:
@@ -102,13 +102,13 @@ class DoorParameters:
             if client in self._reads:
                 self._reads[client] -= 1
 
-    async def _read(self, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+    async def _read(self, names: Sequence[str]) -> tuple[dict[str, object], dict[str, str]]:
         """Return the values, and the reason for each parameter that the door may not read."""
         if not names:
             listed = await self._node.master("getParamNames")
             names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
             _check_number(names)
-        values: dict[str, Any] = {}
+        values: dict[str, object] = {}
         denials: dict[str, str] = {}
         for name in names:
             try:

@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 from appliance.base import clock
 from appliance.base.counted import counted
@@ -163,7 +162,7 @@ class DoorProcesses:
 
     # --- messages of a process ---
 
-    def _heard(self, number: int, message: Any) -> None:
+    def _heard(self, number: int, message: object) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
         if slot.ending is not None and slot.ending is slot.link.channel:
             return

@@ -128,7 +128,7 @@ class Foxglove:
             metadata={"ROS_DISTRO": "noetic"},
         )
 
-    def _tell(self, op: str, **fields: Any) -> None:
+    def _tell(self, op: str, **fields: object) -> None:
         self.queue.reply(text_frame(msgspec.json.encode({"op": op} | fields)))
 
     # --- frames of the client ---
@@ -325,7 +325,7 @@ class Foxglove:
             head = _SERVICE_CALL.pack(3, service, call, len(_ENCODINGS[0])) + _ENCODINGS[0].encode("ascii")
             self.queue.reply(binary_frame(head, bytes(values)))
 
-    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+    def parameters(self, values: Mapping[str, object], reply_to: str | None) -> None:
         rows = [{"name": name, "value": value} for name, value in values.items()]
         self._tell("parameterValues", parameters=rows, **({} if reply_to is None else {"id": reply_to}))
 

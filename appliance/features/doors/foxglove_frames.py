@@ -1,6 +1,6 @@
 """The text frames of Foxglove's protocol: the operations of clients as structs, and announcements."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 from msgspec import UNSET, Meta, Raw, Struct, UnsetType
@@ -116,7 +116,7 @@ _Operations = (
 FOXGLOVE_OPERATION: msgspec.json.Decoder[_Operations] = msgspec.json.Decoder(_Operations)
 
 
-def channel_fields(number: int, seen: SeenTopic) -> dict[str, Any]:
+def channel_fields(number: int, seen: SeenTopic) -> dict[str, object]:
     return {
         "id": number,
         "topic": seen.topic,
@@ -127,7 +127,7 @@ def channel_fields(number: int, seen: SeenTopic) -> dict[str, Any]:
     }
 
 
-def service_fields(number: int, seen: SeenService) -> dict[str, Any]:
+def service_fields(number: int, seen: SeenService) -> dict[str, object]:
     return {
         "id": number,
         "name": seen.service,

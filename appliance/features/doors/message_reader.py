@@ -6,7 +6,6 @@ a budget of values, because a small message can have very many, such as empty st
 
 import struct
 from collections.abc import Callable
-from typing import Any
 
 import cbor2
 
@@ -62,8 +61,9 @@ class _Cursor:
         return int(_LENGTH.unpack(self.take(4))[0])
 
 
-_Read = Callable[[_Cursor], Any]
-_ReadInto = Callable[[_Cursor, dict[str, Any]], None]
+_Read = Callable[[_Cursor], object]
+_ReadObject = Callable[[_Cursor], dict[str, object]]
+_ReadInto = Callable[[_Cursor, dict[str, object]], None]
 
 
 class MessageReader:
@@ -75,10 +75,10 @@ class MessageReader:
         self._most_values = most_values
         self._read = _Readers(definitions, typed_arrays=typed_arrays).message(name)
 
-    def read(self, data: Body) -> dict[str, Any]:
+    def read(self, data: Body) -> dict[str, object]:
         cursor = _Cursor(data, self._most_values)
         try:
-            values: dict[str, Any] = self._read(cursor)
+            values = self._read(cursor)
         except struct.error:
             raise MessageValueError(f"{self._name}: the message ends inside a field") from None
         except MessageValueError as error:
@@ -94,14 +94,14 @@ class _Readers:
     def __init__(self, definitions: Definitions, *, typed_arrays: bool) -> None:
         self._definitions = definitions
         self._typed_arrays = typed_arrays
-        self._made: dict[str, _Read] = {}
+        self._made: dict[str, _ReadObject] = {}
 
-    def message(self, name: str) -> _Read:
+    def message(self, name: str) -> _ReadObject:
         if name not in self._made:
             self._made[name] = self._message(name)
         return self._made[name]
 
-    def _message(self, name: str) -> _Read:
+    def _message(self, name: str) -> _ReadObject:
         parts: list[_ReadInto] = []
         scalars: list[Field] = []
         fields = self._definitions.message(name).fields
@@ -117,9 +117,9 @@ class _Readers:
             parts.append(_scalars(scalars))
         cost = _COST_OF_OBJECT + len(fields)
 
-        def read(cursor: _Cursor) -> dict[str, Any]:
+        def read(cursor: _Cursor) -> dict[str, object]:
             cursor.charge(cost)
-            values: dict[str, Any] = {}
+            values: dict[str, object] = {}
             for part in parts:
                 part(cursor, values)
             return values
@@ -137,7 +137,7 @@ class _Readers:
             return _numbers(field)
         element = self._element(field.type)
 
-        def read(cursor: _Cursor) -> list[Any]:
+        def read(cursor: _Cursor) -> list[object]:
             count = cursor.count() if field.length is None else field.length
             cursor.charge(count)
             return [element(cursor) for _ in range(count)]
@@ -153,7 +153,7 @@ class _Readers:
 
 
 def _one(name: str, read: _Read) -> _ReadInto:
-    def read_into(cursor: _Cursor, values: dict[str, Any]) -> None:
+    def read_into(cursor: _Cursor, values: dict[str, object]) -> None:
         values[name] = read(cursor)
 
     return read_into
@@ -163,7 +163,7 @@ def _scalars(fields: list[Field]) -> _ReadInto:
     whole = struct.Struct("<" + "".join(PRIMITIVES[field.type][0] for field in fields))
     names = [field.name for field in fields]
 
-    def read_into(cursor: _Cursor, values: dict[str, Any]) -> None:
+    def read_into(cursor: _Cursor, values: dict[str, object]) -> None:
         values.update(zip(names, whole.unpack_from(cursor.data, cursor.position), strict=True))
         cursor.position += whole.size
 
@@ -197,7 +197,7 @@ def _typed_array(field: Field) -> _Read:
 def _numbers(field: Field) -> _Read:
     code, size = PRIMITIVES[field.type]
 
-    def read(cursor: _Cursor) -> list[Any]:
+    def read(cursor: _Cursor) -> list[object]:
         count = cursor.count() if field.length is None else field.length
         data = cursor.take(count * size)
         cursor.charge(len(data) // 8)

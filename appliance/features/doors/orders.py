@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from typing import Any
 
 import structlog
 
@@ -200,7 +199,7 @@ class DoorOrders:
                 with contextlib.suppress(OSError):
                     self._processes.retry()
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         rows = self._table.live()
         return {"doors": DoorsState([self._processes.health(row) for row in rows]) if rows else None}
 

@@ -142,7 +142,7 @@ class DoorProcess:
         name, added = ("", 0.0) if self._given is None else (self._given.name, self._given.added)
         self._child.tell(door_link.DoorStarted(name, added, self._listens))
 
-    def _heard(self, message: Any) -> None:
+    def _heard(self, message: object) -> None:
         match message:
             case door_link.DoorGiven():
                 if self._given is None:
@@ -170,7 +170,7 @@ class DoorProcess:
             case _:
                 self._answered(message)
 
-    def _answered(self, message: Any) -> None:
+    def _answered(self, message: object) -> None:
         match message:
             case door_link.HostsGiven(number, hosts):
                 self._hosts.given(number, hosts)
@@ -195,7 +195,7 @@ class DoorProcess:
         for client in [one for one in self._clients if one.ticket and ended(one.ticket)]:
             client.session.revoke("the ticket is over; ask the operator for a new one")
 
-    def _took(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _took(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:
             case door_link.SocketGiven(number) if self._network is not None:
                 self._network.given(number, descriptors[0])

@@ -177,7 +177,7 @@ def _publish_head(topic: str) -> bytes:
     return b"\xa3\x62op\x67publish\x65topic" + cbor(topic)
 
 
-def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> ClientFrame:
+def json_frame(fields: dict[str, object], reply_to: ClientId = None) -> ClientFrame:
     return text_frame(msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}))
 
 

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
-from typing import Any, Protocol
+from typing import Protocol
 
 from msgspec import Raw
 from websockets.exceptions import ProtocolError as WebSocketError
@@ -102,7 +102,7 @@ class ClientProtocol(Protocol):
 
     def answered(self, number: int, values: Raw | bytes) -> None: ...
 
-    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None: ...
+    def parameters(self, values: Mapping[str, object], reply_to: str | None) -> None: ...
 
     def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None: ...
 
@@ -526,7 +526,7 @@ class DoorSession:
     def answered(self, call: int, values: Raw | bytes) -> None:
         self._tell(lambda: self._protocol.answered(call, values))
 
-    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+    def parameters(self, values: Mapping[str, object], reply_to: str | None) -> None:
         self._tell(lambda: self._protocol.parameters(values, reply_to))
 
     def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:

@@ -17,7 +17,7 @@ import sqlite3
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
@@ -54,7 +54,14 @@ from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"
 MOST_RECORDS = 1_000_000
-Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
+
+
+class Ask(Protocol):
+    """Ask the appliance."""
+
+    def __call__(self, request: AdminRequest[A], /) -> AdminAnswer[A]: ...
+
+
 Member = tuple[str, Iterable[bytes]]
 _PAGE = 500
 _APART = 1000  # a larger distance between two records begins a new run

@@ -1,7 +1,7 @@
 """`/v1/evidence` and `/v1/recordings/{id}/evidence`: one file of evidence that any machine can verify."""
 
 import asyncio
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Query, Response
 from starlette.responses import StreamingResponse
@@ -16,7 +16,7 @@ from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, in_thread
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.channel.admin import AdminAnswer, AdminRequest, PolicyWanted
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, PolicyWanted
 from appliance.features.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
 from appliance.features.evidence.page import Names
 
@@ -50,7 +50,7 @@ def routes(services: Services) -> Routes:
 async def _bundle(services: Services, bearer: Bearer, wanted: TimeSpan | RecordingSelection) -> Response:
     loop = asyncio.get_running_loop()
 
-    def ask(asked: AdminRequest[Any]) -> AdminAnswer[Any]:
+    def ask(asked: AdminRequest[A]) -> AdminAnswer[A]:
         return asyncio.run_coroutine_threadsafe(services.control.ask(asked, bearer), loop).result()
 
     give_back = services.exports.take(bearer, "exports")

@@ -199,11 +199,14 @@ class BundleGate:
 
     # --- the link ---
 
-    def _heard(self, message: BundleOffered | BundlePollReported) -> None:
+    def _heard(self, message: object) -> None:
         if isinstance(message, BundleOffered):
             self._offered = message
             self._there.set()
-            return
+        elif isinstance(message, BundlePollReported):
+            self._reported(message)
+
+    def _reported(self, message: BundlePollReported) -> None:
         if message.rejected and message.trouble != self._poll.trouble:
             self._trail.happened("bundle metadata rejected", message.trouble, collector=self._fleet.collector)
         self._poll = message

@@ -218,7 +218,7 @@ class _Stream(httpcore.NetworkStream):
             raise
         return _Stream(self._stream.start_tls(ssl_context, server_hostname, left), self._deadline)
 
-    def get_extra_info(self, info: str) -> Any:
+    def get_extra_info(self, info: str) -> object:
         return self._stream.get_extra_info(info)
 
 

@@ -120,8 +120,9 @@ class _Process:
                     break  # the supervisor restarts the process
         await asyncio.to_thread(self._loop.stop, _LAST_SECONDS)
 
-    def _said(self, message: BundleStated) -> None:
-        self._stated = message
+    def _said(self, message: messages.Message) -> None:
+        if isinstance(message, BundleStated):
+            self._stated = message
 
     def _linked(self) -> None:
         self._told = None

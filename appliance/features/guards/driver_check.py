@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import structlog
 
@@ -62,7 +61,7 @@ class DriverChecks:
         self._changing = asyncio.Lock()
         self._ended = asyncio.Event()
 
-    def methods(self) -> tuple[RequestMethod[Any], ...]:
+    def methods(self) -> tuple[RequestMethod[object], ...]:
         return (
             RequestMethod(DriverCheckBegin, self.begin, who=True),
             RequestMethod(DriverCheckWanted, self.wanted, order=False),

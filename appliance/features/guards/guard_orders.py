@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import msgspec
 
@@ -85,7 +84,7 @@ class GuardOrders:
         self._recorded = ""
         """The tag of the monitors whose guards are recorded."""
 
-    def methods(self) -> tuple[RequestMethod[Any], ...]:
+    def methods(self) -> tuple[RequestMethod[object], ...]:
         return (
             RequestMethod(guard_requests.GuardsWanted, self.guards, order=False),
             RequestMethod(guard_requests.GuardSuggestionsWanted, self.suggestions, order=False),

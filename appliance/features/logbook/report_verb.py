@@ -120,9 +120,8 @@ class _Live(msgspec.Struct):
     @classmethod
     def of(cls, appliance: Appliance, records: Reading) -> "_Live":
         try:
-            status, policy, tokens = (
-                appliance.ask(request) for request in (StatusWanted(), PolicyWanted(), TokenList())
-            )
+            status, policy = appliance.ask(StatusWanted()), appliance.ask(PolicyWanted())
+            tokens = appliance.ask(TokenList())
         except NotRunningError as error:
             return cls(reason=f"not known: {error}")
         for answer in (status, policy, tokens):

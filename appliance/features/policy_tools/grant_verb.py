@@ -2,7 +2,7 @@
 
 import shlex
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import msgspec
 import typer
@@ -165,7 +165,7 @@ def _unknown(record: str) -> NoReturn:
     fail(f"no record in the log has the id {record!a}; list them: rosrv audit search", 1)
 
 
-def _over_rest(appliance: Appliance, record: str, what: str, *, tool: bool = False) -> dict[str, Any]:
+def _over_rest(appliance: Appliance, record: str, what: str, *, tool: bool = False) -> dict[str, object]:
     if not ID_OR_SEQUENCE.fullmatch(record):
         _unknown(record)
     with Errors():

@@ -1,7 +1,5 @@
 """Build the recorder's part of control: plan, orders, and the link to the process."""
 
-from typing import Any
-
 from appliance.audit.log.ids import IdSource
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
@@ -26,7 +24,7 @@ async def begin(core: Core) -> ControlPart:
     return ControlPart(request_methods(orders), status=lambda: {"recorder": orders.state()})
 
 
-def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[Any], ...]:
+def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[object], ...]:
     """Orders are accepted on a full disk, because the recorder checks its own disk space."""
     return (
         RequestMethod(requests.RecordingsWanted, orders.recordings),

@@ -8,7 +8,6 @@ import mmap
 import os
 import socket
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -42,7 +41,7 @@ class _Process:
         )
         self._rings: dict[int, memoryview] = {}
         self._memory = 0
-        self._said: list[Any] = []
+        self._said: list[object] = []
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
@@ -82,7 +81,7 @@ class _Process:
             reserve=int(settings.audit.reserve_bytes),
         )
 
-    def _hear(self, message: Any) -> None:
+    def _hear(self, message: object) -> None:
         self._said.append(message)
         self._wake.set()
 

@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -70,7 +69,7 @@ class Recorder:
         self._answers: list[messages.Message] = []
         self._take_up()
 
-    def step(self, said: Iterable[Any] = ()) -> list[messages.Message]:
+    def step(self, said: Iterable[object] = ()) -> list[messages.Message]:
         for message in said:
             try:
                 self._obey(message)
@@ -100,7 +99,7 @@ class Recorder:
 
     # --- messages of control ------------------------------------------------------------------------------
 
-    def _obey(self, message: Any) -> None:
+    def _obey(self, message: object) -> None:
         match message:
             case recorder_link.RecordingsAsked():
                 making = [making.opened for making in self._making]

@@ -3,7 +3,6 @@
 import mmap
 import os
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import msgspec
 
@@ -71,5 +70,5 @@ class ExcludedStream:
         self._marked.close()
 
 
-def open_ring(terms: Mapping[str, Any], descriptor: int, now: Callable[[], int]) -> RecorderRing:
+def open_ring(terms: Mapping[str, object], descriptor: int, now: Callable[[], int]) -> RecorderRing:
     return RecorderRing(msgspec.convert(terms, RingTerms), descriptor, now)

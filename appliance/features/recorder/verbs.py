@@ -3,9 +3,9 @@
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import msgspec
 import typer
@@ -280,7 +280,7 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
     return way.state / "recordings" / recording.id / "recording.bag"
 
 
-def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
+def _asked(way: "RestWay", path: str, query: Mapping[str, object], kind: type[_T]) -> _T:
     given = {name: value for name, value in query.items() if value is not None}
     try:
         return msgspec.convert(way.client.call("GET", f"/v1/recordings/{path}", params=given), kind)

@@ -28,7 +28,7 @@ class ProbeError(Exception):
 
 
 class _Transport(xmlrpc.client.Transport):
-    def make_connection(self, host: Any) -> http.client.HTTPConnection:
+    def make_connection(self, host: object) -> http.client.HTTPConnection:
         return http.client.HTTPConnection(str(host), timeout=_SECONDS)
 
 
@@ -110,7 +110,7 @@ class _Node:
         class Server(SimpleXMLRPCServer):
             address_family = _family(host)
 
-            def _dispatch(self, method: str, _parameters: Any) -> list[Any]:
+            def _dispatch(self, method: str, _parameters: object) -> list[object]:
                 return [1, "", ["TCPROS", host, port] if method == "requestTopic" else 0]
 
         self._api = Server((host, 0), logRequests=False)

@@ -87,7 +87,7 @@ def _found(claims: Mapping[str, Any], path: str) -> Any:
     return next(_at(claims, path), None)
 
 
-def _at(claims: Any, path: str) -> Iterator[Any]:
+def _at(claims: object, path: str) -> Iterator[object]:
     """Return the values at a path; a name in it may have dots, and the longest name counts first."""
     if not isinstance(claims, Mapping):
         return

@@ -1,7 +1,7 @@
 """Answer the requests of single sign-on in control: begin and complete sign-ons, list and end sessions."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from appliance.channel import messages
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
@@ -123,7 +123,7 @@ class SsoOrders:
             raise UnavailableError("the process of single sign-on gave another answer: try again")
         return answer
 
-    def _received(self, message: Any) -> None:
+    def _received(self, message: object) -> None:
         if isinstance(message, SignOnBegun | SignOnConfirmed | SignOnFailed):
             self.link.answered(message.number, message)
         else:

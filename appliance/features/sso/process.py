@@ -68,7 +68,7 @@ class _Process:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _serve(self, message: Any) -> None:
+    async def _serve(self, message: SignOnWanted | SignOnReturned) -> None:
         try:
             self._child.tell(await self._answer(message))
         except SignOnRefusedError as error:
@@ -81,7 +81,7 @@ class _Process:
             reason = f"a defect of rosrv: {type(error).__name__}"
             self._child.tell(SignOnFailed(message.number, reason, refused=False))
 
-    async def _answer(self, message: Any) -> messages.Message:
+    async def _answer(self, message: SignOnWanted | SignOnReturned) -> messages.Message:
         match message:
             case SignOnWanted(number, keys, address, again):
                 return SignOnBegun(number, *await self._sign_ons.begin(keys, address, again=again))

@@ -10,7 +10,6 @@
 import asyncio
 import json
 from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 
@@ -48,7 +47,7 @@ class Provider:
         self._endpoints: tuple[float, ProviderEndpoints] | None = None
         self._failure: tuple[float, str] | None = None  # of the last fetch of the endpoints
         self._one_fetch = asyncio.Lock()
-        self._keys: tuple[float, list[dict[str, Any]]] | None = None
+        self._keys: tuple[float, list[dict[str, object]]] | None = None
 
     async def endpoints(self) -> ProviderEndpoints:
         """Return the endpoints: an hour old at most, or as old as keys while the provider does not serve them."""
@@ -88,7 +87,7 @@ class Provider:
             )
         return found
 
-    async def keys(self) -> Sequence[dict[str, Any]]:
+    async def keys(self) -> Sequence[dict[str, object]]:
         now = clock.now()
         try:
             self._keys = now, await self._fetch_keys()
@@ -100,7 +99,7 @@ class Provider:
     async def post(self, url: str, headers: Sequence[tuple[str, str]], body: bytes) -> tuple[int, bytes]:
         return await self._exchange("POST", url, headers, body)
 
-    async def _fetch_keys(self) -> list[dict[str, Any]]:
+    async def _fetch_keys(self) -> list[dict[str, object]]:
         url = (await self.endpoints()).jwks_uri
         try:
             found = json.loads(await self._get(url))["keys"]

@@ -13,7 +13,7 @@ import json
 import secrets
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import quote, urlencode
 
 from appliance.api.front.rates import peer_key
@@ -158,7 +158,7 @@ class SignOns:
         ]
 
 
-def _json(body: bytes) -> dict[str, Any]:
+def _json(body: bytes) -> dict[str, object]:
     try:
         found = json.loads(body)
     except (ValueError, RecursionError):

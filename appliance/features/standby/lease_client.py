@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import Any
 
 from appliance.base import clock
 from appliance.channel import messages
@@ -98,7 +97,7 @@ class LeaseClient:
         if reason:
             raise HandOverError(reason)
 
-    def heard(self, message: Any) -> None:
+    def heard(self, message: object) -> None:
         match message:
             case lease_link.LeaseState():
                 self.state = message

@@ -6,7 +6,6 @@ is still the newest. So a lapse only suspends the processes that serve the robot
 
 import asyncio
 from collections.abc import Mapping
-from typing import Any
 
 from appliance.base import clock
 from appliance.channel import messages
@@ -39,7 +38,7 @@ class LeaseWatch(ServiceGate):
         self._until = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
-    def heard(self, message: Any) -> None:
+    def heard(self, message: object) -> None:
         match message:
             case messages.LeaseHeld(until, epoch):
                 self.held(until, epoch)

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import Any, Never, Protocol
 
 import structlog
 
@@ -134,7 +134,7 @@ class StandbyAdministration:
         return _state_of(self._source)
 
 
-def on_standby(state: StandbyState) -> admin.AdminAnswer[Any]:
+def on_standby(state: StandbyState) -> admin.AdminAnswer[Never]:
     other = state.other
     text = f"this appliance is the standby of {other.name} ({other.address}); give the command there"
     return admin.AdminAnswer(False, error=text, trouble="standby", active=other.address)

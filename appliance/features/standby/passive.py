@@ -5,7 +5,6 @@ import socket
 import ssl
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Any
 
 import structlog
 
@@ -196,7 +195,7 @@ class PassiveControl:
         if refusal:
             raise HandOverError(refusal)
 
-    def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def _heard(self, message: object, descriptors: tuple[int, ...]) -> None:
         """Leave the supervisor's other messages to the active control."""
         if isinstance(message, messages.LinkOpened) and message.role == "api":
             self._rest.attach(self._lifeline.api_channel(descriptors[0]))

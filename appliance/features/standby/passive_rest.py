@@ -6,7 +6,6 @@ import sqlite3
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -14,6 +13,7 @@ from appliance.base import clock
 from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
+from appliance.channel.messages import Message
 from appliance.channel.messages.api import (
     ConnectionAnswered,
     ConnectionPassed,
@@ -120,7 +120,7 @@ class PassiveRest:
                 self._state_tokens()
             await asyncio.sleep(_READ_SECONDS)
 
-    def _received(self, message: Any) -> None:
+    def _received(self, message: object) -> None:
         if isinstance(message, RestServed):
             self.pin = message.pin
         if isinstance(message, ConnectionPassed):
@@ -143,13 +143,13 @@ class PassiveRest:
             return
         self._answer(made.number, await self._administration.carry_out(made.request, who=who))
 
-    def _answer(self, number: int, answer: AdminAnswer[Any]) -> None:
+    def _answer(self, number: int, answer: AdminAnswer[object]) -> None:
         self._send(RequestAnswered(number, encode(answer)))
 
     def _state_tokens(self) -> None:
         self._send(TokensStated(self._tokens.usable(), self._tokens.blocked))
 
-    def _send(self, message: Any) -> None:
+    def _send(self, message: Message) -> None:
         try:
             self._link.send(message)
         except ChannelFullError:

@@ -13,7 +13,7 @@ import secrets
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import structlog
 
@@ -245,7 +245,7 @@ class LeaseProcess:
         self._told = None
         self._wake.set()
 
-    def control_said(self, message: Any) -> None:
+    def control_said(self, message: object) -> None:
         match message:
             case lease_link.ReplicationReported():
                 self._report = message

@@ -13,7 +13,7 @@ import os
 import socket
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import structlog
@@ -165,7 +165,7 @@ class Replication:
         lease.listen(self._lease_changed)
         self.report()
 
-    def on_introduction(self, introduced: Callable[[Introduction], Coroutine[Any, Any, None]]) -> None:
+    def on_introduction(self, introduced: Callable[[Introduction], Coroutine[object, object, None]]) -> None:
         def start(introduction: Introduction) -> None:
             task = asyncio.get_running_loop().create_task(introduced(introduction))
             self._tasks.add(task)

@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import math
 import struct
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Generic, TypeVar
 
 import msgspec
 
@@ -128,7 +128,7 @@ def obstacle_of(reason: str) -> ObstacleFound:
 class ReplicationLink(Generic[M]):
     """One end of the link, which receives messages of one type."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, received: Any) -> None:
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, received: object) -> None:
         self._reader = reader
         self._writer = writer
         self._encoder = msgspec.msgpack.Encoder()
@@ -136,7 +136,7 @@ class ReplicationLink(Generic[M]):
         self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(received)
         self._taken = -math.inf  # when the other appliance last took bytes, by the event loop
 
-    async def send(self, message: Any) -> None:
+    async def send(self, message: object) -> None:
         body = self._encoder.encode(message)
         if len(body) > LARGEST_FRAME:
             raise ReplicationError(

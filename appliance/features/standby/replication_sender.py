@@ -14,7 +14,7 @@ import asyncio
 import contextlib
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import structlog
@@ -290,7 +290,7 @@ class ReplicationSender:
             await self._post(link, SnapshotBegin(self._epoch(), self._database.history, number))
             rows = 0
             puts = _rows_of(copy, self._database.tables)
-            while (put := await _in_thread(next, puts, None)) is not None:
+            while (put := await _in_thread(lambda: next(puts, None))) is not None:
                 await self._free_to_send(_ROWS_UNANSWERED)
                 await self._post(link, SnapshotRows([put]))
                 rows += len(put.rows)
@@ -311,9 +311,9 @@ class ReplicationSender:
         self._most_sent = max(self._most_sent, number)
 
 
-async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
+async def _in_thread(function: Callable[[], T]) -> T:
     """Call a function in a thread. Wait for its end even if cancelled: the caller then closes its connection."""
-    task = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
+    task = asyncio.ensure_future(asyncio.to_thread(function))
     try:
         return await asyncio.shield(task)
     except asyncio.CancelledError:

@@ -1,9 +1,9 @@
 """Run the forwarder of the audit log to a syslog receiver, as a process of the appliance."""
 
 import asyncio
+import ssl
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.features.syslog.log_forwarder import LogForwarder
@@ -38,10 +38,10 @@ def receiver_of(wanted: Syslog) -> Receiver:
     protocol, host, port = wanted.destination
     if protocol == "udp":
         return DatagramReceiver(host, port)
-    context: Callable[[], Any] | None = None
+    context: Callable[[], ssl.SSLContext] | None = None
     if protocol == "tls":
         # Made for each connection, so that replaced certificate files apply to the next connection.
-        def context() -> Any:
+        def context() -> ssl.SSLContext:
             return tls_context(wanted.ca, wanted.certificate, wanted.key)
 
     return StreamReceiver(host, port, context, wanted.name)

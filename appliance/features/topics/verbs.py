@@ -198,7 +198,7 @@ def part_of(fields: Any, path: str) -> Any:
     return value
 
 
-def _left_out(value: Any, name: str) -> str:
+def _left_out(value: object, name: str) -> str:
     if isinstance(value, Mapping):
         return str(value.get(CUT, ""))
     last = value[-1] if isinstance(value, list) and value else value

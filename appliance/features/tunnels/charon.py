@@ -9,13 +9,15 @@ import socket
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from vici import Session
 from vici.exception import CommandException, DeserializationException, EventUnknownException, SessionException
 
 from appliance.channel.messages import TunnelHost, TunnelSeen, TunnelsStated
 from appliance.ipsec.strongswan import connection, connection_name, host_of, pool, proposals_of
+
+_Row = dict[str, "bytes | list[bytes] | _Row"]
+"""A section of a reply of charon."""
 
 _SECONDS = 10.0
 _LISTS = 3  # at most, until a rekeyed tunnel is in one
@@ -36,7 +38,7 @@ class ViciClient:
         self._path = path
         self._session = self._connect()
         self._loaded: dict[str, TunnelHost] = {}
-        self._former: dict[str, set[bytes]] = {}  # by host: the ids of its tunnels with earlier certificates
+        self._former: dict[str, set[str]] = {}  # by host: the ids of its tunnels with earlier certificates
         self._stated: TunnelsStated | None = None
         self.proposals = proposals_of(self._key_exchanges())
 
@@ -95,7 +97,7 @@ class ViciClient:
                 self._end(host_of(name), {"ike-id": _text(row, "uniqueid")})
         return [one for name, row in found if (one := _seen(name, row)) is not None]
 
-    def _standing(self) -> list[tuple[str, Any]]:
+    def _standing(self) -> list[tuple[str, _Row]]:
         with self._said("the list of tunnels"):
             return [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
 
@@ -147,7 +149,7 @@ class ViciClient:
             # charon reports an error if no tunnel is open.
             list(self._session.terminate({**tunnel, "timeout": "-1", "force": "yes"}))
 
-    def _connect(self, timeout: float | None = _SECONDS) -> Any:
+    def _connect(self, timeout: float | None = _SECONDS) -> Session:
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         sock.settimeout(timeout)
         try:
@@ -170,17 +172,17 @@ def _der_of(pem: bytes) -> bytes:
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
-def _hidden(found: list[tuple[str, Any]]) -> set[str]:
+def _hidden(found: list[tuple[str, _Row]]) -> set[str]:
     """Return tunnels that a list lacks because their keys were replaced while charon made it."""
     rekeyed = {name for name, row in found if _text(row, "state") == "REKEYED"}
     return rekeyed - {name for name, row in found if _seen(name, row) is not None}
 
 
-def _seen(name: str, row: Any) -> TunnelSeen | None:
+def _seen(name: str, row: _Row) -> TunnelSeen | None:
     host = host_of(name)
     if host is None or _text(row, "state") not in ("ESTABLISHED", "REKEYING"):
         return None
-    children = [child for child in row.get("child-sas", {}).values() if _text(child, "state") == "INSTALLED"]
+    children = [child for child in _carried(row) if _text(child, "state") == "INSTALLED"]
     if not children:
         return None
     return TunnelSeen(
@@ -192,12 +194,23 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
     )
 
 
-def _parts(row: Any) -> set[bytes]:
+def _carried(row: _Row) -> list[_Row]:
+    children = row.get("child-sas")
+    return (
+        [child for child in children.values() if isinstance(child, dict)]
+        if isinstance(children, dict)
+        else []
+    )
+
+
+def _parts(row: _Row) -> set[str]:
     """Return the ids of a tunnel, of two kinds; a rekeying changes only one of them."""
-    carried = row.get("child-sas", {}).values()
-    return {b"ike " + row["uniqueid"], *(b"child " + child["uniqueid"] for child in carried)}
+    return {
+        f"ike {_text(row, 'uniqueid')}",
+        *(f"child {_text(child, 'uniqueid')}" for child in _carried(row)),
+    }
 
 
-def _text(row: Any, key: str) -> str:
+def _text(row: _Row, key: str) -> str:
     value = row.get(key, b"")
     return value.decode("ascii", "replace") if isinstance(value, bytes) else ""

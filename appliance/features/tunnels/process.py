@@ -91,7 +91,7 @@ class TunnelProcess:
         if self._vici is not None:
             self._say_what_it_is(self._vici)
 
-    def _control_said(self, message: Any) -> None:
+    def _control_said(self, message: object) -> None:
         if isinstance(message, messages.TunnelsStated):
             self._wanted = message
             self._changed.set()

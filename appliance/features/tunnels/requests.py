@@ -1,6 +1,6 @@
 """Define the requests about hosts in tunnels, for the admin socket and REST."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.rest_operation import Versioned, parameter, rest
@@ -167,7 +167,7 @@ class AuthorityWanted(AdminRequest[host_answers.AuthorityCertificate], frozen=Tr
     """The authority's certificate, in PEM."""
 
 
-REQUESTS: tuple[type[AdminRequest[Any]], ...] = (
+REQUESTS: tuple[type[AdminRequest[object]], ...] = (
     HostToken,
     HostAdd,
     HostEnrol,

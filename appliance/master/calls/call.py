@@ -163,7 +163,7 @@ METHOD = CallParameter("method_name", _text)
 
 
 def canonicalise(
-    parameters: Sequence[CallParameter[Any]], caller_id: str, values: Sequence[Value]
+    parameters: Sequence[CallParameter[object]], caller_id: str, values: Sequence[Value]
 ) -> tuple[object, ...]:
     canonical = []
     for parameter, value in zip(parameters, values, strict=True):
@@ -174,7 +174,7 @@ def canonicalise(
     return tuple(canonical)
 
 
-def check_arity(parameters: Sequence[CallParameter[Any]], values: Sequence[Value]) -> None:
+def check_arity(parameters: Sequence[CallParameter[object]], values: Sequence[Value]) -> None:
     if len(values) != len(parameters):
         raise ProtocolError("Error: bad call arity")
 
@@ -213,7 +213,7 @@ class Method(Generic[S]):
     """A method of `S` that carries out a call, and the parameters of the call after the caller_id."""
 
     perform: Callable[..., Awaitable[Value]]
-    parameters: tuple[CallParameter[Any], ...]
+    parameters: tuple[CallParameter[object], ...]
 
 
 @overload

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import structlog
 
@@ -42,7 +41,7 @@ class RelayOutbox(Link):
     is safe, because peers connect only with a grant, and grants and revocations are sent at once.
     """
 
-    def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
+    def __init__(self, index: int, heard: Callable[[object], None], lost: Callable[[str], None]) -> None:
         super().__init__(heard, lost)
         self.index = index
         self.stated: dict[str, dict[Change, messages.RelayFact]] = {}  # by key of the node, whose port it has

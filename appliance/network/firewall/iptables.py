@@ -14,7 +14,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
 from appliance.network.firewall.firewall_rules import (
@@ -28,6 +29,9 @@ from appliance.network.firewall.firewall_rules import (
     PacketVerdict,
 )
 from appliance.network.namespaces import Namespace
+
+if TYPE_CHECKING:
+    import iptc
 
 LOCK = Path("/run/xtables.lock")  # the lock of the `iptables-legacy` programs
 _ONE_AT_A_TIME = threading.Lock()  # guards the library's global state
@@ -238,7 +242,7 @@ def _interface(interface: Interface | None) -> str | None:
 class _Table:
     """A table, opened in the namespace of the thread."""
 
-    def __init__(self, library: Any, table: Any, family: Family) -> None:
+    def __init__(self, library: ModuleType, table: "iptc.Table", family: Family) -> None:
         self._library = library
         self._table = table
         self._family = family
@@ -290,7 +294,7 @@ class _Table:
             entry = self._table.next_rule(entry)
         return found
 
-    def _counter(self, chain: Chain, rule: Any) -> RuleCounter:
+    def _counter(self, chain: Chain, rule: "iptc.Rule") -> RuleCounter:
         packets, octets = rule.get_counters()
         return RuleCounter(chain.value, self._family, _comment(rule), packets, octets)
 
@@ -307,10 +311,10 @@ class _Table:
             entry = self._table.next_rule(entry)
         return count
 
-    def _jump(self, chain: Chain) -> Any:
+    def _jump(self, chain: Chain) -> "iptc.Rule":
         return self._build(RenderedRule("", self._family, HeaderMatch(), (), (chain.value, ())))
 
-    def _build(self, rendered: RenderedRule) -> Any:
+    def _build(self, rendered: RenderedRule) -> "iptc.Rule":
         rule = self._library.Rule6() if rendered.family == 6 else self._library.Rule()
         header = rendered.header
         if header.protocol is not None:
@@ -336,7 +340,7 @@ class _Table:
         return rule
 
 
-def _comment(rule: Any) -> str:
+def _comment(rule: "iptc.Rule") -> str:
     """Return a rule's comment; the library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
@@ -368,7 +372,7 @@ def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
             type(table)._cache.pop(name, None)  # the cached table is bound to this namespace
 
 
-def _library() -> Any:
+def _library() -> ModuleType:
     try:
         with warnings.catch_warnings(action="ignore"):  # its sources are for an older Python
             import iptc  # noqa: PLC0415 - loading it looks for the C libraries, which a machine may lack
@@ -381,7 +385,8 @@ def _library() -> Any:
         raise BackendMissingError(
             f"the firewall back end iptables needs libiptc and xtables: sudo apt install iptables ({error})"
         ) from error
-    return iptc
+    library: ModuleType = iptc
+    return library
 
 
 def _families() -> tuple[Family, ...]:

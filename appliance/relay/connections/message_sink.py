@@ -1,7 +1,7 @@
 """The interface of consumers that get a copy of publishers' messages, such as memory that the supervisor holds."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 
 class MessageStream(Protocol):
@@ -27,5 +27,5 @@ class MessageSink(Protocol):
         """Return a stream for a publisher's connection, or None if the sink does not take its messages."""
 
 
-OpenSink = Callable[[Mapping[str, Any], int, Callable[[], int]], MessageSink]
+OpenSink = Callable[[Mapping[str, object], int, Callable[[], int]], MessageSink]
 """Makes a sink from its terms, a descriptor of its memory and the monitors' clock."""

@@ -3,7 +3,7 @@
 import struct
 from collections import OrderedDict
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 from weakref import WeakValueDictionary
 
 from appliance.relay.monitors.batch_progress import BatchProgress
@@ -89,9 +89,9 @@ class ObservedMessage:
             return MessageSender(source, _HEADER.unpack(self._head)[0], SEQ)
         return MessageSender(source)
 
-    def detail(self) -> Mapping[str, Any]:
+    def detail(self) -> Mapping[str, object]:
         progress, position = self._progress, self._position
-        detail: dict[str, Any] = {
+        detail: dict[str, object] = {
             "number": progress.number_at(position) if progress is not None else position
         }
         if len(self._head) == HEAD:

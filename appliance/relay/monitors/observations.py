@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 from appliance.base.varying_numbers import without_numbers
 from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
@@ -31,7 +30,7 @@ _FLUSH_SECONDS = 0.05
 _VALUES = 32
 _INTEGERS = range(-(1 << 63), 1 << 64)
 
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
+_NOTHING: Mapping[str, object] = MappingProxyType({})
 
 _Key = tuple[str, str, str, str, str, str, bool]
 """Kind, monitor, key of the incarnation, resource, host, distinction, and whether the monitor stops the topic.
@@ -48,7 +47,7 @@ class _Repeated:
     """
 
     caller_id: str
-    shared: Mapping[str, Any]
+    shared: Mapping[str, object]
     count: int = 0
     first_time: int = 0
     last_time: int = 0
@@ -67,7 +66,7 @@ class _Repeated:
         self.count += count
         self.last_time, self.last_text = max(last_time, self.last_time), text
 
-    def detail(self) -> dict[str, Any]:
+    def detail(self) -> dict[str, object]:
         found = dict(self.shared)
         if self.first_time:
             found |= {"first_time": self.first_time, "last_time": self.last_time}
@@ -101,8 +100,8 @@ class Observations:
         distinction: str = "",
         safe: bool = False,
         only_number: bool = False,
-        shared: Mapping[str, Any] = _NOTHING,
-        detail: Mapping[str, Any] | None = None,
+        shared: Mapping[str, object] = _NOTHING,
+        detail: Mapping[str, object] | None = None,
         before: bytes = b"",
         after: bytes = b"",
         size: int = 0,
@@ -149,7 +148,7 @@ class Observations:
         text: str = "",
         first: int = 0,
         distinction: str = "",
-        shared: Mapping[str, Any] = _NOTHING,
+        shared: Mapping[str, object] = _NOTHING,
         safe: bool = False,
     ) -> None:
         repeated = self._repeated(kind, monitor, point, distinction, safe=safe)
@@ -195,7 +194,7 @@ class Observations:
         monitor: str,
         point: ObservationPoint,
         distinction: str,
-        shared: Mapping[str, Any],
+        shared: Mapping[str, object],
         *,
         safe: bool,
     ) -> _Repeated:
@@ -247,11 +246,11 @@ def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:
     )
 
 
-def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:
+def _plain(detail: Mapping[str, object]) -> dict[str, object]:
     return {str(name)[:200]: _value(value, 3) for name, value in list(detail.items())[:_VALUES]}
 
 
-def _value(value: Any, depth: int) -> Any:
+def _value(value: object, depth: int) -> object:
     if value is None or isinstance(value, bool | float) or (isinstance(value, int) and value in _INTEGERS):
         return value
     if isinstance(value, Mapping) and depth:

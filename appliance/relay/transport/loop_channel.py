@@ -3,7 +3,6 @@
 import os
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 from appliance.channel.channel import AGAIN_SECONDS, Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Message
@@ -22,7 +21,7 @@ class LoopLink:
         self,
         loop: EventLoop,
         channel: Channel,
-        received: Callable[[Any, tuple[int, ...]], bool | None],
+        received: Callable[[Message, tuple[int, ...]], bool | None],
         ended: Callable[[str], None],
     ) -> None:
         self._loop = loop
@@ -33,7 +32,7 @@ class LoopLink:
         self._live = True
         self._waits = False
         self._end_of_link: str | None = None  # the reason, once the link has ended
-        self._arrived: deque[tuple[Any, tuple[int, ...]]] = deque()
+        self._arrived: deque[tuple[Message, tuple[int, ...]]] = deque()
         self._slice: LoopTimer | None = None
         self._again: LoopTimer | None = None  # the next attempt of a write that the kernel refused
         loop.watch(channel.fileno(), READ, self._ready)

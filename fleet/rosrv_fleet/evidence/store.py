@@ -9,7 +9,6 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import structlog
@@ -53,7 +52,7 @@ class StoredEvidence(EvidenceContent, frozen=True, kw_only=True):
     added: int
     by: str
 
-    def has(self, record: Mapping[str, Any]) -> bool:
+    def has(self, record: Mapping[str, object]) -> bool:
         is_same_log = self.robot == record["robot"] and self.log == record["log"]
         return is_same_log and rfc3339(self.since) <= str(record["time"]) < rfc3339(self.until)
 

@@ -18,7 +18,7 @@ import msgspec
 import pytest
 
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Failed, Lifeline, Walled
+from appliance.channel.messages import Failed, Lifeline, Message, Walled
 from appliance.configuration.sections import Sections
 from appliance.features.table import FEATURES
 from appliance.supervisor.process_slot import ProcessSlot
@@ -124,7 +124,7 @@ class Place:
         assert isinstance(said, Walled)
         return json.loads(done.stderr.splitlines()[-1]), said
 
-    def start(self, role: Role, entry: str) -> tuple[subprocess.CompletedProcess[str], list[Lifeline]]:
+    def start(self, role: Role, entry: str) -> tuple[subprocess.CompletedProcess[str], list[Message]]:
         here, there = socket.socketpair()
         files = dict.fromkeys(("ca", "certificate", "key", "receipt_key"), Path("/etc/ssl/certs/none.pem"))
         receivers: dict[str, dict[str, Any]] = {

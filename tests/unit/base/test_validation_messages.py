@@ -39,7 +39,9 @@ LIBRARY = re.compile(
 )  # fmt: skip
 def test_the_form_of_a_name_is_described_in_words(pattern: str, words: str) -> None:
     assert body_refusal(f"Expected `str` matching regex '{pattern}'") == f"must be {words}"
-    told = refusal({"type": "string_pattern_mismatch", "ctx": {"pattern": pattern}, "input": "ü"})
+    told = refusal(
+        {"type": "string_pattern_mismatch", "loc": (), "msg": "", "ctx": {"pattern": pattern}, "input": "ü"}
+    )
     assert told == f"must be {words}, not 'ü'"
 
 

@@ -55,6 +55,7 @@ def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
     ]  # fmt: skip
     for message, descriptors in received:
         for descriptor in descriptors:
+            assert isinstance(message, SocketKept)
             with socket.socket(fileno=descriptor) as sock:
                 assert names[sock.getsockname()] == message.name
 

@@ -203,6 +203,7 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     while verify(path).signed_checkpoints < verify(path).checkpoints:
         assert select.select([link[0]], [], [], _LIMIT_SECONDS)[0], "no answer"
         for message, _descriptors in link[0].receive():
+            assert isinstance(message, SignatureMade)
             log.signed(message.number, message.signature, message.public_key)
         settle(log)
     log.close()

@@ -151,7 +151,7 @@ def test_forgetting_an_incarnation_removes_its_rows(tmp_path: Path) -> None:
 def test_parameters_keep_their_types(tmp_path: Path) -> None:
     store = reopened(tmp_path)
     assert store.load_parameters() == {}
-    tree = {"a": {"b": [1, 2.5, True, "x", b"\x00\xff"]}, "empty": {}, "nan_free": -(2**31)}
+    tree: dict[str, Value] = {"a": {"b": [1, 2.5, True, "x", b"\x00\xff"]}, "empty": {}, "nan_free": -(2**31)}
     store.save_parameters(tree)
     store.close()
     again = reopened(tmp_path)

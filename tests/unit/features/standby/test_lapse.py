@@ -6,7 +6,7 @@ from typing import cast
 import pytest
 
 from appliance.base import clock
-from appliance.channel.messages import LeaseEnded, LeaseHeld
+from appliance.channel.messages import LeaseEnded, LeaseHeld, Message
 from appliance.features.standby.lease_watch import LeaseWatch
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.process_handle import ProcessHandle
@@ -36,7 +36,7 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
     for slot, process in zip(supervisor.slots[:-1], stand_ins, strict=True):
         slot.process, process.ready, process.role = cast(ProcessHandle, process), True, slot.role.name
 
-    def report(message: object) -> None:
+    def report(message: Message) -> None:
         supervisor.reports.received(cast(ProcessHandle, lease), message, ())
 
     report(LeaseHeld(clock.since_boot() + 60, 5))

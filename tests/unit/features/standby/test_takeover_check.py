@@ -230,7 +230,7 @@ async def test_an_audit_log_that_cannot_be_written(standby: Standby) -> None:
 class OwnCompiler(SpecificationCompiler):
     questions = 0
 
-    async def _asked(self, question: Callable[[int], Any], **_: Any) -> Any:
+    async def _asked(self, question: Callable[[int], Any], *_: Any, **__: Any) -> Any:
         self.questions += 1
         wanted = question(0)
         if isinstance(wanted, messages.PartsWanted):
