@@ -309,25 +309,25 @@ class TopicCodegen:
             for number, event in enumerate(events)
         ]
         functions = [*self._written, *self.handlers()]
-        self._says = any(written.says for written in functions)
-        if self._says and stamped and any(written.early for written in functions):
+        self._says = any(written.effects.says for written in functions)
+        if self._says and stamped and any(written.effects.early for written in functions):
             raise NotCompiledError("prints a line about a message whose header it changes")
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
         self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
         assigned = sorted(
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
-        if any(written.changes_elements for written in functions) and any(
+        if any(written.effects.changes_elements for written in functions) and any(
             isinstance(cells.variables[name][1], value_types.VectorType) for name in assigned
         ):
             raise NotCompiledError("keeps an array, and changes an element of one")
         addresses = [cells.variables[name][0] for name in assigned]
         self._settles = not set(addresses).isdisjoint(cells.kept)
-        self._replaces = any(written.replaces for written in self._written)
+        self._replaces = any(written.effects.replaces for written in self._written)
         if self._replaces and self._settles and any(map(self._reads_in_place, events)):
             raise NotCompiledError("keeps a string or an array, and sends the safe message")
         self._undo = tuple((address, writer.take(8)) for address in addresses)
-        self._log = writer.take(16 * sum(written.writes for written in self._written))
+        self._log = writer.take(16 * sum(written.effects.writes for written in self._written))
         properties = {
             advance.property for event in events for advance in event.advances if advance.property is not None
         }
@@ -358,7 +358,7 @@ class TopicCodegen:
         return TopicCode(
             name,
             any(map(self._drops, range(len(self._events)))),
-            any(written.writes for written in self._written),
+            any(written.effects.writes for written in self._written),
             self.verdicts,
             self._counters,
             self._log,
@@ -374,7 +374,7 @@ class TopicCodegen:
 
     def _drops(self, number: int) -> bool:
         run = [written for advance in self._events[number].advances for _, written in self._handled(advance)]
-        return any(written.drops for written in (self._written[number], *run))
+        return any(written.effects.drops for written in (self._written[number], *run))
 
     def _table(self, number: int, place: int) -> int | None:
         advance = self._events[number].advances[place]
@@ -428,7 +428,7 @@ class TopicCodegen:
             self._frame(),
             BLOCK, BLOCK,
             *(self._event(number) for number in range(len(self._events))),
-            self._changed() if any(written.writes for written in self._written) else b"",
+            self._changed() if any(written.effects.writes for written in self._written) else b"",
             br(1), END,
             self._dropped(), END,
             self._done(),
@@ -485,20 +485,20 @@ class TopicCodegen:
             code += store(I32, ALTERED, load(I32, UNDO) + constant(I32, self._log) + I32_NE)
         code += _set(bits, message + call(written.number))
         code += self._is(bits, ELSEWHERE) + left
-        if written.writes:
+        if written.effects.writes:
             loud = local_get(_TOLD) + constant(I64, 0) + I64_LT_S
             changed = self._is(bits, CHANGED) + constant(I32, 0) + I32_NE
             code += changed + loud + I32_AND + left
             wrote = (
                 changed
-                if not written.replaces
+                if not written.effects.replaces
                 else self._is(bits, CHANGED | REPLACED) + constant(I32, 0) + I32_NE
             )
             which = wrote + I64_EXTEND_I32_U + constant(I64, number) + I64_SHL
             code += _set(_WHO, local_get(_WHO) + which + I64_OR)
-        if written.drops:
+        if written.effects.drops:
             code += self._drop(number, self._is(bits, DROPPED))
-        if written.replaces:
+        if written.effects.replaces:
             code += self._is(bits, REPLACED) + IF + NOTHING + self._suppressed() + END
         gone = self._telling + 3
         steps = [
@@ -508,10 +508,10 @@ class TopicCodegen:
         ]
         if steps:
             happened = self._is(bits, HAPPENED)
-            if written.replaces:
+            if written.effects.replaces:
                 happened = self._is(bits, HAPPENED | REPLACED) + constant(I32, HAPPENED) + I32_EQ
             code += happened + IF + NOTHING + b"".join(steps) + END
-        if any(written.drops for advance in event.advances for _, written in self._handled(advance)):
+        if any(written.effects.drops for advance in event.advances for _, written in self._handled(advance)):
             code = _set(gone, constant(I32, 0)) + code + self._drop(number, local_get(gone))
         return code + END
 

@@ -11,7 +11,7 @@
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from types import MappingProxyType
@@ -108,6 +108,20 @@ EARLY = 16
 MOST_SAFE = 1024
 
 
+@dataclass
+class MessageEffects:
+    """The possible effects of a function; `writes` counts the places that write to the message."""
+
+    writes: int = 0
+    drops: bool = False
+    says: bool = False
+    """Whether it may print lines."""
+    early: bool = False
+    """Whether it may write to the first bytes of the message, where a header is."""
+    changes_elements: bool = False
+    replaces: bool = False
+
+
 @dataclass(frozen=True)
 class WasmFunction:
     number: int
@@ -115,18 +129,11 @@ class WasmFunction:
     result: int
     code: bytes
     assigned: frozenset[str]
-    writes: int
-    drops: bool
+    effects: MessageEffects = field(hash=False)
     brief: bool
     """Whether it has no loops."""
     passes: bool
     """Whether conditions may end it early for some messages."""
-    says: bool
-    """Whether it may print lines."""
-    early: bool
-    """Whether it may write to the first bytes of the message, where a header is."""
-    changes_elements: bool
-    replaces: bool = False
     references: tuple[tuple[str, int], ...] = ()
     """Each reference parameter, with the address where the function stores its value before it returns."""
     names: tuple[str, ...] = ()
@@ -189,8 +196,7 @@ class ModuleCodegen(MemoryLayout):
 
     def _added(self, parameters: tuple[int, ...], code: bytes, result: int = I32) -> WasmFunction:
         written = WasmFunction(
-            len(self.written), parameters, result, code, frozenset(), 0,
-            drops=False, brief=True, passes=True, says=False, early=False, changes_elements=False,
+            len(self.written), parameters, result, code, frozenset(), MessageEffects(), brief=True, passes=True,
         )  # fmt: skip
         self.written.append(written)
         return written
@@ -216,11 +222,7 @@ class _FunctionCodegen(StringCodegen):
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # was checked
         self._types = tuple(parameters.values())
         self._depends = False  # whether messages may be left before this place
-        self._writes = 0
-        self._drops = False
-        self._says = False
-        self._early = False
-        self._changes_elements = False
+        self._effects = MessageEffects()
         self._channel = channel
         self._safe: nodes.SafeMessage | None = None
         self._bits: tuple[tuple[str, int], ...] = ()
@@ -244,14 +246,9 @@ class _FunctionCodegen(StringCodegen):
             self._result,
             function([(1, machine) for _, machine in made], body + UNREACHABLE),
             frozenset(self._assigned.intersection(self._writer.shared)),
-            self._writes,
-            self._drops,
+            replace(self._effects, replaces=self._safe is not None),
             self._brief,
             self._depends,
-            self._says,
-            self._early,
-            self._changes_elements,
-            self._safe is not None,
             tuple(self._references.items()),
             tuple(self._locals),
         )
@@ -361,7 +358,7 @@ class _FunctionCodegen(StringCodegen):
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
-        self._drops = True
+        self._effects.drops = True
         return constant(I32, 1) + self._set("dropped")
 
     def _stop(self, node: nodes.StopMessage) -> bytes:
@@ -376,11 +373,11 @@ class _FunctionCodegen(StringCodegen):
 
     def _put_safe(self, safe: nodes.SafeMessage, site: int) -> bytes:
         code, offset = b"", safe_messages.HEAD if safe.stamped else 0
-        self._early = self._early or offset < EARLY
+        self._effects.early = self._effects.early or offset < EARLY
         while offset < len(safe.data):
             size = next(size for size in _MOVES if offset + size <= len(safe.data))
             number = int.from_bytes(safe.data[offset : offset + size], "little")
-            self._writes += 1
+            self._effects.writes += 1
             code += self._put_bits(self._get("at"), offset, size, constant(I64 if size == 8 else I32, number))
             offset += size
         return code + self._leave(nodes.Leave(site, True))
@@ -422,8 +419,8 @@ class _FunctionCodegen(StringCodegen):
         if (safe := self._safe) is not None:
             code += self._when(self._get("replaced"), lambda: self._put_safe(safe, node.site))
         for write in sorted(node.writes, key=lambda write: write.end is not None):
-            self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
-            self._changes_elements = self._changes_elements or any(
+            self._effects.early = self._effects.early or (write.at.base is None and write.at.offset < EARLY)
+            self._effects.changes_elements = self._effects.changes_elements or any(
                 isinstance(part, int) for part in write.path[1:]
             )
             code += self._when(self._get(write.flag), partial(self._put_field, write, node.site))
@@ -453,7 +450,7 @@ class _FunctionCodegen(StringCodegen):
             )
         elif len(codes) == 2:
             code, value = self._parts_of(write.value.type, value)
-        self._writes += 1
+        self._effects.writes += 1
         base = b"" if write.at.base is None else self._get(write.at.base, I64) + I32_WRAP_I64 + I32_ADD
         return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
 
@@ -525,7 +522,7 @@ class _FunctionCodegen(StringCodegen):
         for place, value in enumerate(line.values):
             first, slot, size = self._slot(value, f"value {place} {number}", HEAD.size + 8 * place)
             code, stores, cost = code + first, stores + slot, cost + size
-        self._says = True
+        self._effects.says = True
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
     def _noted_line(self, line: OutputLine, cost: bytes) -> bytes:
@@ -704,7 +701,7 @@ class _FunctionCodegen(StringCodegen):
             called = self._writer.function(function, parameters, result, function.context)
             self._assigned |= called.assigned
         self._brief = self._brief and called.brief
-        self._says = self._says or called.says
+        self._effects.says = self._effects.says or called.effects.says
         return code + call(called.number), called.references
 
     def _return(self, node: nodes.Return) -> bytes:
