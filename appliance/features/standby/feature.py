@@ -34,6 +34,7 @@ FEATURE = Feature(
     },
     console=(
         ConsolePart("banner", "pair.js", "PairBanner"),
+        ConsolePart("situation", "pair.js", "Ready"),
         ConsolePart("now", "pair.js", "PairNow"),
         ConsolePart("standby", "page.js", "StandbyPage"),
     ),

@@ -2,6 +2,7 @@ import errno
 import functools
 import json
 import re
+import signal
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -12,6 +13,7 @@ from playwright.sync_api import Browser, Page, Playwright, expect
 
 from examples.landshark.lab import Host as LabHost
 from examples.landshark.lab import Lab
+from tests.support.appliance import OPEN_POLICY
 from tests.support.features.standby.standby_site import ADDRESSES, StandbySite
 from tests.support.requirements import need_root
 from tests.support.rest import Rest
@@ -20,6 +22,9 @@ from tests.system.console.conftest import launch
 from tests.system.console.reader import LIMIT, Reader
 
 PORT = 8443
+SIZES = ((1440, 900), (390, 844))
+HOLDER = "10.79.0.20"
+POLICY = f"{OPEN_POLICY}[Authority]\nbase = /cmd_vel\ntake base = *\nlease base = 600s\n"
 SETTINGS = f"""\
 api: 0.0.0.0:{PORT}
 api_networks: [10.79.0.0/24]
@@ -45,7 +50,7 @@ class PairConsoles:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
     need_root()
     home = tmp_path_factory.mktemp("pair")
-    with Lab("rosrv-console") as lab, StandbySite(lab, home, settings=SETTINGS) as site:
+    with Lab("rosrv-console") as lab, StandbySite(lab, home, policy=POLICY, settings=SETTINGS) as site:
         site.start_witness()
         site.start("a")
         site.start("b")
@@ -229,3 +234,60 @@ def _switch_over(page: Page, name: str) -> None:
 
     order.click()
     eventually(closed, "the switchover is ordered")
+
+
+def test_a_standby_that_died_is_seen_at_once(pair: PairConsoles) -> None:
+    windows = [pair.open("a", "viewer", width=width, height=height) for width, height in SIZES]
+    for reader in windows:
+        reader.go("now")
+        expect(panel(reader.page).get_by_role("row").nth(2)).to_contain_text(
+            "can take over", timeout=2 * LIMIT
+        )
+    pair.site.signal("b", signal.SIGKILL)
+    for reader in windows:
+        reader.sees(ready(reader.page), re.compile(r"b is away for \d+ s"))
+        reader.fits()
+        reader.keep_picture("a_dead_standby")
+        expect(panel(reader.page).get_by_role("row").nth(2)).to_contain_text("away")
+    one = pair.site.appliances["b"]
+    assert one.process is not None
+    one.process.stop()
+    pair.site.start("b")
+    pair.site.until_both_in_sync()
+    for reader in windows:
+        expect(ready(reader.page)).to_contain_text("b can take over", timeout=2 * LIMIT)
+
+
+def test_a_page_of_the_earlier_active_shows_no_holder_as_present(pair: PairConsoles) -> None:
+    """Its machine loses its power: the page says so. The new active has no holder, and the page then leads there."""
+    pair.site.appliances["a"].rosrv("drive", "assign", "base", "--host", HOLDER)
+    windows = [pair.open("a", "admin", width=width, height=height) for width, height in SIZES]
+    for reader in windows:
+        expect(drives(reader.go("now"))).to_contain_text(f"{HOLDER} drives base")
+    pair.site.cut("a")
+    for reader in windows:
+        reader.sees(reader.page.locator(".banner"), re.compile("No news|Not live"))
+        reader.sees(drives(reader.page), re.compile(r"^Drives, \d+ s ago"))
+        reader.fits()
+        reader.keep_picture("the_active_died")
+    pair.site.until_taken_over("b")
+    for width, height in SIZES:
+        reader = pair.open("b", "admin", width=width, height=height)
+        reader.go("now")
+        reader.sees(drives(reader.page), "no host drives base")
+        reader.sees(ready(reader.page), re.compile("a (is away|cannot take over)"))
+        reader.keep_picture("after_a_takeover")
+    pair.site.restore("a")
+    for reader in windows:
+        expect(reader.page.get_by_role("heading", level=1, name="Standby")).to_be_visible(timeout=2 * LIMIT)
+        expect(reader.page.get_by_role("link", name="Open the console of b")).to_be_visible()
+        expect(reader.page.get_by_text(HOLDER)).to_be_hidden()
+        reader.keep_picture("the_earlier_active_is_the_standby")
+
+
+def drives(page: Page) -> Any:
+    return page.get_by_role("region", name="Situation").get_by_role("link", name=re.compile("^Drives"))
+
+
+def ready(page: Page) -> Any:
+    return page.get_by_role("region", name="Situation").get_by_role("link", name=re.compile("^Standby"))

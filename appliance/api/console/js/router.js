@@ -17,11 +17,12 @@ export function go(path, { replace = false } = {}) {
 }
 
 /** A link within the console. */
-export function Link(/** @type {any} */ { to, children, ...more }) {
+export function Link(/** @type {any} */ { to, children, onClick, ...more }) {
   const follow = (/** @type {MouseEvent} */ event) => {
     if (event.metaKey || event.ctrlKey || event.shiftKey || event.button) return;
     event.preventDefault();
     go(to);
+    onClick?.();
   };
   return html`<a href=${to} onClick=${follow} ...${more}>${children}</a>`;
 }

@@ -5,6 +5,7 @@ import { live } from "#console/live.js";
 import { lasting, Moment } from "#console/moments.js";
 import { counted } from "#console/numbers.js";
 import { Badge } from "#console/parts/badge.js";
+import { Fact } from "#console/parts/fact.js";
 import { Given } from "#console/parts/given.js";
 import { Icon } from "#console/parts/icon.js";
 import { useStore } from "#console/store.js";
@@ -30,6 +31,17 @@ export function Pair({ state, orders = false }) {
       <tr><${Name} name="Witness" address=${witness.address} more="on the robot" /><td><${Witness} witness=${witness} name=${state.name} active=${active} /></td></tr>
     </tbody></table></div>
     <div class="panel-body small muted">Nodes reach the active appliance at <${Given} value=${state.fixed} mono />.${active ? ` ${waits(state)}` : ""}</div></section>`;
+}
+
+/** Whether the standby could take over, in the situation: at once, while an alarm waits a minute for a machine that is updated. */
+export function Ready() {
+  const state = useStore(live, (one) => one.status?.standby);
+  if (!state) return null;
+  const { other, troubles } = state;
+  const [words, why] = !other.connected ? [`is away${other.trouble_seconds === null ? "" : ` for ${lasting(other.trouble_seconds)}`}`, other.reason]
+    : troubles.length ? ["cannot take over", troubles[0]] : other.in_sync ? ["can take over", ""] : ["is behind: it cannot take over", ""];
+  const wrong = !other.connected || troubles.length > 0 || !other.in_sync;
+  return html`<${Fact} name="Standby" to="/console/now" show="pair" tone=${wrong ? "warn" : ""}><${Given} value=${other.name} most=${40} /> <span class=${wrong ? "" : "muted"}>${words}</span>${why && html`<div class="muted small"><${Given} value=${why} most=${100} /></div>`}</${Fact}>`;
 }
 
 /** The most urgent condition of the two appliances. */

@@ -5,8 +5,8 @@ import { lasting } from "../moments.js";
 import { Link } from "../router.js";
 import { useAge } from "../standing.js";
 
-/** @param {{name: string, to: string, tone?: "allow" | "warn" | "deny" | "", children?: any}} given */
-export function Fact({ name, to, tone = "", children }) {
+/** @param {{name: string, to: string, show?: string, tone?: "allow" | "warn" | "deny" | "", children?: any}} given `show`: the id of the part of this page that it is about */
+export function Fact({ name, to, show = "", tone = "", children }) {
   const { age, old } = useAge();
-  return html`<${Link} to=${to} class=${`fact ${old ? "old" : tone}`}><span class="fact-name">${name}${old && `, ${lasting(age)} ago`}</span><span class="fact-text">${children}</span></${Link}>`;
+  return html`<${Link} to=${to} onClick=${() => document.getElementById(show)?.scrollIntoView()} class=${`fact ${old ? "old" : tone}`}><span class="fact-name">${name}${old && `, ${lasting(age)} ago`}</span><span class="fact-text">${children}</span></${Link}>`;
 }
