@@ -34,7 +34,7 @@ FEATURE = Feature(
     },
     console=(
         ConsolePart("banner", "pair.js", "PairBanner"),
-        ConsolePart("situation", "pair.js", "Ready"),
+        ConsolePart("situation", "pair.js", "Ready", order=4),
         ConsolePart("now", "pair.js", "PairNow"),
         ConsolePart("standby", "page.js", "StandbyPage"),
     ),

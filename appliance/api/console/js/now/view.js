@@ -13,6 +13,7 @@ import { Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Link } from "../router.js";
 import { useKeys } from "../shortcuts.js";
+import { useAge } from "../standing.js";
 import { useStore } from "../store.js";
 import { Alarms, placeOf } from "./alarms.js";
 import { Doings, Refusals } from "./lists.js";
@@ -47,7 +48,8 @@ export function Now() {
 function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) {
   const grave = alarms.filter((one) => one.severity === "alarm").length;
   const warnings = alarms.filter((one) => one.severity === "warning").length;
-  const state = grave ? ["deny", "Needs attention"] : warnings ? ["warn", "In service, with warnings"] : ["allow", "In service"];
+  const { old } = useAge();
+  const state = old ? ["", "Not known"] : grave ? ["deny", "Needs attention"] : warnings ? ["warn", "In service, with warnings"] : ["allow", "In service"];
   const first = alarms.find((one) => one.severity !== "notice");
   const isolation = status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`;
   const { policy, monitors, ipsec, audit } = status;
