@@ -288,7 +288,7 @@ WALL_CLOCK = {
         "features/tunnels/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
         "features/recorder/recorder.py", "features/recorder/ring.py", "features/recorder/recorder_ring.py",
         "features/recorder/rings.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
-        "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
+        "specifications/specifications_in_force.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
         "supervisor/supervisor.py",
     ],
     "the date of an end of `EndTable`, for people and for the api": [

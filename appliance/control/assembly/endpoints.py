@@ -20,7 +20,7 @@ from appliance.master.reconcile.sinks import Enforcement, MasterSideApi, ProxyEn
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations, RosMaster, limits_of_answers
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.specification_manager import ALLOCATION
+from appliance.specifications.specifications_in_force import ALLOCATION
 from roswire.standard import standard_definitions
 
 _REFUSALS = 2
