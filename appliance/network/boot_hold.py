@@ -7,7 +7,8 @@
    systemd also restarts it with rosrv.service; then `off` leaves the hold in force, without a gap.
 2. It is armed by a start that serves. An appliance that never served, or that is off, holds up no host.
 3. Other machines: new TCP connections to RVMaster's port and the kernel's range, in which nodes listen, are dropped, so
-   their clients try again. Loopback, the appliance's link, established connections and other ports pass.
+   their clients try again. Loopback, the appliance's link, established connections and other ports pass. While a graph
+   is given back before a restart, only RVMaster's port is held: nodes of other machines then connect with one another.
 4. `own`: new connections of the machine to itself on RVMaster's port are also dropped. The kernel ends this part after
    its seconds, even if no process of the appliance runs.
 """
@@ -56,8 +57,11 @@ class HeldPorts:
     own_seconds: int | None = None
 
 
-def hold_rules(held: HeldPorts, own_seconds: int) -> tuple[PacketRule, ...]:
-    """Return the rules; the machine's own connections are held for `own_seconds` more, or not if that is 0."""
+def hold_rules(held: HeldPorts, own_seconds: int, *, nodes: bool = True) -> tuple[PacketRule, ...]:
+    """Return the rules; the machine's own connections are held for `own_seconds` more, or not if that is 0.
+
+    Without `nodes`, only the port of the master is held.
+    """
     rules = []
     if held.link:
         rules.append(
@@ -80,7 +84,7 @@ def hold_rules(held: HeldPorts, own_seconds: int) -> tuple[PacketRule, ...]:
                 seconds=own_seconds,
             )
         )
-    for ports in (PortRange.one(held.master), PortRange(held.first, held.last)):
+    for ports in (PortRange.one(held.master), PortRange(held.first, held.last))[: 1 + nodes]:
         rules.append(
             PacketRule(
                 f"hold: other machines wait for the appliance, TCP {ports}",
@@ -115,20 +119,21 @@ class BootHold:
         """Return whether the rules are as `put` or `lift` left them: another program may have flushed them."""
         return not self._in_force.exists() or any(map(_holds, self._backends))
 
-    def put(self) -> bool:
+    def put(self, *, nodes: bool = True) -> bool:
         """Hold other machines off, if armed; return whether another program had removed the rules of an earlier hold.
 
-        Raises `FirewallError`; without a working back end, nothing is held.
+        Without `nodes`, they are held off the master alone. Raises `FirewallError`; without a working back end, nothing
+        is held.
         """
         held = self._held()
         if held is None:
             return False
         removed = not self.is_intact()
-        own = 0 if held.own_seconds is None else held.own_seconds - int(self._seconds_so_far())
+        own = 0 if held.own_seconds is None or not nodes else held.own_seconds - int(self._seconds_so_far())
         reasons = []
         for backend in self._backends:
             try:
-                backend.install(hold_rules(held, own))
+                backend.install(hold_rules(held, own, nodes=nodes))
             except FirewallError as error:
                 reasons.append(f"{backend.name}: {error}")
             else:
@@ -198,7 +203,7 @@ def _holds(backend: Backend) -> bool:
     return False
 
 
-def _starts_again() -> bool:
+def starts_again() -> bool:
     """Return whether systemd is to start rosrv.service, as after the stop of a restart."""
     command = ["systemctl", "list-jobs", "--no-legend", "--plain", _SERVICE]
     try:
@@ -215,7 +220,7 @@ def main(arguments: Sequence[str]) -> None:
         if list(arguments) == ["on"]:
             hold.put()
         elif list(arguments) == ["off"]:
-            if not _starts_again():
+            if not starts_again():
                 hold.lift()
         else:
             sys.exit("usage: python -m appliance.network.boot_hold on|off")

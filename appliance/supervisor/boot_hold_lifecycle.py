@@ -9,7 +9,7 @@ import structlog
 from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.configuration.settings import Settings
-from appliance.network.boot_hold import BootHold, HeldPorts
+from appliance.network.boot_hold import BootHold, HeldPorts, starts_again
 from appliance.network.close_ports import local_port_range
 from appliance.network.namespaces import Namespace, NetworkError
 
@@ -49,6 +49,14 @@ class HoldAround:
                 log.error(
                     "other machines are not held off while the appliance does not serve", error=str(error)
                 )
+
+    def put_before_restart(self) -> None:
+        """Hold other machines off the master before an ordered restart gives the robot's graph back to its own one."""
+        if self._ports is not None and starts_again():
+            try:
+                self._hold.put(nodes=False)
+            except (NetworkError, OSError) as error:
+                log.error("other machines reach the robot's own master until the restart", error=str(error))
 
     def keep(self) -> None:
         """Restore the hold if another program has removed its rules; looks every five seconds at most."""

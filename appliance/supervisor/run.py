@@ -307,6 +307,7 @@ def _supervise(
             stands_by=say_standing_by,
             gate=pairing.gate if pairing is not None else ServiceGate,
             work=work,
+            gives_back=hold.put_before_restart,
         )
         async with manager.watched():
             keeping = asyncio.create_task(_keep(hold, supervisor, isolation))

@@ -117,8 +117,10 @@ class Supervisor:
         stands_by: Callable[[], None] = lambda: None,
         gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
         work: MachineWork | None = None,
+        gives_back: Callable[[], None] = lambda: None,
     ) -> None:
-        """`ready` and `stands_by` are called at most once; `ready` may raise `StartError`.
+        """`ready` and `stands_by` are called at most once; `ready` may raise `StartError`. `gives_back` is called
+        before an ordered end gives a graph back.
 
         Without `memory`, the state of monitors is lost when relays die.
         """
@@ -143,6 +145,7 @@ class Supervisor:
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
         self.reports = ProcessCallbacks(self._received, self._violated, self.died)
         self._work = work or NoMachineWork()
+        self._gives_back = gives_back
         self.stopping = asyncio.Event()
         self._end_agreed = asyncio.Event()
         self._process_died = asyncio.Event()
@@ -195,6 +198,7 @@ class Supervisor:
         """Let control give a graph back that it took over, unless the appliance ends because of a failure."""
         if self.failure is not None or not self.is_ready or not self._work.takes_over():
             return
+        await asyncio.to_thread(self._gives_back)
         self._work.end()
         self._tell_control(messages.EndAnnounced())
         try:

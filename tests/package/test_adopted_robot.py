@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.booted_debian import BootedDebian, booted_debian
-from tests.support.vendors_robot import adopted, fetch_like, is_adopted, record_of, runs, write_robot
+from tests.support.vendors_robot import adopted, closed, fetch_like, is_adopted, record_of, runs, write_robot
 from tests.support.waiting import eventually
 
 pytestmark = pytest.mark.timeout(7200)  # the system is fetched and the package is built
@@ -45,8 +45,9 @@ def test_a_vendors_robot_is_adopted_and_given_back(suite: str, package: Path, tm
             for _ in range(BOOTS):
                 boots_adopted(debian, order, drop_ins)
         the_power_fails_in_the_middle(debian)
-        debian.run("systemctl", "restart", "rosrv")
-        adopted(debian)
+        with closed(debian):
+            debian.run("systemctl", "restart", "rosrv")
+            adopted(debian)
         removal = debian.run("dpkg", "--remove", "rosrv")
         runs(debian)
         assert not list((debian.root / "etc/systemd/system").glob("*/50-rosrv-adopt.conf")), (

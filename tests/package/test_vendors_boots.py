@@ -6,7 +6,6 @@ master, and no unit fails.
 
 import os
 import random
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 from tests.support.booted_debian import BootedDebian, booted_debian
 from tests.support.vendors_robot import (
     adopt,
+    closed,
     is_adopted,
     nodes,
     roslaunch_alone,
@@ -83,21 +83,8 @@ def boot(debian: BootedDebian, units: list[str], generator: random.Random) -> No
 
 def settle(debian: BootedDebian, is_settled: Callable[[], bool]) -> None:
     """Wait for the end of a boot, in which no other machine may reach the robot's own master."""
-    found, end = set[str](), threading.Event()
-    look = threading.Thread(target=lambda: visit(debian, found, end))
-    look.start()
-    try:
+    with closed(debian):
         eventually(is_settled, debian.story)
-    finally:
-        end.set()
-        look.join()
-    assert found <= {"", "RVMaster"}, f"{found}\n{debian.story()}"
-
-
-def visit(debian: BootedDebian, found: set[str], end: threading.Event) -> None:
-    while not end.is_set():
-        found.add(debian.master_of_visitor())
-        end.wait(0.1)
 
 
 def units_are_content(debian: BootedDebian, *units: str) -> None:

@@ -1,6 +1,9 @@
 """Robots as vendors make them, in a `BootedDebian`: their units, and what shows that they run."""
 
+import contextlib
 import json
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 from tests.support.booted_debian import BootedDebian
@@ -80,6 +83,7 @@ def is_adopted(debian: BootedDebian) -> bool:
 
 def adopted(debian: BootedDebian) -> None:
     eventually(lambda: is_adopted(debian), debian.story)
+    eventually(lambda: debian.master_of_visitor() == "RVMaster", debian.story)
     runs(debian)
 
 
@@ -95,6 +99,26 @@ def adopt(debian: BootedDebian, units: dict[str, str]) -> None:
     said = debian.shell("rosrv adopt --audit-only")
     assert "adopted" in said, f"{said}\n{debian.story()}"
     adopted(debian)
+
+
+@contextlib.contextmanager
+def closed(debian: BootedDebian) -> Iterator[None]:
+    """No other machine may reach the robot's own master in this block."""
+    found, end = set[str](), threading.Event()
+
+    def visit() -> None:
+        while not end.is_set():
+            found.add(debian.master_of_visitor())
+            end.wait(0.1)
+
+    visits = threading.Thread(target=visit)
+    visits.start()
+    try:
+        yield
+    finally:
+        end.set()
+        visits.join()
+    assert found <= {"", "RVMaster"}, f"{found}\n{debian.story()}"
 
 
 def record_of(debian: BootedDebian) -> Path:

@@ -9,9 +9,11 @@ import pytest
 from appliance.base.clock import using
 from appliance.configuration.settings import FirewallSection, Settings
 from appliance.network import boot_hold
-from appliance.network.boot_hold import BootHold, HeldPorts
+from appliance.network.boot_hold import BootHold, HeldPorts, hold_rules
 from appliance.network.firewall.backend import FirewallError
+from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace
+from appliance.supervisor import boot_hold_lifecycle
 from appliance.supervisor.boot_hold_lifecycle import HoldAround
 from tests.support.virtual_clock import VirtualClock
 
@@ -25,8 +27,8 @@ class RecordedHold(BootHold):
         self._lapsed, self._broken = lapsed, broken
         self.flushed = False
 
-    def put(self) -> bool:
-        self.calls.append("put")
+    def put(self, *, nodes: bool = True) -> bool:
+        self.calls.append("put" if nodes else "put master")
         if self._broken:
             raise FirewallError("no back end works")
         removed, self.flushed = self.flushed, False
@@ -72,6 +74,34 @@ def test_the_service_holds_until_it_serves_and_at_its_end(
     assert run.served() == ""
     run.put()
     assert hold.calls == ["put", "lift", armed, "put"]
+
+
+@pytest.mark.parametrize(("again", "calls"), [(True, ["put master", "put"]), (False, ["put"])])
+def test_before_a_restart_other_machines_wait_while_a_graph_is_given_back(
+    monkeypatch: pytest.MonkeyPatch, again: bool, calls: list[str]
+) -> None:
+    monkeypatch.setattr(boot_hold_lifecycle, "starts_again", lambda: again)
+    hold = RecordedHold()
+    run = around(hold)
+    run.put_before_restart()
+    run.put()
+    assert hold.calls == calls
+
+
+def test_a_hold_before_a_restart_that_fails_does_not_stop_the_giving_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(boot_hold_lifecycle, "starts_again", lambda: True)
+    around(RecordedHold(broken=True)).put_before_restart()
+    hold = RecordedHold()
+    around(hold, "off").put_before_restart()
+    assert hold.calls == []
+
+
+def test_while_a_graph_is_given_back_nodes_of_other_machines_connect() -> None:
+    held = HeldPorts(11311, 32_768, 60_999, "veth-rosrv")
+    ports = [rule.tcp_ports for rule in hold_rules(held, 0, nodes=False) if rule.tcp_ports is not None]
+    assert ports == [PortRange.one(11311)]
 
 
 @pytest.mark.anyio
