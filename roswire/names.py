@@ -17,6 +17,8 @@ from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
 """A generous limit: names on robots are shorter than a quarter of it."""
+ROSOUT = "/rosout"
+"""The node that collects the log, and the topic of the log."""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]++){1,512}\Z")  # a name of MAX_NAME_LENGTH has at most 512 segments

@@ -15,8 +15,9 @@ from typing import NamedTuple
 from appliance.base.actors import DISK
 from appliance.base.owner_access import is_named_there
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.policy_gate import KeptPolicy, PolicyRefusedError, policy_at_start
+from appliance.control.assembly.policy_gate import KeptPolicy, policy_at_start
 from appliance.control.assembly.robot import robot_addresses
+from appliance.control.errors import PolicyRefusedError
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS

@@ -1,5 +1,7 @@
 """Define the errors of requests that cannot be answered, and of a state that cannot be used."""
 
+from collections.abc import Sequence
+
 
 class UnknownThingError(Exception):
     """The requested name or number does not exist."""
@@ -19,3 +21,11 @@ class StateError(Exception):
 
 class TokenRefusedError(Exception):
     """The token cannot be made or revoked; the message gives the reason."""
+
+
+class PolicyRefusedError(Exception):
+    """The policy is rejected; `findings` has every reason, as `file:line:column: error: text`."""
+
+    def __init__(self, findings: Sequence[str]) -> None:
+        super().__init__("\n".join(findings))
+        self.findings = list(findings)

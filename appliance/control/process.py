@@ -29,7 +29,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operator_assembly import Operators, make_operators, make_queries
 from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.spare_memory import return_spare_memory
-from appliance.control.start_gate import StartGate
+from appliance.control.start_gate import StartGate, StartingControl
 from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.features.table import start_gate
 from appliance.hosts.tunnel_state import Tunnels
@@ -106,7 +106,7 @@ async def _start(
     parts.endpoints.places.policy_changed(base.policies.current.ports)
     base.policy_services.began()
     await parts.monitors.start(restarted=restarted, taken_over=role.paired)
-    features.add(await gate.begin(base, parts))
+    features.add(await gate.begin(_starting(base, parts)))
     control = _Control(base, parts, features, make_operators(base, queries, features))
     await _restore(base, parts)
     await control.serve()
@@ -221,6 +221,22 @@ async def _end_others(seconds: float) -> None:
         task.cancel()
     if others:
         await asyncio.wait(others, timeout=seconds)
+
+
+def _starting(base: Foundation, parts: Parts) -> StartingControl:
+    return StartingControl(
+        settings=base.settings,
+        role=base.role,
+        store=base.store,
+        trail=base.trail,
+        audit=base.audit,
+        signed=base.signing.signed,
+        monitors=parts.monitors,
+        parameters=parts.core.parameters,
+        ready=parts.reconciler.ready,
+        relays=lambda: parts.endpoints.relay.presence,
+        probe=lambda: base.lifeline.surroundings.probe,
+    )
 
 
 async def _restore(base: Foundation, parts: Parts) -> None:

@@ -2,19 +2,41 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from appliance.audit.log.log import AuditLog
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.core import ControlPart
 from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.master.parameter_mirror import ParameterMirror
 from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.specifications.specification_manager import SpecificationManager
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 
-if TYPE_CHECKING:
-    from appliance.control.assembly.assembly import Parts
-    from appliance.control.assembly.foundation import Foundation
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StartingControl:
+    """The parts of a control that is about to serve."""
+
+    settings: Settings
+    role: ActiveRole
+    store: StateStore
+    trail: AuditTrail
+    audit: AuditLog
+    signed: asyncio.Event
+    """Set with each signature of a checkpoint."""
+    monitors: SpecificationManager
+    parameters: ParameterMirror
+    ready: asyncio.Event
+    """Set once the ROS master has what the graph has."""
+    relays: Callable[[], str]
+    """Returns whether the relays are connected, as `RelayControl.presence`."""
+    probe: Callable[[], str]
+    """Returns the result of the probe of the ROS master's isolation."""
 
 
 class StartGate:
@@ -34,6 +56,6 @@ class StartGate:
         del config, settings, lifeline, compiler, stopping
         return ActiveRole()
 
-    async def begin(self, base: "Foundation", parts: "Parts") -> ControlPart | None:
-        del base, parts
+    async def begin(self, control: StartingControl) -> ControlPart | None:
+        del control
         return None

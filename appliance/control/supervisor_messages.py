@@ -14,7 +14,7 @@ from appliance.channel.channel import Channel
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.policies import RevisionChangedError
-from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.control.errors import PolicyRefusedError
 from appliance.control.operator_assembly import Operators
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind

@@ -22,13 +22,12 @@ from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.control.assembly.policy_gate import (
     KeptPolicy,
-    PolicyRefusedError,
     judged,
     policy_at_start,
     read_policy,
     with_cases,
 )
-from appliance.control.errors import UnknownThingError
+from appliance.control.errors import PolicyRefusedError, UnknownThingError
 from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext

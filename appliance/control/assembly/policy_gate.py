@@ -3,12 +3,12 @@
 The supervisor imports this module too, so it does not import the store.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from appliance.base.input_files import read_given_text
+from appliance.control.errors import PolicyRefusedError
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
@@ -19,14 +19,6 @@ _KEPT = (
     " the version and configuration that took it, run `rosrv policy reload` there, and start again"
 )
 _NOT_EITHER = "revision {0.revision}, which was in force before, cannot come into force either: {1}"
-
-
-class PolicyRefusedError(Exception):
-    """The policy is rejected; `findings` has every reason, as `file:line:column: error: text`."""
-
-    def __init__(self, findings: Sequence[str]) -> None:
-        super().__init__("\n".join(findings))
-        self.findings = list(findings)
 
 
 class KeptPolicy(NamedTuple):

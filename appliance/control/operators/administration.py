@@ -9,8 +9,13 @@ from appliance.channel.admin import A
 from appliance.channel.channel import ChannelFullError
 from appliance.channel.operations import ORDERS
 from appliance.control.assembly.policies import RevisionChangedError
-from appliance.control.assembly.policy_gate import PolicyRefusedError
-from appliance.control.errors import SenselessError, TokenRefusedError, UnavailableError, UnknownThingError
+from appliance.control.errors import (
+    PolicyRefusedError,
+    SenselessError,
+    TokenRefusedError,
+    UnavailableError,
+    UnknownThingError,
+)
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.hosts.host_table import (

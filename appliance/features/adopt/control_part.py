@@ -22,12 +22,12 @@ from appliance.features.adopt.takeover import AdoptError, AdoptOperation, LeftTh
 from appliance.master.calls.call import Caller
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.graph.registry import Life
-from appliance.master.graph.revocation import ROSOUT
 from appliance.policy.model import Address, address_of
 from appliance.rpc.master_reader import Entry, MasterReader
 from appliance.rpc.server import Peer
 from appliance.store.state_file import StateStore
 from appliance.supervisor.machine_work import Found
+from roswire.names import ROSOUT
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 

@@ -8,12 +8,12 @@ from typing import Protocol
 from appliance.features.adopt.places import NodePlace
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
-from appliance.master.graph.revocation import ROSOUT
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import Answer
 from appliance.policy.model import Address
 from appliance.rpc.master_reader import PUBLICATION, SERVICE, SUBSCRIPTION, Entry, MasterGraph, printable
 from appliance.telemetry.audit_trail import AuditTrail
+from roswire.names import ROSOUT
 from roswire.uris import service_uri
 from roswire.xmlrpc import Value
 

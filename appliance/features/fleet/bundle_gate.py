@@ -11,7 +11,7 @@
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 
 import msgspec
 import structlog
@@ -22,7 +22,7 @@ from appliance.base.counted import counted
 from appliance.channel import admin
 from appliance.channel.link import Link
 from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
-from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.control.errors import PolicyRefusedError
 from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.features.fleet.bundle_link import (
     BundleHealth,
@@ -43,7 +43,6 @@ from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
 from appliance.specifications.specification_manager import MonitorsChangedError, SpecificationManager
-from appliance.specifications.switches import Switches
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -108,8 +107,8 @@ class BundleRecord(msgspec.Struct, frozen=True):
     """
 
 
-def disabled_among(monitors: Iterable[str], switches: Switches) -> str:
-    off = [name for name in monitors if not (switches.enabled(name) or switches.in_shadow(name))]
+def disabled_among(states: Mapping[str, bool | str]) -> str:
+    off = [name for name, state in states.items() if state is False]
     return f"; disabled on this robot: {', '.join(off)} (rosrv monitor enable)" if off else ""
 
 
@@ -339,7 +338,7 @@ class BundleGate:
                 content=self._content(),
             )
         )
-        without = disabled_among(self._monitors.checked.monitors, self._monitors.switches)
+        without = disabled_among(self._monitors.switches.states)
         self._trail.happened(
             "bundle in force",
             f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s{without}",

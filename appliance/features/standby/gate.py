@@ -5,12 +5,10 @@ from pathlib import Path
 
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
 from appliance.control.core import ControlPart
 from appliance.control.errors import StateError
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.start_gate import StartGate
+from appliance.control.start_gate import StartGate, StartingControl
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.lease_link import LeaseLink
 from appliance.features.standby.membership import LINK_FILE, MembershipError, load_membership
@@ -44,8 +42,8 @@ class StandbyGate(StartGate):
         pair = await until_activated(membership, settings, lifeline, self._lease, compiler, stopping=stopping)
         return None if pair is None else PairedRole(pair, settings)
 
-    async def begin(self, base: Foundation, parts: Parts) -> ControlPart:
-        return await begin(base, parts)
+    async def begin(self, control: StartingControl) -> ControlPart:
+        return await begin(control)
 
 
 GATE = StandbyGate

@@ -9,10 +9,9 @@ import structlog
 
 from appliance.base import clock
 from appliance.channel.status_summary import no_relay
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
 from appliance.control.core import ControlPart
 from appliance.control.operators.request_method import RequestMethod
+from appliance.control.start_gate import StartingControl
 from appliance.control.start_rehearsal import lacking_room
 from appliance.features.standby import lease_link
 from appliance.features.standby import requests as standby_requests
@@ -28,13 +27,13 @@ _REPAIR_SECONDS = 8.0
 class ServiceReport:
     """The service reports of one control process."""
 
-    def __init__(self, base: Foundation, parts: Parts) -> None:
-        self._base = base
-        self._parts = parts
+    def __init__(self, control: StartingControl) -> None:
+        self._control = control
         self._sound = clock.now()  # when nothing was to be repaired
 
     def now(self) -> lease_link.ControlServes:
-        failed, monitors, settings = self._base.audit.failed, self._parts.monitors, self._base.settings
+        control = self._control
+        failed, monitors, settings = control.audit.failed, control.monitors, control.settings
         # With less, hosts wait before the log fails: records still fit into SQLite's write-ahead file.
         obstacle = lacking_room(settings.state / "control")
         if failed is not None and settings.audit.on_audit_failure == "deny":
@@ -45,8 +44,8 @@ class ServiceReport:
         return lease_link.ControlServes(obstacle or self._lasting(), keeps_state)
 
     def _lasting(self) -> str:
-        probe = self._base.lifeline.surroundings.probe
-        broken = no_relay(self._parts.endpoints.relay.presence)
+        probe = self._control.probe()
+        broken = no_relay(self._control.relays())
         if probe not in ("", "passed"):
             broken = f"the ROS master is not hidden: {probe}"
         now = clock.now()
@@ -60,26 +59,26 @@ _SEAL_SECONDS = 0.5  # the robot waits
 _log = structlog.get_logger()
 
 
-async def begin(base: Foundation, parts: Parts) -> ControlPart:
-    role = base.role
+async def begin(control: StartingControl) -> ControlPart:
+    role, store = control.role, control.store
     if not isinstance(role, PairedRole):
-        return _part(StandbyOrders(SingleAppliance(), base.trail))
-    pair, replication, rollout = role.pair, role.replication, parts.monitors.rollout
-    recorder = await _begin_epoch(base, parts, pair)
-    copies = StateCopies(pair, base.store, rollout, replication.followed)
+        return _part(StandbyOrders(SingleAppliance(), control.trail))
+    pair, replication, rollout = role.pair, role.replication, control.monitors.rollout
+    recorder = await _begin_epoch(control, pair)
+    copies = StateCopies(pair, store, rollout, replication.followed)
 
     def save_parameters() -> None:
-        mirror = parts.core.parameters
+        mirror = control.parameters
         if mirror.unnoted:  # the standby has all other changes of parameters
             mirror.unnoted = False
-            base.store.save_parameters(mirror.tree)
+            store.save_parameters(mirror.tree)
 
     async def rehearsing() -> None:
         save_parameters()
         await copies.rehearse()
 
     async def leaving() -> None:
-        await leave_state(pair, base.store, rollout)
+        await leave_state(pair, store, rollout)
         save_parameters()
         try:
             async with asyncio.timeout(_SEAL_SECONDS):
@@ -88,11 +87,11 @@ async def begin(base: Foundation, parts: Parts) -> ControlPart:
             _log.warning("the log is not sealed before the switchover: the signer does not answer")
 
     async def report_service() -> None:
-        await parts.reconciler.ready.wait()
-        await pair.lease.report_service(ServiceReport(base, parts).now)
+        await control.ready.wait()
+        await pair.lease.report_service(ServiceReport(control).now)
 
-    active = ActiveAppliance(replication, rehearsing, leaving, partial(keep_state, base.store, rollout))
-    orders = StandbyOrders(active, base.trail)
+    active = ActiveAppliance(replication, rehearsing, leaving, partial(keep_state, store, rollout))
+    orders = StandbyOrders(active, control.trail)
     work: dict[str, Callable[[], Awaitable[None]]] = {
         "the replication": replication.run,
         "the copies of monitors' state": copies.run,
@@ -116,11 +115,11 @@ def _part(orders: StandbyOrders) -> ControlPart:
     )
 
 
-async def _begin_epoch(base: Foundation, parts: Parts, pair: Pair) -> TakeoverRecorder:
+async def _begin_epoch(control: StartingControl, pair: Pair) -> TakeoverRecorder:
     name, other = pair.membership.name, pair.membership.other
     recorder = TakeoverRecorder(
-        base.trail, base.audit, base.store, base.signing.signed, name=name, other=other
+        control.trail, control.audit, control.store, control.signed, name=name, other=other
     )
     await recorder.took_over(pair.epoch)
-    parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
+    control.monitors.rollout.inherit(*inherited_state(pair, control.store))
     return recorder

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from appliance.base.counted import counted
 from appliance.master.calls.call import ApiUri, Attempt, Caller, CallVerb
 from appliance.master.graph.registry import HostFullError, Incarnation, Kind, Life, Registry
-from appliance.master.graph.revocation import OWN, OWN_PARAMETERS, ROSOUT, rosout_may_have
+from appliance.master.graph.revocation import OWN, OWN_PARAMETERS, rosout_may_have
 from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
 from appliance.policy.policy_settings import AT_ONCE
 from appliance.policy.rights import decide, rights_of_call
 from appliance.quotas.table import NAMES
+from roswire.names import ROSOUT
 from roswire.parameter_tree import Tree
 
 _TIMES_THE_REST = 3

@@ -19,7 +19,6 @@ from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree
 
 OWN = "the appliance's own node"
-ROSOUT = "/rosout"
 _RESOURCES = {
     Kind.PUBLICATION: frozenset({"/rosout_agg"}),
     Kind.SUBSCRIPTION: frozenset({"/rosout"}),

@@ -7,7 +7,7 @@ from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Registrations
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.control.errors import PolicyRefusedError
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.answers import example
 from tests.support.control_parts import OPEN

@@ -19,7 +19,7 @@ from appliance.channel.admin import (
     PolicyWanted,
 )
 from appliance.control.assembly.policies import Policies, RevisionChangedError
-from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.control.errors import PolicyRefusedError
 from appliance.policy import judgement
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight

@@ -18,4 +18,4 @@ from appliance.specifications.switches import Switches
 )
 def test_the_record_of_a_bundle_names_the_monitors_that_do_nothing(enable: str, end: str) -> None:
     checked: Any = SimpleNamespace(monitors={"fence": "fence.rv", "zone": "zone.rv"}, sharing=[])
-    assert disabled_among(checked.monitors, Switches(enable).of(checked)) == end
+    assert disabled_among(Switches(enable).of(checked).states) == end

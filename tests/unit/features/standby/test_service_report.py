@@ -22,16 +22,14 @@ class Control:
         self.checked = SimpleNamespace(states={"gun": SimpleNamespace(held=False)})
 
     def report(self) -> ServiceReport:
-        base: Any = SimpleNamespace(
+        control: Any = SimpleNamespace(
             audit=self.audit,
             settings=SimpleNamespace(audit=self.policy, state=self.state),
-            lifeline=SimpleNamespace(surroundings=self.surroundings),
-        )
-        parts: Any = SimpleNamespace(
             monitors=SimpleNamespace(switches=self.switches, checked=self.checked),
-            endpoints=SimpleNamespace(relay=self.relay),
+            relays=lambda: self.relay.presence,
+            probe=lambda: self.surroundings.probe,
         )
-        return ServiceReport(base, parts)
+        return ServiceReport(control)
 
 
 @pytest.fixture
