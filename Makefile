@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
-CHECKED := conftest.py appliance roswire rosmop fleet tests examples benchmarks distribution
+CHECKED := conftest.py appliance roswire rosmop stubs fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
 DETERMINISTIC := -m "not nightly and not real" tests/unit tests/world rosmop/tests
 # Files with tests that are marked `real`.
