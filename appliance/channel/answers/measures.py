@@ -1,4 +1,4 @@
-"""The measured values, in numbers; `appliance.telemetry.metrics` defines their names."""
+"""The measured values, in numbers; `Meter` of `appliance/telemetry/audit_trail.py` defines their names."""
 
 import msgspec
 

@@ -15,7 +15,6 @@ from appliance.control.assembly.master_calls import (
 from appliance.control.assembly.master_core import MasterCore, make_master_core
 from appliance.control.assembly.monitor_states import published_now
 from appliance.master import rosout
-from appliance.master.calls.arrivals import ServeNode
 from appliance.master.calls.call import Table, served
 from appliance.master.calls.call_table import master_table
 from appliance.master.calls.monitor_calls import MonitorCalls
@@ -23,7 +22,7 @@ from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.publisher import OwnPublisher
-from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.calls.registration import RegistrationCalls, ServeNode
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.reminders import RelayMoves, Reminders
 from appliance.master.rosmaster import own_parameters

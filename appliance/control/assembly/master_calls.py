@@ -7,13 +7,13 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.assembly.master_core import MasterCore
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.master.calls.arrivals import Arrivals, ServeNode
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.multicall import Multicall
 from appliance.master.calls.node_calls import NodeCalls
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls.registration import Arrivals, ServeNode
 from appliance.rpc.fair_queue import LargeWrites, bulk_turns
 
 

@@ -12,7 +12,7 @@ from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraf
 from appliance.master.graph.registry import Life
 from appliance.policy.model import Category
 from appliance.specifications.records import KINDS
-from appliance.telemetry.metrics import Meter
+from appliance.telemetry.audit_trail import Meter
 
 MOST_DELAYED = 200  # the most topics that have their own histogram
 

@@ -15,7 +15,7 @@ from appliance.control.assembly.monitor_states import monitors_status
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.specifications.specification_manager import SpecificationManager
-from appliance.telemetry.metrics import Meter
+from appliance.telemetry.audit_trail import Meter
 
 _MORE_OFTEN = 3  # a change may not make denials this many times as frequent
 _ATTENTION_AT = MinuteState(0, {}).attention_at

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import structlog
 
 from appliance.audit.log.record import Severity
-from appliance.master.calls.arrivals import NodeElsewhereError
 from appliance.master.calls.call import (
     Attempt,
     Caller,
@@ -31,7 +30,7 @@ from appliance.master.calls.call import (
 )
 from appliance.master.calls.gate import CallGate, NameConflict, contested
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
-from appliance.master.calls.registration import given_up
+from appliance.master.calls.registration import NodeElsewhereError, given_up
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import HostFullError, Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError

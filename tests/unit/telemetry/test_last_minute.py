@@ -1,4 +1,4 @@
-from appliance.telemetry.metrics import LastMinute, Meter
+from appliance.telemetry.audit_trail import LastMinute, Meter
 
 
 def test_only_the_last_minute_counts() -> None:

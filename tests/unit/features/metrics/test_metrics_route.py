@@ -10,7 +10,7 @@ from appliance.base.metric import BOUNDS
 from appliance.channel.answers.measures import Measures
 from appliance.features.metrics.metric_table import METRICS, markdown
 from appliance.features.metrics.routes import rendered
-from appliance.telemetry.metrics import Meter
+from appliance.telemetry.audit_trail import Meter
 from tests.support.answers import example
 
 PAGE = Path(__file__).parents[4] / "docs" / "reference" / "metrics.md"

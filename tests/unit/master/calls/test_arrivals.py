@@ -3,7 +3,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.calls.arrivals import Arrivals
+from appliance.master.calls.registration import Arrivals
 from appliance.master.endpoints import node_ports
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
 from appliance.master.graph.registry import Incarnation, Registry
