@@ -109,6 +109,39 @@ def _log_id(connection: sqlite3.Connection) -> str:
     return found if isinstance(found, str) and _LOG_ID.fullmatch(found) else ""
 
 
+class _Findings:
+    """What is wrong with a log. After `_MOST_FINDINGS`, one finding stands for all further ones."""
+
+    def __init__(self) -> None:
+        self.rows: list[LogFinding] = []
+        self._further: LogFinding | None = None
+        self._untold = 0
+
+    @property
+    def full(self) -> bool:
+        return len(self.rows) >= _MOST_FINDINGS
+
+    def add(self, kind: FindingKind, first: int, last: int, message: str) -> None:
+        if not self.full:
+            name = f"record {first}" if first == last else f"records {first} to {last}"
+            self.rows.append(LogFinding(kind, first, last, f"{name}: {message}"))
+        else:
+            first = first if self._further is None else self._further.first
+            self._untold += 1
+            message = (
+                f"records {first} to {last}: {counted(self._untold, 'further finding')}, not told one by one"
+            )
+            self._further = LogFinding(kind, first, last, message)
+
+    def structure(self, message: str) -> None:
+        message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were not text
+        self.rows.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
+
+    def in_order(self) -> list[LogFinding]:
+        rows = sorted(self.rows, key=lambda finding: finding.first)
+        return rows if self._further is None else [*rows, self._further]
+
+
 class _Verifier:
     def __init__(
         self,
@@ -126,9 +159,7 @@ class _Verifier:
         self._log = log
         self._checkpoints = CheckpointVerifier(self._log, key, remembered)
         self._copies = None if copies is None else CopiesVerifier(self._log, key, copies)
-        self._findings: list[LogFinding] = []
-        self._further: LogFinding | None = None
-        self._untold = 0
+        self._findings = _Findings()
         self._sealed: dict[int, bytes] = {}
         self._reported: set[int] = set()
         self._shift = 0
@@ -138,34 +169,32 @@ class _Verifier:
     def run(self) -> Verification:
         self._check_structure()
         if not self._log:
-            self._structure("table log does not have the one id of a log: what it sealed is unknown")
+            self._findings.structure("table log does not have the one id of a log: what it sealed is unknown")
         removed = self._last_removal()
         audit, copies = self._checkpoints, self._copies
         try:
             audit.read(self._connection)
         except sqlite3.DatabaseError as error:
-            self._structure(f"the checkpoints cannot be read: {error}")
+            self._findings.structure(f"the checkpoints cannot be read: {error}")
         sealed = audit.sequences | (copies.sequences if copies else set())
         self._sealed = dict.fromkeys(sealed, b"")
         self._walk(removed)
         chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
         last = self.last - self._shift
-        self._findings += audit.check(removed, chain, last, self._reported)
+        self._findings.rows += audit.check(removed, chain, last, self._reported)
         if copies is not None:
             texts = {row.number: row.text for row in audit.rows() if row.number in copies.numbers}
             if removed.last_sequence:
                 chain[removed.last_sequence] = bytes.fromhex(removed.last_hash)
-            self._findings += copies.check(chain, removed.last_sequence, last, texts)
+            self._findings.rows += copies.check(chain, removed.last_sequence, last, texts)
         removal = self._check_removal(removed)
-        self._findings.sort(key=lambda finding: finding.first)
-        if self._further is not None:
-            self._findings.append(self._further)
+        findings = self._findings.in_order()
         return Verification(
-            ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
+            ok=not findings, log=self._log, records=self.records, first=self.first, last=self.last,
             removed=removed.last_sequence, checkpoints=audit.count,
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
-            findings=self._findings, elsewhere=copies.result() if copies else None, removal=removal,
+            findings=findings, elsewhere=copies.result() if copies else None, removal=removal,
             remembered=audit.remembered, other_logs=audit.other_logs,
         )  # fmt: skip
 
@@ -188,20 +217,8 @@ class _Verifier:
                 "said to have been removed for their age or the log's size, and the signer did not sign that: nothing"
                 " shows that they had to go"
             )
-            self._find(FindingKind.REMOVAL_UNFOUNDED, 1, removed.last_sequence, message)
+            self._findings.add(FindingKind.REMOVAL_UNFOUNDED, 1, removed.last_sequence, message)
         return "unsigned"
-
-    def _find(self, kind: FindingKind, first: int, last: int, message: str) -> None:
-        if len(self._findings) < _MOST_FINDINGS:
-            name = f"record {first}" if first == last else f"records {first} to {last}"
-            self._findings.append(LogFinding(kind, first, last, f"{name}: {message}"))
-        else:
-            first = first if self._further is None else self._further.first
-            self._untold += 1
-            message = (
-                f"records {first} to {last}: {counted(self._untold, 'further finding')}, not told one by one"
-            )
-            self._further = LogFinding(kind, first, last, message)
 
     # --- the database itself --------------------------------------------------------------------------------
 
@@ -210,20 +227,16 @@ class _Verifier:
         expected = set(log_database.TABLES)
         for name, sql in found:
             if sql not in expected and name not in _WORDS_TABLES:
-                self._structure(f"{name} does not belong to a log: {sql}")
+                self._findings.structure(f"{name} does not belong to a log: {sql}")
             expected.discard(sql)
         for sql in sorted(expected):
-            self._structure(f"missing: {sql}")
+            self._findings.structure(f"missing: {sql}")
         try:
             for (problem,) in self._connection.execute("PRAGMA integrity_check(20)"):
                 if problem != "ok":
-                    self._structure(problem)
+                    self._findings.structure(problem)
         except sqlite3.DatabaseError as error:
-            self._structure(str(error))
-
-    def _structure(self, message: str) -> None:
-        message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were not text
-        self._findings.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
+            self._findings.structure(str(error))
 
     def _last_removal(self) -> RemovedRange:
         try:
@@ -245,18 +258,22 @@ class _Verifier:
                 previous = self._step(row, previous)
         except sqlite3.DatabaseError as error:
             after = self.last + 1
-            self._find(FindingKind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}")
+            self._findings.add(
+                FindingKind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}"
+            )
 
     def _step(self, row: _Row, previous: bytes) -> bytes:
         sequence, expected = row.sequence, self.last + 1
         if sequence < expected:
-            self._find(FindingKind.INSERTED, sequence, sequence, "stands before the first record of the log")
+            self._findings.add(
+                FindingKind.INSERTED, sequence, sequence, "stands before the first record of the log"
+            )
             return previous
         self.last = sequence
         if sequence <= self._explained:
             return previous
         if sequence > expected:
-            self._find(FindingKind.MISSING, expected, sequence - 1, "removed from the log")
+            self._findings.add(FindingKind.MISSING, expected, sequence - 1, "removed from the log")
         elif not row.follows(previous, sequence - self._shift):
             return self._explain(row, previous)
         self._note(row, sequence - self._shift)
@@ -284,7 +301,7 @@ class _Verifier:
 
         After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take hours.
         """
-        ahead = list(self._rows(row.sequence, _WINDOW)) if len(self._findings) < _MOST_FINDINGS else []
+        ahead = list(self._rows(row.sequence, _WINDOW)) if not self._findings.full else []
         place = row.sequence - self._shift
         order = _original_order([row, *ahead], previous, place) if ahead else []
         if not order:
@@ -292,11 +309,15 @@ class _Verifier:
         first, end = order[0].sequence, row.sequence + len(order) - 1
         if len(order) > 1 and max(written.sequence for written in order) == end:
             self._explained = end
-            self._find(FindingKind.REORDERED, row.sequence, end, "not in the order they were written in")
+            self._findings.add(
+                FindingKind.REORDERED, row.sequence, end, "not in the order they were written in"
+            )
             for offset, written in enumerate(order):
                 self._note(written, place + offset)
             return order[-1].hash
-        self._find(FindingKind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered")
+        self._findings.add(
+            FindingKind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered"
+        )
         self._explained = first - 1
         self._shift += first - row.sequence
         return previous
@@ -306,16 +327,16 @@ class _Verifier:
         distance, sequence = next(fitting, 0), row.sequence
         if distance > 0:
             message = "removed; what follows was renumbered"
-            self._find(FindingKind.MISSING, place, place + distance - 1, message)
+            self._findings.add(FindingKind.MISSING, place, place + distance - 1, message)
         elif distance < 0:
             message = "inserted with a hash of its own; what follows was renumbered"
-            self._find(FindingKind.INSERTED, sequence + distance, sequence - 1, message)
+            self._findings.add(FindingKind.INSERTED, sequence + distance, sequence - 1, message)
         else:
             message = (
                 "does not have the content it was written with"
                 f" (or record {sequence - 1} was replaced by one with a hash of its own)"
             )
-            self._find(FindingKind.CHANGED, sequence, sequence, message)
+            self._findings.add(FindingKind.CHANGED, sequence, sequence, message)
         self._shift -= distance
         self._note(row, place + distance)
         return row.hash

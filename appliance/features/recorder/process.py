@@ -71,6 +71,7 @@ class _Process:
             RecordingStore(
                 Path.cwd(),
                 disk=int(rules.disk),
+                reserve=int(settings.audit.reserve_bytes),
                 seconds=None if rules.days is None else rules.days * _DAY,
                 clock=age,
                 dated=age.dated,
@@ -78,7 +79,6 @@ class _Process:
             settings.state / "control" / "audit.db",
             [ring for _index, ring in sorted(self._rings.items())],
             memory=self._memory,
-            reserve=int(settings.audit.reserve_bytes),
         )
 
     def _hear(self, message: object) -> None:

@@ -49,7 +49,6 @@ class Recorder:
         rings: Sequence[memoryview],
         *,
         memory: int,
-        reserve: int,
         clock: Callable[[], int] = clock.wall_ns,
     ) -> None:
         self._rules = rules
@@ -57,7 +56,6 @@ class Recorder:
         self._log = log
         self._rings = rings
         self._memory = memory
-        self._reserve = reserve
         self._clock = clock
         self._ids = IdSource(clock=clock)
         self._limit = HourlyLimit(rules.per_hour, store.recordings)
@@ -140,7 +138,7 @@ class Recorder:
             reason = f"the memory has the last {self._rules.before:g} seconds, and none of that period"
             self._answers.append(recorder_link.RecordingRefused(wanted.number, reason, unknown=True))
             return
-        if self._store.free < 2 * self._reserve + self._store.largest:
+        if not self._store.has_room:
             self._answers.append(recorder_link.RecordingRefused(wanted.number, "the disk is nearly full"))
             return
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
@@ -247,7 +245,7 @@ class Recorder:
                     self._close(making)
                 except OSError as error:
                     self._give_up(making, error)
-        if self._store.free < 2 * self._reserve + self._store.largest:
+        if not self._store.has_room:
             return None, "the disk is nearly full"
         if (
             not planned
@@ -299,7 +297,7 @@ class Recorder:
         elif progress.id not in self._asked_for:
             self._asked_for.add(progress.id)
             self._answers.append(recorder_link.RevisionsWanted())
-        if self._store.free < self._reserve:
+        if self._store.full:
             progress.why_not = "the disk was nearly full"
         if progress.why_not:
             progress.ends = min(now, progress.ends)

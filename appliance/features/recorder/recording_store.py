@@ -45,7 +45,8 @@ _log = structlog.get_logger()
 class RecordingStore:
     """The recordings in a folder, each kept for `seconds` of `clock`.
 
-    `dated` corrects a date of the clock from a time when a long gap did not count yet.
+    `reserve` bytes of the disk stay free for the audit log. `dated` corrects a date of the clock from a time when a
+    long gap did not count yet.
     """
 
     def __init__(
@@ -53,12 +54,14 @@ class RecordingStore:
         folder: Path,
         *,
         disk: int,
+        reserve: int,
         seconds: float | None,
         clock: Callable[[], int],
         dated: Callable[[int], int] = int,
     ) -> None:
         self._folder = folder
         self._disk = disk
+        self._reserve = reserve
         self._seconds = seconds
         self._clock = clock
         self._dated = dated
@@ -101,6 +104,16 @@ class RecordingStore:
     @property
     def free(self) -> int:
         return shutil.disk_usage(self._folder).free
+
+    @property
+    def full(self) -> bool:
+        """Whether the space that is reserved for the audit log is in use."""
+        return self.free < self._reserve
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the largest recording leaves twice the reserve."""
+        return self.free >= 2 * self._reserve + self.largest
 
     def part(self, recording_id: str) -> Path:
         return self._folder / f".{recording_id}.part"

@@ -132,6 +132,34 @@ def host_endpoint(settings: Settings, membership: Membership) -> str:
     return settings.ipsec.endpoint or membership.address
 
 
+class _ReplicationPort:
+    """The port to which the standby connects; `trouble` is the reason why it cannot."""
+
+    def __init__(self, number: int, listener: ReplicationListener) -> None:
+        self._number = number
+        self._listener = listener
+        self.trouble = ""
+
+    async def run(self) -> None:
+        with await self._listening() as listening:
+            await self._listener.run(listening)
+
+    async def _listening(self) -> socket.socket:
+        address = ("", self._number)
+        while True:
+            try:
+                made = socket.create_server(address, backlog=_BACKLOG)
+            except OSError as error:
+                if not self.trouble:
+                    reason = os.strerror(error.errno or 0)
+                    self.trouble = f"the standby cannot connect to port {address[1]}: {reason}"
+                    _log.error("the replication is not served", reason=self.trouble)
+                await asyncio.sleep(_PORT_SECONDS)
+            else:
+                self.trouble = ""
+                return made
+
+
 class Replication:
     """The replication of an active appliance. Create it before the first change that the standby needs."""
 
@@ -151,11 +179,9 @@ class Replication:
         self._since = clock.wall()
         self.switchover_wanted = asyncio.Event()
         self.sender = ReplicationSender(database, lambda: epoch, switchover_wanted=self.switchover_wanted.set)
-        self._listener = ReplicationListener(
-            self.sender, replication_context(membership, folder, server=True)
-        )
+        context = replication_context(membership, folder, server=True)
+        self._port = _ReplicationPort(membership.port, ReplicationListener(self.sender, context))
         self._permission = 0
-        self._unserved = ""  # why no standby can connect
         self._trouble_since: float | None = None
         self.admission = RobotAdmission()
         self._taken_over = taken_over
@@ -181,8 +207,7 @@ class Replication:
             loop.create_task(run_always("the copy on this disk", self._sync_always)),
         ]
         try:
-            with await self._listening() as listening:
-                await self._listener.run(listening)
+            await self._port.run()
         finally:
             for task in tasks:
                 task.cancel()
@@ -200,21 +225,6 @@ class Replication:
     def close(self) -> None:
         """Stop. A change that is not answered yet gets no answer."""
         self.sender.close()
-
-    async def _listening(self) -> socket.socket:
-        address = ("", self._membership.port)
-        while True:
-            try:
-                made = socket.create_server(address, backlog=_BACKLOG)
-            except OSError as error:
-                if not self._unserved:
-                    reason = os.strerror(error.errno or 0)
-                    self._unserved = f"the standby cannot connect to port {address[1]}: {reason}"
-                    _log.error("the replication is not served", reason=self._unserved)
-                await asyncio.sleep(_PORT_SECONDS)
-            else:
-                self._unserved = ""
-                return made
 
     async def stored(self) -> None:
         try:
@@ -236,7 +246,7 @@ class Replication:
             behind_changes=lag.changes,
             behind_bytes=lag.bytes,
             waiting_seconds=None if waiting is None else round(now - waiting, 3),
-            reason="" if self._connected() else self._unserved or lag.reason or "it does not answer",
+            reason="" if self._connected() else self._port.trouble or lag.reason or "it does not answer",
             trouble_seconds=None if trouble is None else round(now - trouble, 3),
             witness_seconds=None if witnessed is None else round(clock.since_boot() - witnessed, 3),
         )

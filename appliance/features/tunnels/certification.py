@@ -29,6 +29,27 @@ from appliance.telemetry.audit_trail import AuditTrail
 _SERVED_SECONDS = 10.0
 
 
+class ServedRest:
+    """The pin of the key with which REST is served; empty before."""
+
+    def __init__(self) -> None:
+        self.pin = ""
+        self._begun = asyncio.Event()
+
+    def begin(self, pin: str) -> None:
+        self.pin = pin
+        self._begun.set()
+
+    async def wait(self) -> bool:
+        """Wait until REST is served; return False if it takes too long."""
+        try:
+            async with asyncio.timeout(_SERVED_SECONDS):
+                await self._begun.wait()
+        except TimeoutError:
+            return False
+        return True
+
+
 class Certification:
     """The common steps of enrolment by operators and by hosts. Methods raise `HostRefusedError`."""
 
@@ -59,13 +80,11 @@ class Certification:
         self._master_port = master_port
         self._revocations: Counter[str] = Counter()  # revocations by name, since this process started
         self._warned: set[str] = set()  # serial numbers of certificates whose end was announced
-        self.pin = ""
-        self._served = asyncio.Event()
+        self.served = ServedRest()
 
     def served_by(self, pin: str) -> None:
-        self.pin = pin
         self._appliances.is_served(pin)
-        self._served.set()
+        self.served.begin(pin)
 
     def revoked(self, name: str) -> None:
         self._revocations[name] += 1
@@ -143,7 +162,7 @@ class Certification:
         return await self.kit(name, warning, kept)
 
     async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
-        if self.rest.inner_port is not None and not await self.until_served():
+        if self.rest.inner_port is not None and not await self.served.wait():
             warning = warning or "REST is not running: the kit cannot renew its certificate automatically"
         authority = await self.authority_certificate()
         await self._appliances.until_introduced()
@@ -166,7 +185,7 @@ class Certification:
             master=f"http://{own}:{self._master_port}",
             rest_url=f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
             rest_trouble=rest.trouble,
-            pin=";".join(filter(None, [self.pin, other.pin if other is not None else ""])),
+            pin=";".join(filter(None, [self.served.pin, other.pin if other is not None else ""])),
             warning=warning,
             serial=row.serial,
             expires=row.expires,
@@ -191,14 +210,6 @@ class Certification:
             return await self._authority.certificate()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
-
-    async def until_served(self) -> bool:
-        try:
-            async with asyncio.timeout(_SERVED_SECONDS):
-                await self._served.wait()
-        except TimeoutError:
-            return False
-        return True
 
     def each_hour(self) -> None:
         """Adopt renewed certificates once the earlier ones have ended, and record each certificate that ends soon."""

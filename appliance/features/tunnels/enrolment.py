@@ -144,7 +144,7 @@ class HostEnrolment(TunnelHosts):
                 raise HostRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
             if self._certification.rest.port is None:
                 raise HostRefusedError(self._certification.rest.trouble)
-            if not await self._certification.until_served():
+            if not await self._certification.served.wait():
                 raise HostRefusedError("REST is not running: see `rosrv status` and the log", ours=True)
             if len(self._awaited.rows()) >= MOST:
                 raise HostRefusedError(f"{MOST} hosts are already awaited: revoke some")
@@ -175,7 +175,7 @@ class HostEnrolment(TunnelHosts):
             url = f"https://{place}:{self._certification.rest.port}"
             # The script contains no token. It makes the key on the host, and the key never leaves that host. It checks
             # the pin of REST's key and the authority's fingerprint, so a man in the middle learns nothing.
-            known = {"url": url, "pin": self._certification.pin, "authority": _fingerprint(authority)}
+            known = {"url": url, "pin": self._certification.served.pin, "authority": _fingerprint(authority)}
             return answers.EnrolmentToken(
                 revision=self._table.revision,
                 name=name,

@@ -50,14 +50,13 @@ class Scene:
         self.recorder = self.make_recorder()
 
     def make_recorder(self) -> Recorder:
-        store = RecordingStore(self.folder, disk=self.disk, seconds=None, clock=lambda: 0)
+        store = RecordingStore(self.folder, disk=self.disk, reserve=1 << 20, seconds=None, clock=lambda: 0)
         return Recorder(
             self.rules,
             store,
             self.log.path,
             [self.memory],
             memory=self.born,
-            reserve=1 << 20,
             clock=self.clock,
         )
 

@@ -62,7 +62,7 @@ def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recordi
 
 
 def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     second, first = put(store, recording(2)), put(store, recording(1))
     store.part("f" * 20).mkdir()
     about = (tmp_path / first.id / ABOUT).read_bytes()
@@ -71,13 +71,13 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
         spoilt = tmp_path / (letter * 20)
         spoilt.mkdir()
         (spoilt / ABOUT).write_bytes(damaged)
-    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    again = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     assert again.recordings == [first, second]
     assert again.parts() == [again.part("f" * 20)]
     again.remove(first, "eve", "")
     assert not (tmp_path / first.id).exists()
     assert again.find(first.id) is None
-    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    again = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     assert list(again.removed()) == [(first, "eve", "")]
     again.note(first.id)
     assert not list(again.removed())
@@ -85,15 +85,17 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
 
 
 def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     first, second = put(store, recording(1)), put(store, recording(2))
     store.note(first.id)
     store.note("0" * 20)
-    assert RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns).unnoted() == [second]
+    assert RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns).unnoted() == [
+        second
+    ]
 
 
 def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     put(store, recording(1, "order", 8 * MIB))
     put(store, recording(2, "fault", 8 * MIB))
     for number in range(3, 8):
@@ -105,7 +107,7 @@ def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
 
 
 def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     put(store, recording(1, size=8 * MIB, charged_to=ROBOT))
     put(store, recording(2, size=8 * MIB, charged_to="10.0.0.7"))
     for number in range(3, 50):
@@ -118,7 +120,7 @@ def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
 
 
 def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
 
     def arrive(number: int, charged_to: str) -> str:
         _gone, why_not = room_for(store, charged_to)
@@ -139,7 +141,7 @@ def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
 
 
 def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     for number in range(8):
         put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
     assert room_for(store, "10.0.0.9") == ([], "recorder.disk is full")
@@ -148,11 +150,11 @@ def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
 def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control receives all recordings in one message."""
     monkeypatch.setattr("appliance.features.recorder.recording_store._MOST_DESCRIBED", 1000)
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     for number in range(1, 9):
         put(store, recording(number))
     cleared(store, room=True)
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     left = [(tmp_path / found.id / "recording.json").stat().st_size for found in store.recordings]
     assert 0 < sum(left) <= 1000
 
@@ -161,7 +163,7 @@ def test_old_recordings_are_removed(tmp_path: Path) -> None:
     age = 1000 * SECOND
 
     def make() -> RecordingStore:
-        return RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+        return RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=10, clock=lambda: age)
 
     store = make()
     put(store, recording(1))
@@ -176,19 +178,21 @@ def test_old_recordings_are_removed(tmp_path: Path) -> None:
 def test_a_recording_of_an_earlier_version_ages_from_the_first_start(tmp_path: Path) -> None:
     """Its own end is by the machine's clock, which may be years behind, as for one that was made on a full disk."""
     age = 0
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=10, clock=lambda: age)
     (tmp_path / put(store, recording(1)).id / "since").unlink()
     (tmp_path / put(store, recording(2)).id / "since").write_bytes(b"")
     age = 10_000 * SECOND
-    RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+    RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=10, clock=lambda: age)
+    store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=10, clock=lambda: age)
     for age, gone in ((10_010 * SECOND - 1, 0), (10_010 * SECOND, 2)):  # noqa: B007  the clock reads it
         assert len(cleared(store)) == gone
 
 
 class KeptRecording:
     def __init__(self, folder: Path, age: AgeClock) -> None:
-        self._store = RecordingStore(folder, disk=64 * MIB, seconds=KEPT / SECOND, clock=age, dated=age.dated)
+        self._store = RecordingStore(
+            folder, disk=64 * MIB, reserve=0, seconds=KEPT / SECOND, clock=age, dated=age.dated
+        )
 
     def make(self) -> None:
         put(self._store, recording(1))
