@@ -92,6 +92,8 @@ class Operation:
     admin_with: Mapping[str, str] = field(default_factory=dict)
     # Fields that the appliance fills in when the client leaves them out.
     filled: tuple[str, ...] = ()
+    # The path of a route without a token that asks a request without `path`.
+    open_path: str = ""
     # A request without `path` that changes something; it has no bearer.
     changes: bool = False
     # Why the command line sends the request to the admin socket only, and what to do instead.

@@ -55,14 +55,12 @@ class ControlPart:
     """A feature's part of control.
 
     `methods` answer requests. `work` runs while control serves; its keys go into error messages. `status` returns the
-    feature's fields in `rosrv status --json`; a field without a state is null there. `close` finishes what must be done
-    before an ordered end of the appliance.
+    feature's fields in `rosrv status --json`; a field without a state is null there.
     """
 
     methods: tuple[RequestMethod[object], ...] = ()
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     status: Callable[[], Mapping[str, object]] = dict
-    close: Callable[[], Awaitable[None]] | None = None
 
 
 class Links:
@@ -90,6 +88,10 @@ class Links:
     def kill(self, role: str, index: int = 0) -> None:
         """Kill a process that should have ended, or that lost its link."""
         self._lifeline.say(messages.ProcessOverdue(role, index))
+
+    def before_end(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Finish work before an ordered end of the appliance."""
+        self._lifeline.before_end(work)
 
     def processes(self) -> list[ProcessInfo]:
         return self._lifeline.surroundings.processes

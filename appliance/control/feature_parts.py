@@ -27,10 +27,5 @@ class FeatureParts:
     def status(self) -> dict[str, object]:
         return {field: state for part in self._parts for field, state in part.status().items()}
 
-    async def close(self) -> None:
-        for part in self._parts:
-            if part.close is not None:
-                await part.close()
-
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
         return {what: work for part in self._parts for what, work in part.work.items()}

@@ -123,7 +123,7 @@ class _Control:
         self._parts = parts
         self._features = features
         self._operators = operators
-        self._messages = SupervisorMessages(base, parts, operators, features.close)
+        self._messages = SupervisorMessages(base, parts, operators)
         self._tasks: list[asyncio.Task[None]] = []
         self._admin: object = None
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Coroutine
 
 import structlog
 
@@ -29,10 +29,7 @@ _log = structlog.get_logger()
 class SupervisorMessages:
     """Passes the supervisor's links and reports to the parts of control."""
 
-    def __init__(
-        self, base: Foundation, parts: Parts, operators: Operators, close: Callable[[], Awaitable[None]]
-    ) -> None:
-        self._close = close
+    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
         self._base = base
         self._parts = parts
         self._operators = operators
@@ -77,7 +74,7 @@ class SupervisorMessages:
 
     async def _agree_to_end(self) -> None:
         try:
-            await self._close()
+            await self._base.lifeline.finish()
         finally:
             self._base.lifeline.say(messages.EndAgreed())
 

@@ -7,10 +7,8 @@ The core knows only this module and `table.py`. No feature imports another one. 
 `configuration.settings`, because the settings import the table.
 """
 
-import importlib
-import importlib.util
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from appliance.cli.verb_table import Verbs
 from appliance.configuration.sections import FeatureSection
@@ -38,15 +36,7 @@ class ConsolePart(NamedTuple):
 class Tool:
     """A folder with verbs and routes only: it has no data, no process and no part of control."""
 
-    name: str
     verbs: Verbs = field(default_factory=dict)
-
-    def member(self, file: str, name: str) -> Any:
-        """Return what one of the folder's files defines under a name, or None without the file or the name."""
-        module = f"{__package__}.{self.name}.{file}"
-        if importlib.util.find_spec(module) is None:
-            return None
-        return getattr(importlib.import_module(module), name, None)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ To remove a feature, remove its folder and its name here, and its view in `views
 """
 
 import importlib
+import importlib.util
 import pkgutil
 from collections.abc import Callable
 from pathlib import Path
@@ -53,14 +54,23 @@ def _folder(name: str) -> Tool:
     return folder
 
 
-TOOLS = tuple(map(_folder, NAMES))
+FOLDERS = {name: _folder(name) for name in NAMES}
+TOOLS = tuple(FOLDERS.values())
 """All of them: a feature is also a tool."""
 FEATURES = tuple(folder for folder in TOOLS if isinstance(folder, Feature))
 
 
+def member(folder: str, file: str, name: str) -> Any:
+    """Return what one of a folder's files defines under a name, or None without the file or the name."""
+    module = f"{__package__}.{folder}.{file}"
+    if importlib.util.find_spec(module) is None:
+        return None
+    return getattr(importlib.import_module(module), name, None)
+
+
 def members(file: str, name: str) -> list[Any]:
     """Return what the files of this name define under a name, in the order of the table."""
-    return [member for tool in TOOLS if (member := tool.member(file, name)) is not None]
+    return [found for folder in NAMES if (found := member(folder, file, name)) is not None]
 
 
 def recorded_messages() -> Any:

@@ -30,7 +30,7 @@ from appliance.control.feature_parts import FeatureParts
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
-from appliance.features.table import TOOLS
+from appliance.features.table import NAMES, member
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
@@ -132,7 +132,7 @@ def answered_later() -> list[type[Any]]:
     """Return the requests that the gate of a feature answers."""
     return [
         request
-        for tool in TOOLS
-        if tool.member("gate", "GATE") is not None
-        for request in tool.member("requests", "REQUESTS")
+        for folder in NAMES
+        if member(folder, "gate", "GATE") is not None
+        for request in member(folder, "requests", "REQUESTS")
     ]

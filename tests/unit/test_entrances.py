@@ -28,6 +28,7 @@ _NO_WAY_IN = frozenset(
     {
         "links.start",
         "links.kill",
+        "links.before_end",
         "policy.provide",
         "policy.on_change",
         "policy.on_first",

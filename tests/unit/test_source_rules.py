@@ -165,7 +165,7 @@ LOOKUPS = {
     "appliance/formats/bundle_verifier.py regular": _LIBRARY,
     "appliance/features/syslog/log_forwarder.py step": _TEXT,
     "appliance/features/table.py verb_function": "a feature uses a verb of another feature, which it may not import",
-    "appliance/features/feature.py member": _IMPORTED,
+    "appliance/features/table.py member": _IMPORTED,
     "appliance/features/table.py _folder": _IMPORTED,
     "appliance/supervisor/roles.py memories": _IMPORTED,
     "appliance/features/views.py _named": _IMPORTED,

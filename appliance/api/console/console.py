@@ -11,7 +11,7 @@ import html
 import json
 import mimetypes
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import NamedTuple
@@ -22,8 +22,8 @@ from starlette.responses import Response
 from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
 from appliance.api.front.problems import ProblemError
 from appliance.configuration.settings import Settings
-from appliance.features.feature import Feature
-from appliance.features.table import FEATURES
+from appliance.features.feature import ConsolePart, Feature
+from appliance.features.table import FEATURES, FOLDERS
 
 _VIEWS = ("now", "graph", "audit", "policy", "monitors", "robot")
 _PREFIX = "/console/static/"
@@ -61,12 +61,13 @@ def routes(settings: Settings) -> APIRouter:
     """Return the routes, which are not part of the contract. Raises `ModuleError` if the modules cannot be joined."""
     router = APIRouter(include_in_schema=False)
     served = _collect((files(__package__) / name for name in _SERVED), "")
-    for feature in FEATURES:
-        if feature.console:
-            folder = files(f"appliance.features.{feature.name}") / "console"
-            served |= _collect(folder.iterdir(), f"features/{feature.name}/")
+    parts = {name: feature.console for name, feature in FOLDERS.items() if isinstance(feature, Feature)}
+    for name, of_feature in parts.items():
+        if of_feature:
+            folder = files(f"appliance.features.{name}") / "console"
+            served |= _collect(folder.iterdir(), f"features/{name}/")
     texts = {name: served[name].body.decode() for name in served if name.endswith((".js", ".css", ".html"))}
-    texts[_PARTS] = _parts(FEATURES)
+    texts[_PARTS] = _parts(parts)
     styles = [name for name in texts if name.startswith("features/") and name.endswith(".css")]
     addresses: dict[str, str] = {}
     joined = {
@@ -130,11 +131,11 @@ def views() -> tuple[str, ...]:
     return (*_VIEWS, *(part.title.lower() for part in parts))
 
 
-def _parts(features: Iterable[Feature]) -> str:
+def _parts(of_features: Mapping[str, tuple[ConsolePart, ...]]) -> str:
     """Return the module of the features' components. A component with a page of its own is loaded with that page."""
     imports: list[str] = ['import { late } from "./parts/late.js";\n']
     rows: list[str] = []
-    parts = ((feature.name, part) for feature in features for part in feature.console)
+    parts = ((name, part) for name, parts in of_features.items() for part in parts)
     for name, part in sorted(parts, key=lambda row: row[1].order):
         address = f'"../features/{name}/{part.file}"'
         shown = f"part{len(rows)}"

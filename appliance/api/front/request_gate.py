@@ -26,14 +26,14 @@ from appliance.api.front.problems import REASON, ProblemError, defect, too_many
 from appliance.api.front.rates import Buckets
 from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest, LongRequest
+from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
-from appliance.features.table import members
 from appliance.signing.request_signing import HEADER
 
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
-_OF_FEATURES = frozenset(path for paths in members("requests", "PUBLIC") for path in paths)
+_OF_FEATURES = frozenset(operation.open_path for operation in OPERATIONS if operation.open_path)
 PUBLIC = _OF_FEATURES | {
     "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json", "/v1/openapi.html",
     "/v1/enrol", "/v1/revocations", "/v1/authority",

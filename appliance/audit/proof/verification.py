@@ -110,7 +110,7 @@ def _log_id(connection: sqlite3.Connection) -> str:
 
 
 class _Findings:
-    """What is wrong with a log. After `_MOST_FINDINGS`, one finding stands for all further ones."""
+    """The faults of a log. After `_MOST_FINDINGS`, one finding stands for all further ones."""
 
     def __init__(self) -> None:
         self.rows: list[LogFinding] = []

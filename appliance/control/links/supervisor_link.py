@@ -6,7 +6,7 @@ import ipaddress
 import itertools
 import os
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 
 import structlog
 
@@ -148,6 +148,7 @@ class ControlLifeline:
         # Whether the caller that started the appliance has received `Ready` from an earlier control process.
         self.announced = False
         self.questions = SupervisorQuestions(self.say)
+        self._before_end: list[Callable[[], Awaitable[None]]] = []
         self._early: dict[tuple[object, ...], tuple[object, tuple[int, ...]]] = {}
         self._heard: Heard = self.queue
 
@@ -162,6 +163,14 @@ class ControlLifeline:
     def hear_tunnels(self, enclosed: Enclosed) -> Enclosed:
         before, self._enclosed = self._enclosed, enclosed
         return before
+
+    def before_end(self, work: Callable[[], Awaitable[None]]) -> None:
+        self._before_end.append(work)
+
+    async def finish(self) -> None:
+        """Finish the work of features before an ordered end."""
+        for work in self._before_end:
+            await work()
 
     def pause(self) -> None:
         self._heard = self.queue

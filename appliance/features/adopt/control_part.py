@@ -59,6 +59,7 @@ async def begin(core: Core) -> ControlPart:
             RequestMethod(ReleaseOrder, refused.refuse),
         ))  # fmt: skip
     part = AdoptPart(core)
+    core.links.before_end(part.before_end)
     return ControlPart(
         (
             RequestMethod(AdoptStatus, part.status, order=False),
@@ -67,7 +68,6 @@ async def begin(core: Core) -> ControlPart:
         ),
         {"the adoption of the robot's graph": part.run},
         part.status_fields,
-        part.before_end,
     )
 
 

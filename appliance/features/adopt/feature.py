@@ -7,7 +7,6 @@ _PLACE = "appliance.features.adopt."
 
 
 FEATURE = Feature(
-    "adopt",
     verbs={
         "adopt": Verb(f"{_PLACE}adopt_verb:adopt", after="survey"),
         "release": Verb(f"{_PLACE}release_verb:release", after="adopt"),

@@ -7,7 +7,6 @@ _VERBS = "appliance.features.alarms.verbs"
 
 
 FEATURE = Feature(
-    "alarms",
     verbs={
         "alarm": Group(
             "List the present alarms, and record who takes care of them.",

@@ -7,7 +7,6 @@ _PLACE = "appliance.features.audit_tools."
 _VERBS = f"{_PLACE}audit_verbs"
 
 FEATURE = Tool(
-    "audit_tools",
     verbs={
         "audit": Group(
             "Review the audit log and verify that it is complete.",

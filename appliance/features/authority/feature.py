@@ -8,7 +8,6 @@ _PLACE = "appliance.features.authority."
 
 
 FEATURE = Feature(
-    "authority",
     settings=AuthoritySettings,
     console=(
         ConsolePart("situation", "situation.js", "Drives", order=1),

@@ -6,7 +6,6 @@ from appliance.features.feature import Tool
 _VERBS = "appliance.features.backup.backup_verbs"
 
 FEATURE = Tool(
-    "backup",
     verbs={
         "backup": Verb(f"{_VERBS}:backup", after="certificate"),
         "restore": Verb(f"{_VERBS}:restore", after="backup"),

@@ -7,7 +7,6 @@ _PLACE = "appliance.features.blocks."
 
 
 FEATURE = Feature(
-    "blocks",
     verbs={
         "host": Group(
             "Block hosts; enrol, list and revoke hosts that connect through IPsec tunnels.",

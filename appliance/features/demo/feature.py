@@ -3,4 +3,4 @@
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Tool
 
-FEATURE = Tool("demo", verbs={"demo": Verb("appliance.features.demo.demo:demo", after="selftest")})
+FEATURE = Tool(verbs={"demo": Verb("appliance.features.demo.demo:demo", after="selftest")})

@@ -12,7 +12,6 @@ _PART = "appliance.features.doors.control_part"
 
 
 FEATURE = Feature(
-    "doors",
     settings=Doors,
     roles=(
         Role(

@@ -7,7 +7,6 @@ _VERBS = "appliance.features.evidence.verbs"
 
 
 FEATURE = Feature(
-    "evidence",
     verbs={
         "evidence": Group(
             "Export and verify signed evidence of an incident.",

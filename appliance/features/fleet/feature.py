@@ -27,7 +27,6 @@ def _sandbox(facts: Facts, *, log: bool) -> SandboxPlan:
 
 
 FEATURE = Feature(
-    "fleet",
     settings=Fleet,
     roles=(
         Role(

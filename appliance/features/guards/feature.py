@@ -7,7 +7,6 @@ _VERBS = "appliance.features.guards.verbs"
 
 
 FEATURE = Feature(
-    "guards",
     console=(
         ConsolePart("situation", "situation.js", "Stops", order=2),
         ConsolePart("robot", "panel.js", "Guards", order=2),

@@ -7,6 +7,5 @@ _PLACE = "appliance.features.limits."
 
 
 FEATURE = Feature(
-    "limits",
     verbs={"limits": Verb(f"{_PLACE}verb:limits", after="status")},
 )

@@ -6,7 +6,6 @@ from appliance.features.feature import Tool
 _PLACE = "appliance.features.logbook."
 
 FEATURE = Tool(
-    "logbook",
     verbs={
         "report": Group(
             "Print the machine's logbook: interventions in its safety settings.",

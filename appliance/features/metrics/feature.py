@@ -2,4 +2,4 @@
 
 from appliance.features.feature import Tool
 
-FEATURE = Tool("metrics")
+FEATURE = Tool()

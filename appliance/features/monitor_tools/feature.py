@@ -8,7 +8,6 @@ _PLACE = "appliance.features.monitor_tools."
 _LANGUAGE, _LIVE, _REVISIONS = f"{_PLACE}verbs", f"{_PLACE}in_force", f"{_PLACE}revision_verbs"
 
 FEATURE = Tool(
-    "monitor_tools",
     verbs={
         "monitor": Group(
             "Check specifications, test them on recordings, and run them as monitors on the robot.",

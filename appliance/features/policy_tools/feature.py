@@ -6,7 +6,6 @@ from appliance.features.feature import Tool
 _PLACE = "appliance.features.policy_tools."
 
 FEATURE = Tool(
-    "policy_tools",
     verbs={
         "host": Group("", {"show": Verb(f"{_PLACE}policy_verbs:show_host", after=FIRST)}, after="config"),
         "audit": Group("", {"why": Verb(f"{_PLACE}grant_verb:why", after=FIRST)}),

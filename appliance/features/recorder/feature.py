@@ -12,7 +12,6 @@ _VERBS = "appliance.features.recorder.verbs"
 
 
 FEATURE = Feature(
-    "recorder",
     settings=RecorderRules,
     roles=(
         Role(

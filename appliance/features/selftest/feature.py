@@ -4,6 +4,5 @@ from appliance.cli.verb_table import Verb
 from appliance.features.feature import Tool
 
 FEATURE = Tool(
-    "selftest",
     verbs={"selftest": Verb("appliance.features.selftest.verb:selftest", after="limits")},
 )

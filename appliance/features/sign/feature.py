@@ -3,4 +3,4 @@
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Tool
 
-FEATURE = Tool("sign", verbs={"sign": Verb("appliance.features.sign.verb:sign", after="monitor")})
+FEATURE = Tool(verbs={"sign": Verb("appliance.features.sign.verb:sign", after="monitor")})

@@ -34,7 +34,6 @@ def _sandbox(facts: Facts) -> SandboxPlan:
 
 
 FEATURE = Feature(
-    "sso",
     settings=Sso,
     roles=(
         Role(

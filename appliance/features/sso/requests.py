@@ -39,7 +39,7 @@ class SignedOnList(msgspec.Struct, frozen=True):
     sessions: Annotated[list[SignedOn], doc("oldest first")]
 
 
-@rest(None, seconds=EXCHANGE_SECONDS)
+@rest(None, open_path="/v1/sso/begin", seconds=EXCHANGE_SECONDS)
 class SignOnBegin(WaitingRequest[SignOnPlace], frozen=True, tag="sso begin"):
     """A browser at the address `peer` begins to sign in, with the verifiers of the keys of its session."""
 
@@ -48,7 +48,7 @@ class SignOnBegin(WaitingRequest[SignOnPlace], frozen=True, tag="sso begin"):
     again: bool = False
 
 
-@rest(None, seconds=EXCHANGE_SECONDS)
+@rest(None, open_path="/v1/sso/complete", seconds=EXCHANGE_SECONDS)
 class SignOnComplete(WaitingRequest[SignedOn], frozen=True, tag="sso complete"):
     """A browser at the address `peer` returned from the provider with a code."""
 
@@ -86,5 +86,3 @@ class SessionsEnd(AdminRequest[SignedOnList], frozen=True, tag="sso end"):
 
 
 REQUESTS = (SignOnBegin, SignOnComplete, SessionsWanted, SignOut, SessionsEnd)
-PUBLIC = ("/v1/sso/begin", "/v1/sso/complete")
-"""The paths that need no token."""

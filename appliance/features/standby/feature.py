@@ -10,7 +10,6 @@ _PLACE = "appliance.features.standby."
 
 
 FEATURE = Feature(
-    "standby",
     roles=(
         Role(
             "lease", "rosrv-lease", "lease", f"{_PLACE}process:main",

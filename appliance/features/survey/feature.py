@@ -3,4 +3,4 @@
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Tool
 
-FEATURE = Tool("survey", verbs={"survey": Verb("appliance.features.survey.verb:survey", after="demo")})
+FEATURE = Tool(verbs={"survey": Verb("appliance.features.survey.verb:survey", after="demo")})

@@ -26,7 +26,6 @@ def _sandbox(facts: Facts) -> SandboxPlan:
 
 
 FEATURE = Feature(
-    "syslog",
     settings=Syslog,
     roles=(
         Role(

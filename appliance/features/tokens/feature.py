@@ -6,7 +6,6 @@ from appliance.features.feature import Tool
 _VERBS = "appliance.features.tokens.verbs"
 
 FEATURE = Tool(
-    "tokens",
     verbs={
         "token": Group(
             "Create, rotate, list and revoke access tokens for REST.",

@@ -7,7 +7,6 @@ _PLACE = "appliance.features.topics."
 
 
 FEATURE = Feature(
-    "topics",
     verbs={
         "topic": Group(
             "Show topics of the running robot.",

@@ -9,7 +9,6 @@ _PLACE = "appliance.features.tunnels."
 
 
 FEATURE = Feature(
-    "tunnels",
     roles=(
         Role(
             "charon", "rosrv-ipsec", "ipsec", f"{_PLACE}process:main",

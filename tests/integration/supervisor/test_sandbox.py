@@ -128,13 +128,13 @@ class Place:
         here, there = socket.socketpair()
         files = dict.fromkeys(("ca", "certificate", "key", "receipt_key"), Path("/etc/ssl/certs/none.pem"))
         receivers: dict[str, dict[str, Any]] = {
-            "syslog": {"to": f"tcp://127.0.0.1:{self.ports[0]}"},
+            "audit.syslog": {"to": f"tcp://127.0.0.1:{self.ports[0]}"},
             "fleet": {"collector": f"https://127.0.0.1:{self.ports[0]}", **files},
         }
         sections = [
-            one.settings(**receivers[one.name])
+            one.settings(**receivers[one.settings.place])
             for one in FEATURES
-            if one.name in receivers and one.settings is not None
+            if one.settings is not None and one.settings.place in receivers
         ]
         facts = Facts(
             self.state.path,

@@ -12,7 +12,7 @@ def test_an_unexpected_end_of_a_process_is_recorded() -> None:
     trail = FakeTrail()
     base: Any = SimpleNamespace(trail=trail)
     unused: Any = None
-    reports = SupervisorMessages(base, unused, unused, unused)
+    reports = SupervisorMessages(base, unused, unused)
     reports.heard(ProcessDied("relay", 1, 77, "signal SIGKILL", "it ended with signal SIGKILL", 2.5, 3), ())
     [row] = trail.rows
     assert (row["event"], row["resource"]) == ("process died", "relay")

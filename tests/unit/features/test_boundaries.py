@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from appliance.control.core import ControlPart, Core
-from appliance.features.feature import Feature, Tool
-from appliance.features.table import TOOLS
+from appliance.features.feature import Feature
+from appliance.features.table import FOLDERS as TABLE
+from appliance.features.table import member
 
 ROOT = Path(__file__).parents[3]
 FOLDERS = sorted(path.parent.name for path in (ROOT / "appliance/features").glob("*/feature.py"))
@@ -19,7 +20,7 @@ WORLD = ROOT / "tests/world"  # simulates the whole product, also as one of two 
 
 
 def test_each_folder_is_a_row() -> None:
-    assert sorted(tool.name for tool in TOOLS) == FOLDERS
+    assert sorted(TABLE) == FOLDERS
 
 
 @cache
@@ -54,12 +55,12 @@ _MEMBERS = {
 }
 
 
-@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: str(tool.name))
-def test_the_files_of_a_feature_define_what_the_core_looks_for(tool: Tool) -> None:
-    files = {path.stem for path in (ROOT / "appliance/features" / tool.name).glob("*.py")} & _MEMBERS.keys()
-    assert [file for file in files if tool.member(file, _MEMBERS[file]) is None] == []
+@pytest.mark.parametrize("name", FOLDERS)
+def test_the_files_of_a_feature_define_what_the_core_looks_for(name: str) -> None:
+    files = {path.stem for path in (ROOT / "appliance/features" / name).glob("*.py")} & _MEMBERS.keys()
+    assert [file for file in files if member(name, file, _MEMBERS[file]) is None] == []
     if "control_part" in files:
-        begin = tool.member("control_part", "begin")
+        begin = member(name, "control_part", "begin")
         assert inspect.iscoroutinefunction(begin)
         assert typing.get_type_hints(begin) == {"core": Core, "return": ControlPart}
-    assert isinstance(tool, Feature) or files <= {"routes"}, "a tool has verbs and routes only"
+    assert isinstance(TABLE[name], Feature) or files <= {"routes"}, "a tool has verbs and routes only"
