@@ -1,21 +1,35 @@
 """Limit the bytes of audit records that each host causes, by the free space of the disk. No I/O.
 
 1. A host's debt shrinks by `RATE`. Only calls of a host wait that owes more than its own bound, and whose group also
-   owes more than the group's part of the free space (`disk_parts`).
+   owes more than the group's part of the free space.
 2. A bound that shrinks forgives what it shrank by.
 3. On a nearly full disk all bounds are smaller. The last part of the reserve is kept for the robot and for hosts that
    the policy names. Unknown hosts are not charged, but folded.
+
+`DiskParts` divides the free space among the robot and the hosts that the policy names:
+
+1. A group's debt is never charged to another group, and its part depends on the disk only: no host slows another one.
+2. Records that wait for the disk are finite too (`_MOST_QUEUED`): beyond that, a group has no part until the log has
+   caught up. The robot keeps its part for longer than others.
+3. A part that shrinks forgives what it shrank by: records that were cheap when they were made stop no host later.
 """
 
 import dataclasses
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
-from appliance.audit.log.disk_parts import DiskParts, forgiven
 from appliance.audit.log.record import AuditRecord
 from appliance.base import clock
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
-from appliance.quotas.table import AUDIT_BYTES, AUDIT_RATE, AUDIT_RESERVE
+from appliance.quotas.table import (
+    AUDIT_BYTES,
+    AUDIT_NAMED_MOST,
+    AUDIT_NAMED_PART,
+    AUDIT_RATE,
+    AUDIT_RESERVE,
+    AUDIT_ROBOT_PART,
+)
 
 RATE = AUDIT_RATE
 """Bytes per second; divided by `_SCARCE` on a nearly full disk."""
@@ -25,6 +39,72 @@ _RECORD_BYTES = 400  # on disk, with its entries in the indices
 _BYTES_PER_CHARACTER = 2  # the text, and its entry in the full-text index
 _PAID_EVERY_SECONDS = 0.1
 _LONGEST_PAUSE_SECONDS = 1.0
+_MOST_QUEUED = {True: 0.75, False: 0.25}  # of the log's queue, for the robot and for other groups
+
+
+class DiskGroup(NamedTuple):
+    """The hosts that share a part of the free space: the robot, or those of an address or network of the policy."""
+
+    name: str
+    robot: bool = False
+
+
+THE_ROBOT = DiskGroup("robot", robot=True)
+GroupOf = Callable[[str], DiskGroup | None]
+"""Returns the group of a host; None: the host has no part."""
+
+
+class DiskParts:
+    """The debts of groups. `retained` is the size at which the log removes old records; None: it keeps them.
+
+    Only `queue` may be called from another thread.
+    """
+
+    def __init__(self, group_of: GroupOf = lambda _host: None, retained: int | None = None) -> None:
+        self._group_of = group_of
+        self._retained = retained
+        self._owed: dict[DiskGroup, int] = {}
+        self._free = 0
+        self._queued = 0.0
+
+    def has_part(self, host: str) -> bool:
+        return self._group_of(host) is not None
+
+    def queue(self, full: float) -> None:
+        """Set which part of the log's queue is full."""
+        self._queued = full
+
+    def charge(self, host: str, change: int) -> None:
+        if (group := self._group_of(host)) is not None:
+            self._owed[group] = max(0, self._owed.get(group, 0) + change)
+
+    def pay(self, paid: int) -> None:
+        self._owed = {group: owed - paid for group, owed in self._owed.items() if owed > paid}
+
+    def resize(self, free: int) -> None:
+        """Set the free bytes of the disk."""
+        before, self._free = self._free, free
+        if free < before:
+            for group, owed in self._owed.items():
+                self._owed[group] = forgiven(owed, self._part(group, before), self._part(group, free))
+
+    def beyond(self, host: str) -> int | None:
+        """Return how many bytes the host's group owes beyond its part, at most 0 within it; None without a part."""
+        group = self._group_of(host)
+        if group is None or self._queued >= _MOST_QUEUED[group.robot]:
+            return None
+        return self._owed.get(group, 0) - self._part(group, self._free)
+
+    def _part(self, group: DiskGroup, free: int) -> int:
+        if group.robot:
+            return free // AUDIT_ROBOT_PART
+        free = free if self._retained is None else min(free, self._retained)
+        return min(AUDIT_NAMED_MOST, free // AUDIT_NAMED_PART)
+
+
+def forgiven(owed: int, before: int, bound: int) -> int:
+    """Return what is left of a debt when its bound shrinks from `before`."""
+    return owed if owed <= bound else max(bound, owed - (before - bound))
 
 
 def weight(record: AuditRecord) -> int:

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable
 from functools import partial
 
-from appliance.audit.log.disk_parts import THE_ROBOT, DiskGroup
+from appliance.audit.log.budget import THE_ROBOT, DiskGroup
 from appliance.audit.log.record import Severity
 from appliance.configuration.settings import Settings
 from appliance.master.calls.call import with_record

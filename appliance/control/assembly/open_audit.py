@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from appliance.audit.log.budget import Budget
-from appliance.audit.log.disk_parts import DiskParts, GroupOf
+from appliance.audit.log.budget import Budget, DiskParts, GroupOf
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.retention import Retention
 from appliance.configuration.settings import Settings

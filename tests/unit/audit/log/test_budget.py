@@ -1,5 +1,4 @@
-from appliance.audit.log.budget import RATE, Budget, weight
-from appliance.audit.log.disk_parts import THE_ROBOT, DiskGroup, DiskParts
+from appliance.audit.log.budget import RATE, THE_ROBOT, Budget, DiskGroup, DiskParts, weight
 from appliance.audit.log.record import AuditRecord
 from appliance.quotas.pool import Bounds, QuotaClass
 

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from appliance.audit.log import disk_space
-from appliance.audit.log.budget import Budget, weight
-from appliance.audit.log.disk_parts import THE_ROBOT, DiskGroup, DiskParts
+from appliance.audit.log.budget import THE_ROBOT, Budget, DiskGroup, DiskParts, weight
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.record import AuditRecord

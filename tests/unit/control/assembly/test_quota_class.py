@@ -1,8 +1,7 @@
 import ipaddress
 from dataclasses import replace
 
-from appliance.audit.log.budget import Budget
-from appliance.audit.log.disk_parts import DiskParts
+from appliance.audit.log.budget import Budget, DiskParts
 from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.assembly.listener_limits import HostQuotaClass
 from appliance.control.assembly.robot import charged_to
