@@ -19,7 +19,7 @@ from appliance.channel.messages import (
     Stop,
 )
 
-pytestmark = pytest.mark.nightly
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 class Bench:
@@ -56,22 +56,19 @@ class Bench:
         return channel, came
 
 
-def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
-    async def inside() -> None:
-        bench = Bench()
-        assert await bench.heard.get() == Ready({"x": 1})
-        try:
-            async with asyncio.timeout(30):
-                await work(bench)
-        finally:
-            bench.child.close()
-            for channel in bench.open:
-                channel.close()
-
-    asyncio.run(inside())
+async def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
+    bench = Bench()
+    assert await bench.heard.get() == Ready({"x": 1})
+    try:
+        async with asyncio.timeout(30):
+            await work(bench)
+    finally:
+        bench.child.close()
+        for channel in bench.open:
+            channel.close()
 
 
-def test_it_answers_pings_and_stops() -> None:
+async def test_it_answers_pings_and_stops() -> None:
     async def work(bench: Bench) -> None:
         bench.lifeline.send(Ping(7))
         assert await bench.heard.get() == Pong(7)
@@ -79,28 +76,28 @@ def test_it_answers_pings_and_stops() -> None:
         await bench.child.ended.wait()
         assert bench.child.stopped
 
-    run(work)
+    await run(work)
 
 
-def test_a_failure_of_the_appliance_is_not_a_stop_by_order() -> None:
+async def test_a_failure_of_the_appliance_is_not_a_stop_by_order() -> None:
     async def work(bench: Bench) -> None:
         bench.lifeline.send(Stop(failed=True))
         await bench.child.ended.wait()
         assert not bench.child.stopped
 
-    run(work)
+    await run(work)
 
 
-def test_it_ends_with_its_supervisor() -> None:
+async def test_it_ends_with_its_supervisor() -> None:
     async def work(bench: Bench) -> None:
         bench.lifeline.close()
         await bench.child.ended.wait()
         assert not bench.child.stopped
 
-    run(work)
+    await run(work)
 
 
-def test_a_new_link_replaces_the_old_one() -> None:
+async def test_a_new_link_replaces_the_old_one() -> None:
     async def work(bench: Bench) -> None:
         bench.child.tell(AuthorityStated(0, b""))
         first, came_first = bench.link()
@@ -113,13 +110,13 @@ def test_a_new_link_replaces_the_old_one() -> None:
         assert bench.links == 2
         second.close()
 
-    run(work)
+    await run(work)
 
 
-def test_foreign_descriptors_are_closed() -> None:
+async def test_foreign_descriptors_are_closed() -> None:
     async def work(bench: Bench) -> None:
         _channel, came = bench.link("relay")
         assert await came.get() is None
         assert bench.links == 0
 
-    run(work)
+    await run(work)

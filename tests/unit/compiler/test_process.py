@@ -35,7 +35,7 @@ b() { event said() /chatter std_msgs/String '{}' { if (shared > 3) { } } }
 DEFINITIONS = {"own_msgs/Seen.msg": "std_msgs/Header header\ngeometry_msgs/Point[] at\n"}
 HUNGRY = "s() { event e() /a std_msgs/Bool '{}' { " + "int x; x = 1 + 2 * 3; " * 2000 + " } }"
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 
 
 async def conversation(*wanted: messages.Message) -> list[Any]:
@@ -120,6 +120,7 @@ def nested_repetitions(count: int) -> str:
     return "\n".join(f"s{number}() {{ {events} ere : {formula} @match {{ }} }}" for number in range(count))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("text", "memory", "seconds"),
     [(HUNGRY, 8 << 20, 4), (nested_repetitions(118), 1 << 30, 1)],
@@ -181,6 +182,7 @@ process.main(int(sys.argv[1]))
 """
 
 
+@pytest.mark.nightly
 async def test_a_dry_run_ends_with_its_budget() -> None:
     with started(_COMPILER.format(1)) as (running, _supervisor, control):
         answers: asyncio.Queue[Any] = asyncio.Queue()
@@ -199,6 +201,7 @@ async def test_a_dry_run_ends_with_its_budget() -> None:
         assert await asyncio.to_thread(running.wait, 60) == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("used", [3.0, 0.0], ids=["works", "starts"])
 async def test_a_compiler_without_its_link_ends(used: float) -> None:
     with started(_COMPILER.format(1000)) as (running, _supervisor, control):
@@ -216,6 +219,7 @@ def _until_used(pid: int, seconds: float) -> None:
     eventually(lambda: used() >= seconds, "it works")
 
 
+@pytest.mark.nightly
 def test_an_idle_compiler_ends_with_an_open_lifeline() -> None:
     """The supervisor kills a process that closes its lifeline and still runs, and that would count as a restart."""
     here, there = socket.socketpair()

@@ -21,12 +21,13 @@ async def _gone() -> Message:
     return {"type": "http.disconnect"}
 
 
+@pytest.mark.anyio
 @pytest.mark.parametrize(("receive", "status"), [(_endless, 413), (_silent, 408), (_gone, 400)])
-def test_a_body_has_limits(
+async def test_a_body_has_limits(
     receive: Callable[[], object], status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(request_body, "_SECONDS", 0.01)
     request = Request({"type": "http", "method": "POST", "headers": []}, receive)  # type: ignore[arg-type]  # of ASGI
     with pytest.raises(HTTPException) as refused:
-        asyncio.run(request_body.read_body(request, 1000))
+        await request_body.read_body(request, 1000)
     assert refused.value.status_code == status

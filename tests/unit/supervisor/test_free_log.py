@@ -10,7 +10,7 @@ from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.supervisor import Supervisor
 
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.usefixtures("sockets")
 
 READER = Role("reader", "rosrv-syslog", "reader", "reader:main", dispensable=True, group="rosrv-api")
 

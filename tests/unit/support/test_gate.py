@@ -1,3 +1,4 @@
+import asyncio
 import re
 import socket
 import subprocess
@@ -43,9 +44,10 @@ REPORT = """<testsuites><testsuite>
         lambda: threading.Thread(target=print).start(),
         lambda: subprocess.run(["true"], check=True),
         lambda: socket.socket().close(),
-        lambda: time.sleep(0),  # noqa: TID251  what is forbidden
+        lambda: time.sleep(0),  # noqa: TID251  it is forbidden
+        lambda: asyncio.run(asyncio.sleep(0.01)),
     ],
-    ids=["thread", "process", "socket", "pause"],
+    ids=["thread", "process", "socket", "pause", "loop"],
 )
 def test_a_deterministic_test_may_not_depend_on_chance(act: Callable[[], object]) -> None:
     with WATCH.watching() as found, pytest.raises(ChanceError):

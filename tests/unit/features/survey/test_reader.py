@@ -8,6 +8,7 @@ from appliance.rpc.graph_inventory import GraphInventory
 from appliance.rpc.graph_reader import SurveyError, SurveyLimits, survey
 from appliance.rpc.xmlrpc_client import UnansweredError
 from roswire.uris import NodeUri
+from tests.support import autojump
 
 MASTER: dict[str, Any] = {
     "getSystemState": [[["/scan", ["/laser"]]], [["/scan", ["/base"]]], [["/reset", ["/base"]]]],
@@ -56,7 +57,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def surveyed(limits: SurveyLimits | None = None, **answers: Any) -> GraphInventory:
         FakeClient.answers = answers
-        return asyncio.run(survey("http://127.0.0.1:11311", limits or SurveyLimits(sample=0.001)))
+        return autojump.run(survey("http://127.0.0.1:11311", limits or SurveyLimits(sample=0.001)))
 
     return surveyed
 
@@ -132,4 +133,4 @@ def test_a_limit_is_named_in_the_inventory(run: Any) -> None:
 
 def test_an_address_that_is_not_a_uri_is_an_error_with_an_example() -> None:
     with pytest.raises(SurveyError, match="--master http://robot:11311"):
-        asyncio.run(survey("robot:11311", SurveyLimits()))
+        autojump.run(survey("robot:11311", SurveyLimits()))
