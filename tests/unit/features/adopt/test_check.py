@@ -56,7 +56,7 @@ def test_a_robot_without_a_master_or_with_another_program_stops() -> None:
 
 
 @pytest.mark.parametrize(
-    ("node", "sockets", "about", "level"),
+    ("node", "listeners", "about", "level"),
     [
         (SurveyedNode("/far", "http://nuc:4002/"), (), "hosts", "stop"),
         (SurveyedNode("/lo", "http://localhost:4002/", "127.0.0.1"), (socket(4002),), "nodes", "stop"),
@@ -71,9 +71,9 @@ def test_a_robot_without_a_master_or_with_another_program_stops() -> None:
     ],
 )
 def test_a_node_that_cannot_be_moved_is_named(
-    node: SurveyedNode, sockets: tuple[TcpSocket, ...], about: str, level: str
+    node: SurveyedNode, listeners: tuple[TcpSocket, ...], about: str, level: str
 ) -> None:
-    found = lines(robot(DEFAULT, node, sockets=sockets))[about]
+    found = lines(robot(DEFAULT, node, sockets=listeners))[about]
     assert found.level == level
     assert node.name in found.text or node.host in found.text
 
