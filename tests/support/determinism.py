@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
-from selectors import EpollSelector
 from typing import Any
 
 import pytest
@@ -52,7 +51,6 @@ class Watch:
             (time, "sleep", "sleeps"),
         ):
             setattr(owner, name, self._forbidding(what, getattr(owner, name)))
-        EpollSelector.select = self._unwaiting(EpollSelector.select)  # type: ignore[method-assign]  # of each loop
         for name in _CLOCKS:
             setattr(time, name, self._clock(name, getattr(time, name)))
 
@@ -78,15 +76,6 @@ class Watch:
             return act(*arguments)
 
         return acting
-
-    def _unwaiting(self, select: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(select)
-        def selecting(selector: EpollSelector, timeout: float | None = None) -> Any:
-            if self._watched and timeout != 0:
-                self._refuse("waits in a loop with real time")
-            return select(selector, timeout)
-
-        return selecting
 
     def _clock(self, name: str, read: Callable[..., Any]) -> Callable[..., Any]:
         def reading(*arguments: Any) -> Any:

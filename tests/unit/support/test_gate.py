@@ -1,4 +1,3 @@
-import asyncio
 import re
 import socket
 import subprocess
@@ -45,9 +44,8 @@ REPORT = """<testsuites><testsuite>
         lambda: subprocess.run(["true"], check=True),
         lambda: socket.socket().close(),
         lambda: time.sleep(0),  # noqa: TID251  it is forbidden
-        lambda: asyncio.run(asyncio.sleep(0.01)),
     ],
-    ids=["thread", "process", "socket", "pause", "loop"],
+    ids=["thread", "process", "socket", "pause"],
 )
 def test_a_deterministic_test_may_not_depend_on_chance(act: Callable[[], object]) -> None:
     with WATCH.watching() as found, pytest.raises(ChanceError):
