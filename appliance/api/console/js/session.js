@@ -24,7 +24,7 @@ const LONGEST = 2 ** 31 - 1; // longest delay of a browser's timer, in milliseco
 export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
- * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", left_seconds: number}} Session `left_seconds`: until it ends, when it was opened
+ * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number, left_seconds: number}} Session `left_seconds`: until it ends, when it was opened
  * `current` is null while signed out; `ended` is the reason why the last session ended, under `heading`. `checking`: the token of an
  * earlier page is being checked; `waiting` is the problem that delays the check. While the page is locked, `locked` is
  * the locked session. `number` counts sessions; unlocking does not start a new session.
