@@ -13,6 +13,7 @@ from appliance.features.fleet.bundle_link import BundleLink, BundleOffered, Bund
 from appliance.features.fleet.settings import Bundles, Fleet
 from appliance.formats.bundle_archive import BundleContents
 from appliance.policy.policy_compiler import compile_policy
+from appliance.specifications.switches import Switches
 from appliance.store.writer_thread import StoreError
 from tests.support.autojump import run
 from tests.support.core import FakeTrail
@@ -29,7 +30,7 @@ class Revisions:
     sources = ""
     checked = SimpleNamespace(monitors={})
     rollout = SimpleNamespace(held=frozenset())
-    switches = SimpleNamespace(states_of=lambda _checked: {})
+    switches = Switches()
 
     def __init__(self) -> None:
         self.current = compile_policy(_POLICY, file="policy.ini")

@@ -20,6 +20,7 @@ from appliance.features.fleet.view import BundlesState
 from appliance.formats.bundle_archive import BundleContents
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
+from appliance.specifications.switches import Switches
 from tests.support.core import FakeTrail
 from tests.support.memory_channel import memory_link
 
@@ -47,7 +48,7 @@ class _Part:
         self.held: list[str] = []
         self.rollout = SimpleNamespace(held=frozenset())
         self.checked = SimpleNamespace(monitors={}, sharing=[])
-        self.switches = SimpleNamespace(states_of=lambda _checked: {})
+        self.switches = Switches()
         self.sources = ""
 
     @property
