@@ -1,6 +1,6 @@
 """Join the modules of the witness to the file `witness.py`, which the robot's computer runs without the appliance."""
 
-import ast
+import re
 from collections import defaultdict
 from importlib.resources import files
 
@@ -10,6 +10,13 @@ _PARTS = (
     "firewall", "idle_connections", "enforcement", "serving", "following",
 )  # fmt: skip
 """In the order of their imports. `program` comes last."""
+_DOCSTRING = re.compile(r'""".+?"""$', re.DOTALL | re.MULTILINE)
+_IMPORT = re.compile(
+    r"^(?:import (?P<module>[\w.]+)|from (?P<source>[\w.]+) import (?P<names>[\w, ]+|\([^()]+\)))$",
+    re.MULTILINE,
+)
+"""As ruff writes them. `ast` of Debian 12's Python fails at times when a collection of garbage falls into it."""
+_NAME = re.compile(r"\w+")
 _START = '\n\nif __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
 
 
@@ -26,20 +33,20 @@ class _Part:
 
     def __init__(self, name: str) -> None:
         text = files(_PACKAGE).joinpath(f"{name}.py").read_text("utf-8")
-        docstring, *statements = ast.parse(text).body
-        self.docstring = ast.get_source_segment(text, docstring)
-        self.imports = [node for node in statements if isinstance(node, ast.Import | ast.ImportFrom)]
-        last = max(node.end_lineno or 0 for node in (docstring, *self.imports))
-        self.body = "\n".join(text.splitlines()[last:]).strip()
+        docstring = _DOCSTRING.match(text)
+        assert docstring is not None, name  # noqa: S101  a test joins them all
+        self.docstring = docstring[0]
+        self.imports = list(_IMPORT.finditer(text))
+        self.body = text[max(found.end() for found in (docstring, *self.imports)) :].strip()
 
 
 def _imports(parts: list[_Part]) -> str:
     modules, names = set[str](), defaultdict[str, set[str]](set)
-    for node in (node for part in parts for node in part.imports):
-        if isinstance(node, ast.Import):
-            modules |= {alias.name for alias in node.names}
-        elif node.module and not node.module.startswith(f"{_PACKAGE}."):
-            names[node.module] |= {alias.name for alias in node.names}
+    for row in (row for part in parts for row in part.imports):
+        if row["module"]:
+            modules.add(row["module"])
+        elif not row["source"].startswith(f"{_PACKAGE}."):
+            names[row["source"]] |= set(_NAME.findall(row["names"]))
     rows = [f"import {module}" for module in sorted(modules)]
     return "\n".join(
         [*rows, *(f"from {module} import {', '.join(sorted(names[module]))}" for module in sorted(names))]

@@ -8,7 +8,7 @@ from rosmop.types.roles import types_of_roles
 
 DOCS = Path(__file__).parents[4] / "docs"
 DEFAULTS = [
-    ("driving.md", "its `silent` time ({} s)", "deadman", "silent"),
+    ("driving.md", "been silent for `silent` ({} s)", "deadman", "silent"),
     ("guards.md", "(default {} m/s and", "mode", "vMax"),
     ("guards.md", "m/s and {} rad/s)", "mode", "wMax"),
     ("reference/guards.md", "within `together` ({} s)", "estop", "together"),
