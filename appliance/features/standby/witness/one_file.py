@@ -1,6 +1,5 @@
 """Join the modules of the witness to the file `witness.py`, which the robot's computer runs without the appliance."""
 
-import re
 from collections import defaultdict
 from importlib.resources import files
 
@@ -10,13 +9,7 @@ _PARTS = (
     "firewall", "idle_connections", "enforcement", "serving", "following",
 )  # fmt: skip
 """In the order of their imports. `program` comes last."""
-_DOCSTRING = re.compile(r'""".+?"""$', re.DOTALL | re.MULTILINE)
-_IMPORT = re.compile(
-    r"^(?:import (?P<module>[\w.]+)|from (?P<source>[\w.]+) import (?P<names>[\w, ]+|\([^()]+\)))$",
-    re.MULTILINE,
-)
-"""As ruff writes them. `ast` of Debian 12's Python fails at times when a collection of garbage falls into it."""
-_NAME = re.compile(r"\w+")
+_QUOTES = '"""'
 _START = '\n\nif __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
 
 
@@ -29,24 +22,34 @@ def witness_program() -> str:
 
 
 class _Part:
-    """A module without its imports from the other modules, whose names the program has anyway."""
+    """A module without its imports from the other modules, whose names the program has anyway.
+
+    Its lines are as ruff writes them. `ast` of Debian 12's Python fails at times when garbage is collected inside it.
+    """
 
     def __init__(self, name: str) -> None:
         text = files(_PACKAGE).joinpath(f"{name}.py").read_text("utf-8")
-        docstring = _DOCSTRING.match(text)
-        assert docstring is not None, name  # noqa: S101  a test joins them all
-        self.docstring = docstring[0]
-        self.imports = list(_IMPORT.finditer(text))
-        self.body = text[max(found.end() for found in (docstring, *self.imports)) :].strip()
+        _, docstring, code = text.split(_QUOTES, 2)
+        self.docstring = f"{_QUOTES}{docstring}{_QUOTES}"
+        self.imports, body = list[str](), list[str]()
+        lines = iter(code.splitlines())
+        for line in lines:
+            if line.startswith(("import ", "from ")):
+                self.imports.append(line if line[-1] != "(" else line + "".join(iter(lines.__next__, ")")))
+                body.clear()
+            else:
+                body.append(line)
+        self.body = "\n".join(body).strip()
 
 
 def _imports(parts: list[_Part]) -> str:
     modules, names = set[str](), defaultdict[str, set[str]](set)
     for row in (row for part in parts for row in part.imports):
-        if row["module"]:
-            modules.add(row["module"])
-        elif not row["source"].startswith(f"{_PACKAGE}."):
-            names[row["source"]] |= set(_NAME.findall(row["names"]))
+        kind, module, *rest = row.split(maxsplit=3)
+        if kind == "import":
+            modules.add(module)
+        elif not module.startswith(f"{_PACKAGE}."):
+            names[module] |= {name.strip("( ") for name in rest[1].split(",")} - {""}
     rows = [f"import {module}" for module in sorted(modules)]
     return "\n".join(
         [*rows, *(f"from {module} import {', '.join(sorted(names[module]))}" for module in sorted(names))]

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.approvals.requests import ApprovalsWanted
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
@@ -62,11 +61,13 @@ def test_an_agent_drives_while_it_is_approved_and_holds_the_group(
         base = ros.start(["rostopic", "echo", "-p", "/cmd_vel"])
         ros.start([str(python), str(IN_PYTHON / "drive.py"), "10.77.0.2", "9091"], label="agent")
         rows = eventually(
-            lambda: [one for one in appliance.ask(ApprovalsWanted()).approvals if one.resource == "/cmd_vel"],
+            lambda: [
+                row for row in appliance.rows("approve")[0]["approvals"] if row["resource"] == "/cmd_vel"
+            ],
             "the agent's call waits",
         )
         assert not drives(base), "nobody has approved it"
-        appliance.rosrv("approve", str(rows[0].number), "--for", "300s")
+        appliance.rosrv("approve", str(rows[0]["number"]), "--for", "300s")
         assert not drives(base), "it does not hold the group"
         appliance.rosrv("drive", "free", "base", "--to", "door:agent-1")
         eventually(lambda: drives(base), "the agent drives")
@@ -74,5 +75,5 @@ def test_an_agent_drives_while_it_is_approved_and_holds_the_group(
         eventually(lambda: not drives(base), "another host drives")
         appliance.rosrv("drive", "free", "base", "--to", "door:agent-1")
         eventually(lambda: drives(base), "the agent drives again, without a new connection")
-        appliance.rosrv("approval", "refuse", str(rows[0].number))
+        appliance.rosrv("approval", "refuse", str(rows[0]["number"]))
         eventually(lambda: not drives(base), "its approval has ended")
