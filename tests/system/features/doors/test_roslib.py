@@ -70,9 +70,14 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
+@pytest.fixture(scope="module")
+def place(common_lab: Lab) -> Host:
+    return common_lab.host("appliance", "10.77.0.2/24")
+
+
 @pytest.fixture
-def appliance(common_lab: Lab) -> Iterator[Appliance]:
-    with Appliance(common_lab.host("appliance", "10.77.0.2/24"), policy=POLICY) as running:
+def appliance(place: Host) -> Iterator[Appliance]:
+    with Appliance(place, policy=POLICY) as running:
         running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
         eventually(lambda: not running.row("door", "list")["trouble"], "the door serves")
         yield running
