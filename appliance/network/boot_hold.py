@@ -84,7 +84,10 @@ def hold_rules(held: HeldPorts, own_seconds: int, *, nodes: bool = True) -> tupl
                 seconds=own_seconds,
             )
         )
-    for ports in (PortRange.one(held.master), PortRange(held.first, held.last))[: 1 + nodes]:
+    held_off = [PortRange.one(held.master)]
+    if nodes:
+        held_off.append(PortRange(held.first, held.last))
+    for ports in held_off:
         rules.append(
             PacketRule(
                 f"hold: other machines wait for the appliance, TCP {ports}",
