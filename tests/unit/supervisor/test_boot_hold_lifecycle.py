@@ -1,4 +1,5 @@
 import asyncio
+import socket
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,8 +14,10 @@ from appliance.network.boot_hold import BootHold, HeldPorts, hold_rules
 from appliance.network.firewall.backend import FirewallError
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace
-from appliance.supervisor import boot_hold_lifecycle
+from appliance.supervisor import boot_hold_lifecycle, supervisor
 from appliance.supervisor.boot_hold_lifecycle import HoldAround
+from appliance.supervisor.machine_work import NoMachineWork
+from appliance.supervisor.role import Facts
 from tests.support.virtual_clock import VirtualClock
 
 
@@ -226,3 +229,28 @@ def test_a_hold_knows_that_its_rules_were_removed(tmp_path: Path, monkeypatch: p
     hold.lift()
     assert hold.is_intact(), "no hold is wanted"
     assert not hold.put()
+
+
+@pytest.mark.nightly
+@pytest.mark.anyio
+async def test_other_machines_are_held_before_a_graph_is_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "_AGREED_SECONDS", 0.01)
+    steps: list[str] = []
+    monkeypatch.setattr(NoMachineWork, "takes_over", lambda _work: True)
+    monkeypatch.setattr(NoMachineWork, "end", lambda _work: steps.append("end"))
+    facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
+    with socket.create_server(("127.0.0.1", 0)) as admin:
+        ending = supervisor.Supervisor(
+            (),
+            facts,
+            admin=admin,
+            ready=lambda _said: None,
+            work=NoMachineWork(),
+            gives_back=lambda: steps.append("hold"),
+        )
+        ending.is_ready = True
+        ending.stop()
+        await ending.run()
+    assert steps == ["hold", "end"]
