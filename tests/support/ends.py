@@ -1,12 +1,11 @@
 """Ends for tests, and the rows of the table of all kinds of ends (`tests/unit/store/test_ends.py`).
 
-A kind has its row in a file `ending.py` of the folder that tests its owner.
+A file `ending.py` of the folder that tests the owner of a kind has its row, in `ENDINGS`.
 """
 
-import asyncio
-from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -25,25 +24,12 @@ def ends_in(folder: Path) -> EndTable:
     return ends_of(StateStore(folder, failed=pytest.fail, kind=InlineDatabase), folder)
 
 
-class Ending(ABC):
-    """The owner of one kind, made again at each start over the same state."""
+class Ending(NamedTuple):
+    """A thing of the owner of a kind. `begin(seconds)` may return an awaitable."""
 
-    kind: ClassVar[EndKind]
+    begin: Callable[[float], object]
+    lasts: Callable[[], bool]
 
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        self.store = store
-        self.ends = ends
 
-    @abstractmethod
-    async def begin(self, seconds: float) -> None:
-        """Let the owner begin a thing that ends after this time."""
-
-    @abstractmethod
-    def lasts(self) -> bool:
-        """Return whether the owner treats the thing as not ended."""
-
-    async def still_lasts(self) -> bool:
-        self.ends.look()
-        for _ in range(3):  # an owner may end it in a task
-            await asyncio.sleep(0)
-        return self.lasts()
+Endings = Mapping[EndKind, Callable[[StateStore, EndTable], Ending]]
+"""By kind, how its owner is made at each start over the same state."""

@@ -5,27 +5,20 @@ from appliance.specifications.switches import Switch
 from appliance.specifications.timed_switches import TIMED, TimedSwitches
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
-from tests.support.ends import Ending
-from tests.unit.store.unconfirmed import Unconfirmed
+from tests.support.ends import Ending, Endings
+from tests.unit.store.unconfirmed import unconfirmed
 
 
-class DisabledMonitor(Ending):
-    kind = TIMED
-
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends)
-        self.switches = TimedSwitches(store, ends, self._come_back)
-        self.switches.start({"gun": False})
-
-    async def begin(self, seconds: float) -> None:
-        self.switches.begin({"gun": True}, seconds)
-
-    def lasts(self) -> bool:
-        return "gun" in self.switches
-
-    async def _come_back(self, back: Mapping[str, Switch]) -> None:
+def disabled_monitor(store: StateStore, ends: EndTable) -> Ending:
+    async def come_back(back: Mapping[str, Switch]) -> None:
         assert back == {"gun": True}
 
+    switches = TimedSwitches(store, ends, come_back)
+    switches.start({"gun": False})
+    return Ending(lambda seconds: switches.begin({"gun": True}, seconds), lambda: "gun" in switches)
 
-class UnconfirmedMonitors(Unconfirmed):
-    kind = SpecificationManager.unconfirmed
+
+ENDINGS: Endings = {
+    TIMED: disabled_monitor,
+    SpecificationManager.unconfirmed: unconfirmed(SpecificationManager.unconfirmed),
+}

@@ -6,32 +6,22 @@ from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 from tests.support.core import FakeTrail
-from tests.support.ends import Ending
+from tests.support.ends import Ending, Endings
 
 
-class Token(Ending):
-    kind = TOKENS
-
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends)
-        self.tokens = TokenOrders(store, FakeTrail(), ends, lambda: None)
-
-    async def begin(self, seconds: float) -> None:
-        await self.tokens.add(TokenAdd("ann", "viewer", seconds))
-
-    def lasts(self) -> bool:
-        return bool(self.tokens.usable())
+def token(store: StateStore, ends: EndTable) -> Ending:
+    tokens = TokenOrders(store, FakeTrail(), ends, lambda: None)
+    return Ending(
+        lambda seconds: tokens.add(TokenAdd("ann", "viewer", seconds)), lambda: bool(tokens.usable())
+    )
 
 
-class Silence(Ending):
-    kind = SILENCES
+def silence(store: StateStore, ends: EndTable) -> Ending:
+    handled = HandledAlarms(store, ends)
+    return Ending(
+        lambda seconds: handled.silence("rosmaster", "ann", "", seconds),
+        lambda: bool(handled.marked(example(Status)).handled_alarms),
+    )
 
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends)
-        self.handled = HandledAlarms(store, ends)
 
-    async def begin(self, seconds: float) -> None:
-        self.handled.silence("rosmaster", "ann", "", seconds)
-
-    def lasts(self) -> bool:
-        return bool(self.handled.marked(example(Status)).handled_alarms)
+ENDINGS: Endings = {TOKENS: token, SILENCES: silence}

@@ -9,24 +9,25 @@ from appliance.features.approvals.approval_table import (
 from appliance.policy.model import Category, address_of
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
-from tests.support.ends import Ending
+from tests.support.ends import Ending, Endings
 
 CALL = HeldCall(address_of("10.0.0.7"), Category.PUBLISH, "/cmd_vel")
 
 
-class ApprovedLease(Ending):
-    kind = APPROVING
+def approved_lease(_store: StateStore, ends: EndTable) -> Ending:
+    table = ApprovalTable(17, ends)
 
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends)
-        self.table = ApprovalTable(17, ends)
-
-    async def begin(self, seconds: float) -> None:
+    def begin(seconds: float) -> None:
         charged, now = ChargedHost("10.0.0.7", named=True), clock.now()
-        held = self.table.hold(CALL, charged, now, caller_id="/n", type_="", arguments=b"", size=0)
+        held = table.hold(CALL, charged, now, caller_id="/n", type_="", arguments=b"", size=0)
         assert isinstance(held, ApprovalEntry)
-        self.table.approve(held, seconds, "ann", now, credentials=frozenset({"1"}))
+        table.approve(held, seconds, "ann", now, credentials=frozenset({"1"}))
 
-    def lasts(self) -> bool:
-        entry = self.table.find(CALL)
-        return entry is not None and self.table.seconds_left(entry) > 0
+    def lasts() -> bool:
+        entry = table.find(CALL)
+        return entry is not None and table.seconds_left(entry) > 0
+
+    return Ending(begin, lasts)
+
+
+ENDINGS: Endings = {APPROVING: approved_lease}

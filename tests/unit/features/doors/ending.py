@@ -2,33 +2,21 @@ from appliance.features.doors.door_tickets import TICKETS, DoorTickets
 from appliance.features.doors.door_visits import VISITS, DoorVisits
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
-from tests.support.ends import Ending
+from tests.support.ends import Ending, Endings
 
 
-class Ticket(Ending):
-    kind = TICKETS
-
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends)
-        self.tickets = DoorTickets(store, ends)
-
-    async def begin(self, seconds: float) -> None:
-        self.tickets.make("alice", seconds, "ann")
-
-    def lasts(self) -> bool:
-        return bool(self.tickets.valid("alice"))
+def ticket(store: StateStore, ends: EndTable) -> Ending:
+    tickets = DoorTickets(store, ends)
+    return Ending(lambda seconds: tickets.make("alice", seconds, "ann"), lambda: bool(tickets.valid("alice")))
 
 
-class Visit(Ending):
-    kind = VISITS
-    text = ""
+def visit(_store: StateStore, ends: EndTable) -> Ending:
+    visits, secrets = DoorVisits(ends, lambda: {"1": "ann"}), [""]
 
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends)
-        self.visits = DoorVisits(ends, lambda: {"1": "ann"})
+    def begin(seconds: float) -> None:
+        secrets.append(visits.make("alice", "ann", seconds)[1])
 
-    async def begin(self, seconds: float) -> None:
-        _row, self.text = self.visits.make("alice", "ann", seconds)
+    return Ending(begin, lambda: visits.find("alice", secrets[-1]) is not None)
 
-    def lasts(self) -> bool:
-        return self.visits.find("alice", self.text) is not None
+
+ENDINGS: Endings = {TICKETS: ticket, VISITS: visit}
