@@ -38,8 +38,14 @@ _MAKE = "make one on its machine: rosrv token add NAME"
 class RestClient:
     """A client of REST; the methods raise `NotRunningError` and `RestProblemError`."""
 
-    def __init__(self, url: str, token: str | None, ca_file: Path | None) -> None:
-        """Raises `ValueError` if a token must not be sent to this URL."""
+    def __init__(
+        self,
+        url: str,
+        token: str | None,
+        ca_file: Path | None,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        """Raises `ValueError` if a token must not be sent to this URL. The default transport is the network."""
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
         if ca_file is not None and not secure:
@@ -51,6 +57,7 @@ class RestClient:
             timeout=httpx.Timeout(SECONDS, connect=_CONNECT_SECONDS),
             trust_env=False,
             follow_redirects=False,
+            transport=transport,
         )
 
     def close(self) -> None:

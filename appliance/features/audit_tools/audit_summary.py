@@ -1,6 +1,7 @@
 """`/v1/audit/summary`: the denials by host. A summary may read much of the log, so only one is made at a time."""
 
 import asyncio
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import Query
@@ -9,14 +10,13 @@ from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer
 from appliance.api.front.routing import Routes
-from appliance.api.front.services import Services
 from appliance.api.front.streams import Work
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary, summary_of_log
 from appliance.audit.search.query import Filter
 
 
-def add_summary(router: Routes, services: Services) -> None:
+def add_summary(router: Routes, audit_log: Path) -> None:
     one = Work("summaries of the audit log", 1)
 
     @router.get("/summary")
@@ -33,7 +33,7 @@ def add_summary(router: Routes, services: Services) -> None:
         async with one.turn(bearer):
             try:
                 return await asyncio.to_thread(
-                    summary_of_log, services.audit_log, Filter(since=begin, until=end), limit
+                    summary_of_log, audit_log, Filter(since=begin, until=end), limit
                 )
             except LogUnreadableError as error:
                 raise ProblemError(503, "log-unreadable", str(error)) from error

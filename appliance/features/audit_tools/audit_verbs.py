@@ -233,23 +233,25 @@ def checkpoints(
     Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
     """
     with Errors(unread=1 if follow else 0):
-        for found in _checkpoints(audit_of(appliance.way), after, follow=follow):
+        for found in _checkpoints(audit_of(appliance.way).checkpoints, after, follow=follow):
             for checkpoint in found:
                 write(checkpoint.as_json())
             sys.stdout.flush()
 
 
-def _checkpoints(source: AuditSource, after: int, *, follow: bool) -> Iterator[list[SignedCheckpoint]]:
+def _checkpoints(
+    read: Callable[[int], list[SignedCheckpoint]], after: int, *, follow: bool
+) -> Iterator[list[SignedCheckpoint]]:
     pause, away = threading.Event(), False
     last: SignedCheckpoint | None = None
-    yield (found := source.checkpoints(after))
+    yield (found := read(after))
     while found or follow:
         if found:
             last = found[-1]
         else:
             pause.wait(_CHECKPOINT_SECONDS)
         try:
-            found = source.checkpoints(after) if last is None else _later(source, last)
+            found = read(after) if last is None else _later(read, last)
             away = False
         except NotRunningError as error:
             if not follow or isinstance(error, AccessDeniedError):
@@ -260,12 +262,12 @@ def _checkpoints(source: AuditSource, after: int, *, follow: bool) -> Iterator[l
         yield found
 
 
-def _later(source: AuditSource, last: SignedCheckpoint) -> list[SignedCheckpoint]:
+def _later(read: Callable[[int], list[SignedCheckpoint]], last: SignedCheckpoint) -> list[SignedCheckpoint]:
     """Return the checkpoints after the last one, or all those of a log that has replaced its log."""
-    found = source.checkpoints(last.number - 1)
+    found = read(last.number - 1)
     if found and (found[0].log, found[0].number) == (last.log, last.number):
         return found[1:]
-    anew = source.checkpoints(0)
+    anew = read(0)
     if anew and anew[0].log != last.log:
         note(f"log {anew[0].log} took the place of log {last.log}: see rosrv audit verify")
     return anew

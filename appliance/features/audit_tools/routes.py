@@ -133,7 +133,7 @@ def _json(schema: dict[str, object]) -> Responses:
 def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = LogReader(services)
-    add_summary(router, services)  # before /v1/audit/{record_id}
+    add_summary(router, services.audit_log)  # before /v1/audit/{record_id}
     _add_searches(router, services, desk)
     _add_proofs(router, services, desk)
     _add_one(router, desk)

@@ -12,7 +12,7 @@ from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.connection.admin_client import NotRunningError
-from appliance.cli.connection.audit_source import audit_of
+from appliance.cli.connection.audit_source import AuditSource, audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.cli.status_verb import troubles_of
 from appliance.features.selftest.probe_nodes import TOPIC, ProbeError, call, message_through_the_relay
@@ -47,7 +47,7 @@ def running(appliance: Appliance) -> Iterator[SelftestFinding]:
     yield from run_check("processes", lambda: _processes(status.processes))
     yield from run_check("audit log", lambda: _audit(appliance))
     master = _reachable(appliance, status.master)
-    yield from run_check("RVMaster", lambda: check_call(appliance, master))
+    yield from run_check("RVMaster", lambda: check_call(audit_of(appliance.way), master))
     yield from run_check("relay", lambda: _message(master))
 
 
@@ -104,8 +104,8 @@ def _reachable(appliance: Appliance, master: str) -> str:
     return urlunsplit((parts.scheme, f"{shown}:{parts.port}", "", "", ""))
 
 
-def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
-    before = _last(appliance)
+def check_call(audit: AuditSource, master: str) -> Iterator[SelftestFinding]:
+    before = _last(audit)
     caller = f"{_CALLER}_{secrets.token_hex(4)}"
     began, refusal = clock.now(), ""
     try:
@@ -124,7 +124,7 @@ def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
         yield skip("RVMaster", f"{text}; this user may not read the audit log")
         return
     try:
-        recorded = _recorded(appliance, before, caller, refusal)
+        recorded = _recorded(audit, before, caller, refusal)
     except (LogUnreadableError, NotRunningError) as error:
         yield skip("RVMaster", f"{text}; cannot read the audit log: {error}")
         return
@@ -134,23 +134,23 @@ def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
         yield fail("RVMaster", f"{text}, but is not in the audit log", "rosrv status; rosrv audit verify")
 
 
-def _last(appliance: Appliance) -> int | None:
+def _last(audit: AuditSource) -> int | None:
     try:
-        return audit_of(appliance.way).last()
+        return audit.last()
     except (LogUnreadableError, NotRunningError):
         return None
 
 
-def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
+def _recorded(audit: AuditSource, before: int, caller: str, refusal: str) -> bool:
     """Return whether the log has the call: a record after the sequence `before`, or with the id in `refusal`.
 
     Raise `LogUnreadableError` or `NotRunningError` if the last query failed.
     """
-    source, deadline, pause = audit_of(appliance.way), clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
+    deadline, pause = clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:
         is_last = clock.now() > deadline
         try:
-            page = source.search(Filter(), None, 1000, newest_first=True)
+            page = audit.search(Filter(), None, 1000, newest_first=True)
         except (LogUnreadableError, NotRunningError):
             if is_last:
                 raise

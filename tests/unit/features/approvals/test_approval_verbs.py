@@ -1,15 +1,13 @@
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any, cast
 
 import msgspec
 import pytest
 
 from appliance.cli.connection.admin_client import NotRunningError
-from appliance.cli.connection.target import Appliance
 from appliance.features.approvals import verbs, watch
 from appliance.features.approvals.requests import Approval, Approvals, RefuseCall
 from appliance.features.approvals.watch import changes
+from tests.support.memory_call import call_of
 
 REST = ("10.0.0.7", "/agent", "call", "/log", "roscpp/SetLoggerLevel", "4bf5")
 
@@ -23,8 +21,7 @@ def test_an_operator_sees_that_arguments_are_cut(
 ) -> None:
     data = (5000).to_bytes(4, "little") + b"x" * 4092
     row = Approval(48213, "waits", *REST, data.hex(), size, 60.0, "")  # type: ignore[arg-type]  # of a tuple
-    fake = SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=lambda _request: Approvals([row]))
-    verbs.approve.function(fake, None)
+    verbs.approve.function(call_of(lambda _request: Approvals([row])), None)
     assert shown in capsys.readouterr().out
 
 
@@ -49,8 +46,7 @@ def test_an_operator_sees_every_byte_of_the_arguments(
 ) -> None:
     call = ("10.0.0.7", "/agent", "call", "/set", service, "4bf5")
     row = Approval(48213, "waits", *call, data.hex(), len(data), 60.0, "")  # type: ignore[arg-type]  # of a tuple
-    fake = SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=lambda _request: Approvals([row]))
-    verbs.approve.function(fake, None)
+    verbs.approve.function(call_of(lambda _request: Approvals([row])), None)
     assert shown in capsys.readouterr().out
 
 
@@ -71,19 +67,18 @@ def test_the_watch_goes_on_while_the_appliance_restarts(
         [Approvals([call]), NotRunningError("away"), NotRunningError("away"), Approvals([])]
     )
 
-    def ask(_request: object) -> Approvals:
-        answer = next(answers, None)
-        if answer is None:
-            raise KeyboardInterrupt
-        if isinstance(answer, NotRunningError):
-            raise answer
-        return answer
+    def answer(_request: object) -> Approvals:
+        match next(answers, None):
+            case None:
+                raise KeyboardInterrupt
+            case NotRunningError() as error:
+                raise error
+            case approvals:
+                return approvals
 
     monkeypatch.setattr(watch, "_EVERY_SECONDS", 0)
-    fake = SimpleNamespace(
-        as_json=False, host_in_words=lambda host: f"agent ({host})", ask=ask, body_or_exit=lambda one: one
-    )
-    verbs.approve.function(fake, None, watch=True)
+    call_of_verb = call_of(answer, names=lambda host: f"agent ({host})")
+    verbs.approve.function(call_of_verb, None, watch=True)
     out, err = capsys.readouterr()
     assert "7: agent (10.0.0.7) call /log" in out
     assert "rosrv approve 7 --for 30s" in out
@@ -93,14 +88,13 @@ def test_the_watch_goes_on_while_the_appliance_restarts(
 
 def test_a_call_is_refused_by_both_names_of_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
     refused = Approval(7, "refused", *REST, "", 0, 60.0, "ann")  # type: ignore[arg-type]  # of a tuple
-    asked: list[Any] = []
+    asked: list[object] = []
 
-    def answer_or_exit(request: Any) -> Approval:
+    def answer(request: object) -> Approval:
         asked.append(request)
         return refused
 
-    fake = cast(Appliance, SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=answer_or_exit))
-    verbs.refuse.function(fake, 7)
-    verbs.approve.function(fake, 7, refused=True)
+    verbs.refuse.function(call_of(answer), 7)
+    verbs.approve.function(call_of(answer), 7, refused=True)
     assert asked == [RefuseCall(7), RefuseCall(7)]
     assert "rosrv approve --refuse is now rosrv approval refuse 7" in capsys.readouterr().err

@@ -1,15 +1,13 @@
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
-from starlette.responses import Response
+from fastapi.routing import APIRoute
 
 from appliance.api.front.access import Bearer
 from appliance.api.front.routing import Routes
-from appliance.api.front.services import Services
 from appliance.audit.search.denial_summary import DenialSummary
 from appliance.audit.search.query import Filter
 from appliance.features.audit_tools import audit_summary
@@ -23,16 +21,12 @@ __all__ = ["key", "make_log", "notary", "path"]
 _VIEWER = Bearer("v", "v", "viewer", 1e12, "shown")
 
 
-class _Log:
-    def __init__(self, log: Path) -> None:
-        self.audit_log = log
-
-
-def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
+def route(log: Path) -> Callable[..., Awaitable[DenialSummary]]:
     router = Routes()
-    audit_summary.add_summary(router, cast(Services, _Log(log)))
-    [one] = router.routes
-    return cast(Callable[..., Coroutine[Any, Any, Response]], one.endpoint)  # type: ignore[attr-defined]  # an APIRoute
+    audit_summary.add_summary(router, log)
+    [summary] = router.routes
+    assert isinstance(summary, APIRoute)
+    return summary.endpoint
 
 
 def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

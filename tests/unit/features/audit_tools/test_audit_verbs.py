@@ -12,14 +12,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
 
 import pytest
 
 import appliance
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
-from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.features.audit_tools import audit_verbs
 from appliance.features.audit_tools.audit_verbs import _checkpoints, _new_file
 from appliance.features.audit_tools.unrecorded import CATEGORIES
@@ -64,24 +62,20 @@ def checkpoint(number: int, log: str = "one") -> SignedCheckpoint:
     )
 
 
-class Checkpoints:
-    """A source whose answers are lists of checkpoints, of which it returns the later ones, or errors."""
-
-    def __init__(self, *answers: list[SignedCheckpoint] | NotRunningError) -> None:
-        self._answers = list(answers)
-
-    def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        answer = self._answers[0] if len(self._answers) == 1 else self._answers.pop(0)
-        if isinstance(answer, NotRunningError):
-            raise answer
-        return [one for one in answer if one.number > after]
-
-
 def followed(
     monkeypatch: pytest.MonkeyPatch, *answers: list[SignedCheckpoint] | NotRunningError
 ) -> Iterator[SignedCheckpoint]:
+    """Follow a log that gives these lists of all its checkpoints, or errors; the last one again and again."""
     monkeypatch.setattr(audit_verbs, "_CHECKPOINT_SECONDS", 0.0)
-    found = _checkpoints(cast(RestLog, Checkpoints(*answers)), 0, follow=True)
+    later = itertools.chain(answers, itertools.repeat(answers[-1]))
+
+    def read(after: int) -> list[SignedCheckpoint]:
+        answer = next(later)
+        if isinstance(answer, NotRunningError):
+            raise answer
+        return [checkpoint for checkpoint in answer if checkpoint.number > after]
+
+    found = _checkpoints(read, 0, follow=True)
     return (one for several in found for one in several)
 
 

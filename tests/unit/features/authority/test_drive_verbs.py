@@ -1,30 +1,13 @@
 import json
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import typer
 
-from appliance.cli.output import say_json
 from appliance.features.authority import verbs
 from appliance.features.authority.requests import GroupState, GroupStates
+from tests.support.memory_call import call_of
 
 ROWS = [GroupState(name, [], "", None, 5.0, None, []) for name in ("arm", "base")]
-
-
-def appliance_of(rows: list[GroupState], *, as_json: bool) -> Any:
-    def answer_or_exit(_request: Any) -> GroupStates:
-        if as_json:
-            say_json(GroupStates(rows))
-            raise typer.Exit
-        return GroupStates(rows)
-
-    return SimpleNamespace(
-        host_in_words=str,
-        as_json=as_json,
-        ask_or_exit=lambda _request: GroupStates(rows),
-        answer_or_exit=answer_or_exit,
-    )
 
 
 @pytest.mark.parametrize(
@@ -46,7 +29,7 @@ def test_status_has_the_group_and_the_exit_status(
 ) -> None:
     ended = 0
     try:
-        verbs.status.function(appliance_of(rows, as_json=as_json), group)
+        verbs.status.function(call_of(lambda _request: GroupStates(rows), as_json=as_json), group)
     except typer.Exit as end:
         ended = end.exit_code
     text = capsys.readouterr().out
@@ -60,7 +43,6 @@ def test_status_has_the_group_and_the_exit_status(
 def test_the_reason_names_the_host_of_the_driver(capsys: pytest.CaptureFixture[str]) -> None:
     why = "/teleop on 10.0.0.5 fell silent after a motion: lower ranks wait until it lets go"
     row = GroupState("base", [], "10.0.0.5", 3.0, 0.0, None, [], ["a"], "/teleop", "lost", why)
-    appliance = appliance_of([row], as_json=False)
-    appliance.host_in_words = lambda host: f"ocu ({host})"
-    verbs.status.function(appliance, None)
+    call = call_of(lambda _request: GroupStates([row]), names=lambda host: f"ocu ({host})")
+    verbs.status.function(call, None)
     assert "/teleop on ocu (10.0.0.5) fell silent after a motion" in capsys.readouterr().out

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import typer
@@ -13,11 +13,11 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.cli.connection.audit_over_rest import RestLog
-from appliance.cli.connection.rest_session import RestClient
 from appliance.features.logbook.log_source import logs_of
 from tests.support.audit import settle
 from tests.support.command import rosrv
 from tests.support.engines import ByHand
+from tests.support.memory_rest import page, rest_client
 from tests.support.virtual_clock import VirtualClock
 
 BEGIN = 1_800_000_000
@@ -101,7 +101,7 @@ def test_a_wrong_other_is_refused(states: dict[str, str], other: str, reason: st
 
 
 def test_the_other_log_needs_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    over_rest = RestLog(cast(RestClient, None))
+    over_rest = RestLog(rest_client(lambda _request: page([])))
     with pytest.raises(typer.Exit):
         logs_of(over_rest, tmp_path, "rosrv who-drove")
     assert "--other needs the logs' files" in capsys.readouterr().err

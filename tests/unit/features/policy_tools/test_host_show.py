@@ -1,12 +1,12 @@
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import typer
 
+from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.features.policy_tools import policy_verbs
-from appliance.policy.model import address_of
-from appliance.policy.policy_compiler import compile_policy
+from tests.support.answers import example
+from tests.support.memory_call import call_of
 
 POLICY = """\
 [Groups]
@@ -37,15 +37,13 @@ ask arm = door:alice
 
 
 @pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    hosts = {"door:alice": address_of("198.19.240.2")}
-    policy = compile_policy(POLICY + GROUPS, file="site.ini", hosts=hosts)
-    monkeypatch.setattr(policy_verbs, "compiled", lambda *_given: policy)
+def shown(capsys: pytest.CaptureFixture[str]) -> Any:
+    hosts = {"door:alice": "198.19.240.2"}
+    policy = example(PolicyInForce, text=POLICY + GROUPS, file="site.ini", hosts=hosts)
 
     def show(name: str) -> tuple[int, list[str]]:
-        fake = SimpleNamespace(as_json=False)
         with pytest.raises(typer.Exit) as left:
-            policy_verbs.show_host.function(fake, name)
+            policy_verbs.show_host.function(call_of(lambda _request: policy), name)
         return left.value.exit_code, capsys.readouterr().out.splitlines()
 
     return show

@@ -1,85 +1,78 @@
+import secrets
+import time
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any, cast
+from itertools import chain, repeat
 
+import httpx
 import pytest
 
-from appliance.base.clock import using
-from appliance.cli.connection.admin_client import NotRunningError
-from appliance.cli.connection.target import Appliance
-from appliance.features.selftest import live_checks as selftest_running
-from tests.support.virtual_clock import VirtualClock
-
-OURS = SimpleNamespace(
-    sequence=7, record=SimpleNamespace(caller_id="/rosrv_selftest_00c0ffee", id="0192-ours", host="10.0.0.1")
-)
-NOT_OURS = SimpleNamespace(sequence=6, record=SimpleNamespace(caller_id="/joy", id="0192-other"))
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry, as_json
+from appliance.base import clock
+from appliance.cli.connection.audit_over_rest import RestLog
+from appliance.features.selftest import live_checks
+from tests.support.memory_rest import page, problem, rest_client
+from tests.support.virtual_clock import VirtualClock, let_time_pass
 
 
-class Log:
-    def __init__(self) -> None:
-        self.answers: list[Any] = []
-        self.searches = 0
-        self.machine = VirtualClock()
-
-    @property
-    def way(self) -> "Log":
-        return self
-
-    def last(self) -> int:
-        return 5
-
-    def search(self, *_arguments: object, newest_first: bool) -> Any:
-        assert newest_first
-        self.searches += 1
-        self.machine.advance(0.001)  # a search takes time
-        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
-        if isinstance(answer, Exception):
-            raise answer
-        return SimpleNamespace(entries=answer)
+def record(sequence: int, caller_id: str) -> str:
+    made = AuditRecord(id=f"{sequence:020x}", time=1, event="decision", host="10.0.0.1", caller_id=caller_id)
+    return as_json(LogEntry(sequence, made))
 
 
-@pytest.fixture
-def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
-    log = Log()
-    monkeypatch.setattr(selftest_running, "time", SimpleNamespace(sleep=log.machine.advance))
-    monkeypatch.setattr(selftest_running, "secrets", SimpleNamespace(token_hex=lambda _bytes: "00c0ffee"))
-    monkeypatch.setattr(selftest_running, "call", lambda *_arguments: None)
-    monkeypatch.setattr(selftest_running, "audit_of", lambda way: way)
-    with using(log.machine):
-        yield log
+FIRST, NOT_OURS, OURS = record(5, "/joy"), record(6, "/joy"), record(7, "/rosrv_selftest_00c0ffee")
+DENIED: list[str] = []
+"""Stands for an answer that refuses a search."""
 
 
-def outcome(log: Log) -> tuple[str, str]:
-    (found,) = selftest_running.check_call(cast(Appliance, log), "http://127.0.0.1:11311")
-    return found.outcome, found.text
+@pytest.fixture(autouse=True)
+def call_and_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(time, "sleep", let_time_pass)
+    monkeypatch.setattr(secrets, "token_hex", lambda _bytes: "00c0ffee")
+    monkeypatch.setattr(live_checks, "call", lambda *_arguments: None)
+    with clock.using(VirtualClock()):
+        yield
 
 
-def test_a_delayed_record_is_found(log: Log) -> None:
-    log.answers = [[NOT_OURS], [NOT_OURS], [OURS, NOT_OURS]]
-    found, text = outcome(log)
-    assert found == "ok"
+def outcome(*searches: list[str]) -> tuple[str, str, int]:
+    """Check a call whose record is searched for with these answers, the last one again and again.
+
+    Return the outcome, its text, and the number of searches.
+    """
+    answers, number = chain(searches, repeat(searches[-1])), 0
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        nonlocal number
+        if "order" not in request.url.params:
+            return page([FIRST])  # the last one before the call
+        number += 1
+        let_time_pass(0.001)  # a search takes time
+        records = next(answers)
+        return problem(429, "busy", "too many requests") if records is DENIED else page(records)
+
+    [finding] = live_checks.check_call(RestLog(rest_client(answer)), "http://127.0.0.1:11311")
+    return finding.outcome, finding.text, number
+
+
+def test_a_delayed_record_is_found() -> None:
+    found, text, searches = outcome([NOT_OURS, FIRST], [NOT_OURS, FIRST], [OURS, NOT_OURS, FIRST])
+    assert (found, searches) == ("ok", 3)
     assert "and recorded" in text
-    assert log.searches == 3
 
 
-@pytest.mark.nightly
-def test_a_missing_record_is_searched_for_five_seconds(log: Log) -> None:
-    log.answers = [[NOT_OURS]]
-    found, text = outcome(log)
+def test_a_missing_record_is_searched_for_five_seconds() -> None:
+    began = clock.now()
+    found, text, searches = outcome([NOT_OURS, FIRST])
     assert found == "fail"
     assert "is not in the audit log" in text
-    assert log.searches <= 15
+    assert searches <= 15 and 5 < clock.now() - began < 7
 
 
-def test_a_refused_search_is_repeated(log: Log) -> None:
-    log.answers = [NotRunningError("https://h: too many requests"), [OURS]]
-    assert outcome(log)[0] == "ok"
+def test_a_refused_search_is_repeated() -> None:
+    assert outcome(DENIED, [OURS])[0] == "ok"
 
 
-@pytest.mark.nightly
-def test_an_unreadable_log_is_not_a_defect(log: Log) -> None:
-    log.answers = [NotRunningError("https://h: too many requests")]
-    found, text = outcome(log)
+def test_an_unreadable_log_is_not_a_defect() -> None:
+    found, text, _searches = outcome(DENIED)
     assert found == "skip"
     assert "too many requests" in text
