@@ -180,9 +180,22 @@ def serve(
     try:
         os.umask(0o077)
         secret = read_passphrase(passphrase) if passphrase is not None else None
-        key = load_or_create_key(directory)
-        authority, trouble = open_authority(directory, kind, secret)
+        signer = open_signer(lifeline, directory, kind, secret, kept)
     except (SignerKeyError, OSError) as error:
         lifeline.send(messages.Failed(f"the signer cannot use its key: {error}"))
+        lifeline.close()
         sys.exit(1)
-    asyncio.run(Signer(lifeline, directory, key, authority, kept, trouble=trouble).run())
+    asyncio.run(signer.run())
+
+
+def open_signer(
+    lifeline: Channel,
+    directory: Path,
+    kind: Kind = "ecdsa",
+    secret: bytes | None = None,
+    kept: RetentionLimits = RetentionLimits(),  # noqa: B008  frozen
+) -> Signer:
+    """Return the signer with the keys in a directory, made if missing. Raises `SignerKeyError` or `OSError`."""
+    key = load_or_create_key(directory)
+    authority, trouble = open_authority(directory, kind, secret)
+    return Signer(lifeline, directory, key, authority, kept, trouble=trouble)
