@@ -22,7 +22,7 @@ import structlog
 import appliance
 from appliance.base import clock
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
-from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping, Walled
+from appliance.channel.messages import LinkOpened, Message, Ping, Walled
 from appliance.network.hang_detection import ProcessActivity
 from appliance.supervisor.child_entry import LaunchPlan
 
@@ -86,27 +86,13 @@ def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
     return silent > ANSWER_SECONDS
 
 
-class ProcessHandle:
-    """A running process."""
+class ChildProcess:
+    """A process of the appliance, and its pid descriptor."""
 
-    def __init__(
-        self, role: str, index: int, plan: LaunchPlan, lifeline: socket.socket, reports: ProcessCallbacks
-    ) -> None:
-        """`lifeline` is the supervisor's end."""
-        self.role = role
-        self.index = index
-        self.ready = False
-        self.is_program = bool(plan.argv)
-        self.since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        self.started = clock.now()
-        self.answered: float | None = None
-        self.sandbox: Walled | None = None
-        self.congestion = ""  # the congestion control of a relay's sockets
-        self.reason = ""  # why the process cannot serve, as it reported
-        self.output: tuple[str, ...] = ()  # the last output lines of its program
-        self._asked = 0
-        self._reports = reports
+    def __init__(self, role: str, plan: LaunchPlan) -> None:
+        """Start the process. Raises `OSError`."""
         self._loop = asyncio.get_running_loop()
+        self.is_program = bool(plan.argv)
         self._process = subprocess.Popen(
             # -s: load no code from the process's home, which is its part of the state directory
             [
@@ -136,15 +122,58 @@ class ProcessHandle:
             self._process.kill()
             self._process.wait()
             raise
-        self._loop.add_reader(self._pidfd, self._dead)
-        self._channel: Channel | None = Channel(lifeline, Lifeline, longest=1 << 20)
-        self._channel.attach(
-            self._loop, partial(reports.received, self), self._lifeline_closed, self._refused
-        )
 
-    @property
-    def alive(self) -> bool:
-        return self._pidfd >= 0
+    def watch(self, died: Callable[[], None]) -> None:
+        """Let a function be called, once `wait` does not block."""
+        self._loop.add_reader(self._pidfd, died)
+
+    def wait(self) -> int:
+        """Return the exit status, or the negative number of the signal."""
+        self._loop.remove_reader(self._pidfd)
+        code = self._process.wait()
+        os.close(self._pidfd)
+        self._pidfd = -1
+        return code
+
+    def send_signal(self, number: signal.Signals) -> None:
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._pidfd, number)
+
+    def stalled_seconds(self) -> float:
+        return self._progress.stalled_seconds()
+
+
+class ProcessHandle:
+    """A running process."""
+
+    def __init__(
+        self, role: str, index: int, child: ChildProcess, lifeline: Channel, reports: ProcessCallbacks
+    ) -> None:
+        """`lifeline` is the supervisor's end."""
+        self.role = role
+        self.index = index
+        self.ready = False
+        self.is_program = child.is_program
+        self.pid = child.pid
+        self.alive = True
+        self.since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        self.started = clock.now()
+        self.answered: float | None = None
+        self.sandbox: Walled | None = None
+        self.congestion = ""  # the congestion control of a relay's sockets
+        self.reason = ""  # why the process cannot serve, as it reported
+        self.output: tuple[str, ...] = ()  # the last output lines of its program
+        self._asked = 0
+        self._reports = reports
+        self._child = child
+        child.watch(self._dead)
+        self._channel: Channel | None = lifeline
+        lifeline.attach(
+            asyncio.get_running_loop(),
+            partial(reports.received, self),
+            self._lifeline_closed,
+            self._refused,
+        )
 
     @property
     def sandbox_state(self) -> tuple[str, list[str]]:
@@ -190,13 +219,11 @@ class ProcessHandle:
 
     @property
     def stalled_seconds(self) -> float:
-        return self._progress.stalled_seconds()
+        return self._child.stalled_seconds()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        if not self.alive:
-            return
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._pidfd, number)
+        if self.alive:
+            self._child.send_signal(number)
 
     def _refused(self, reason: str) -> None:
         self._channel = None
@@ -210,7 +237,6 @@ class ProcessHandle:
             self.kill()
 
     def _dead(self) -> None:
-        self._loop.remove_reader(self._pidfd)
         if self._channel is not None:
             # The process's last message may be unread; it gives the reason of a failed start.
             channel, self._channel = self._channel, None
@@ -221,9 +247,8 @@ class ProcessHandle:
             for message, descriptors in messages:
                 self._reports.received(self, message, descriptors)
             channel.close()
-        code = self._process.wait()
-        os.close(self._pidfd)
-        self._pidfd = -1
+        code = self._child.wait()
+        self.alive = False
         self._reports.died(self, code)
 
 

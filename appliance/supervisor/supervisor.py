@@ -26,6 +26,7 @@ import structlog
 from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.channel import messages
+from appliance.channel.channel import Channel
 from appliance.ipsec.strongswan import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
@@ -42,6 +43,7 @@ from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
     FIRST_ANSWER_SECONDS,
     LONGEST_START_SECONDS,
+    ChildProcess,
     ProcessCallbacks,
     ProcessHandle,
     link_processes,
@@ -270,7 +272,9 @@ class Supervisor:
         try:
             with self._watchdog.isolation.inside():
                 plan = slot.plan(self._facts, there.fileno(), lender.fileno() if lender is not None else None)
-                slot.process = ProcessHandle(slot.role.name, slot.index, plan, here, self.reports)
+                child = ChildProcess(slot.role.name, plan)
+            lifeline = Channel(here, messages.Lifeline, longest=1 << 20)
+            slot.process = ProcessHandle(slot.role.name, slot.index, child, lifeline, self.reports)
         except OSError as error:
             here.close()
             slot.short_runs += 1

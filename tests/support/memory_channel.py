@@ -49,6 +49,10 @@ class MemoryChannel(Channel):
         if self._runs_in is not None and not self._runs_in.is_closed():
             self._runs_in.call_soon(act)
 
+    def receive(self) -> list[tuple[Message, tuple[int, ...]]]:
+        bodies, self.arrived = self.arrived, deque()
+        return [(self._decode(body), ()) for body in bodies]
+
     def deliver(self) -> None:
         while self.arrived and self._received is not None and not self.closed:
             try:

@@ -1,8 +1,10 @@
 import asyncio
 import errno
 import threading
+from collections.abc import Iterator
 
 import pytest
+from structlog.testing import capture_logs
 
 from appliance.channel.answers.status import FirewallState
 from appliance.channel.messages import (
@@ -18,6 +20,7 @@ from appliance.network.namespaces import NetworkError
 from appliance.supervisor import isolation_watchdog
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
+from tests.support.determinism import may_depend_on_chance
 
 pytestmark = pytest.mark.anyio
 
@@ -29,13 +32,11 @@ class Surroundings(NoIsolation):
     def __init__(self) -> None:
         self.found: list[str | Exception | None] = []
         self.closed: list[int] = []
-        self.looked = threading.Event()
 
     def report(self) -> FirewallState:
         return FirewallState(backend="nft")
 
     def probe(self) -> str | None:
-        self.looked.set()
         finding = self.found.pop(0)
         if isinstance(finding, Exception):
             raise finding
@@ -53,11 +54,13 @@ class Surroundings(NoIsolation):
 
 
 @pytest.fixture
-def surroundings() -> Surroundings:
-    return Surroundings()
+def surroundings(request: pytest.FixtureRequest) -> Iterator[Surroundings]:
+    if not may_depend_on_chance(request.node):
+        request.getfixturevalue("guard_in_loop")
+    with capture_logs():  # a shown traceback takes a tenth of a second
+        yield Surroundings()
 
 
-@pytest.mark.nightly
 async def test_control_learns_of_each_opening_and_closing(surroundings: Surroundings) -> None:
     told: list[Message] = []
     surroundings.found = ["reached", None]
@@ -68,7 +71,6 @@ async def test_control_learns_of_each_opening_and_closing(surroundings: Surround
     assert told == [report, ProbeFailed("reached"), report, ProbePassed()]
 
 
-@pytest.mark.nightly
 async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surroundings) -> None:
     told: list[Message] = []
     surroundings.found = [NetworkError("no child")]
@@ -76,7 +78,6 @@ async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surround
     assert isinstance(told[-1], ProbeFailed)
 
 
-@pytest.mark.nightly
 async def test_a_new_control_receives_the_last_finding(surroundings: Surroundings) -> None:
     surroundings.found = ["reached"]
     watchdog = IsolationWatchdog(surroundings, lambda _message: None)
@@ -85,7 +86,6 @@ async def test_a_new_control_receives_the_last_finding(surroundings: Surrounding
     assert watchdog.news()[-1] == ProbeFailed("reached")
 
 
-@pytest.mark.nightly
 async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surroundings) -> None:
     surroundings.found = [None]
     watchdog = IsolationWatchdog(surroundings, lambda _message: None)
@@ -95,7 +95,6 @@ async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surr
     assert surroundings.found == []
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("port", [0, 1])
 async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     surroundings: Surroundings, port: int
@@ -108,7 +107,6 @@ async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     assert news[-1] == told[-1]
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     "broken", [OSError(errno.EMFILE, "too many open files"), ValueError("no JSON"), KeyError("chain")]
 )
@@ -116,49 +114,40 @@ async def test_a_failing_probe_is_a_finding_and_probes_go_on(
     surroundings: Surroundings, broken: Exception
 ) -> None:
     told: list[Message] = []
-    surroundings.found = [broken, *[None] * 100_000]
-    running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=0.001).run())
-    async with asyncio.timeout(20):
-        while len(told) < 4 and not running.done():
-            await asyncio.sleep(0)
+    surroundings.found = [broken, None]
+    running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=60.0).run())
+    await asyncio.sleep(150)
     running.cancel()
-    assert [type(one) for one in told[1:4:2]] == [ProbeFailed, ProbePassed]
+    assert [type(one) for one in told[1::2]] == [ProbeFailed, ProbePassed]
     (failed,) = [one for one in told if isinstance(one, ProbeFailed)]
     assert str(broken) in failed.reason
 
 
-@pytest.mark.nightly
-def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
-    answer = asyncio.run(
-        IsolationWatchdog(surroundings, lambda _message: None).open_tunnels("10.9.0.0/24", "10.9.0.1")
-    )
+async def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
+    watchdog = IsolationWatchdog(surroundings, lambda _message: None)
+    answer = await watchdog.open_tunnels("10.9.0.0/24", "10.9.0.1")
     assert answer.esp is None
     assert "no process can be made" in str(answer.reason)
 
 
-@pytest.mark.nightly
 async def test_probes_are_repeated(surroundings: Surroundings) -> None:
     told: list[Message] = []
     surroundings.found = [None, "reached", None]
-    surroundings.found += [None] * 100_000
-    running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=0.001).run())
-    async with asyncio.timeout(20):
-        while len(told) < 6:
-            await asyncio.sleep(0)
+    running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=60.0).run())
+    await asyncio.sleep(200)
     running.cancel()
-    assert [type(one) for one in told[1:6:2]] == [ProbePassed, ProbeFailed, ProbePassed]
+    assert [type(one) for one in told[1::2]] == [ProbePassed, ProbeFailed, ProbePassed]
 
 
-@pytest.mark.nightly
+@pytest.mark.usefixtures("guard_in_loop")
 async def test_without_isolation_nothing_is_probed() -> None:
     told: list[Message] = []
     assert await IsolationWatchdog(NoIsolation(), told.append).look() is None
     assert told == [FirewallReported("none", FirewallState())]
 
 
-@pytest.mark.nightly
-def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:
-    assert asyncio.run(IsolationWatchdog(surroundings, lambda _message: None).endpoint()) == EndpointFound(
+async def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:
+    assert await IsolationWatchdog(surroundings, lambda _message: None).endpoint() == EndpointFound(
         None, "isolation container has no tunnels: use isolation netns or container"
     )
 
@@ -192,7 +181,6 @@ async def test_a_crowd_of_new_hosts_costs_a_few_threads(
     assert most[0] <= 8
 
 
-@pytest.mark.nightly
 async def test_a_former_address_of_the_machine_stays_closed_until_control_has_forgotten_it(
     surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +199,6 @@ async def test_a_former_address_of_the_machine_stays_closed_until_control_has_fo
     surroundings.found = [None, None]
     await watchdog.look()
     assert trusted == [("10.0.0.1",), ("10.0.0.1", "10.0.0.2")]
-    monkeypatch.setattr(isolation_watchdog, "FORMER_SECONDS", 0.0)
+    await asyncio.sleep(isolation_watchdog.FORMER_SECONDS)
     await watchdog.look()
     assert trusted[-1] == ("10.0.0.2",)

@@ -11,8 +11,7 @@ from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
     FIRST_ANSWER_SECONDS,
     LONGEST_START_SECONDS,
-    ProcessCallbacks,
-    ProcessHandle,
+    ChildProcess,
     is_hanging,
 )
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
@@ -56,7 +55,6 @@ async def test_a_process_that_cannot_be_watched_is_ended(monkeypatch: pytest.Mon
     here, there = socket.socketpair()
     account = Account("rosrv", os.geteuid(), os.getegid())
     plan = LaunchPlan(os.getpid(), there.fileno(), account, "/", True, 64, SandboxPlan())
-    callbacks = ProcessCallbacks(*[lambda *_: None] * 3)
     with here, there, pytest.raises(OSError, match="Too many"):
-        ProcessHandle("relay", 0, plan, here, callbacks)
+        ChildProcess("relay", plan)
     assert [one.returncode for one in started] == [-signal.SIGKILL]

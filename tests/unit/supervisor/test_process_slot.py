@@ -1,16 +1,19 @@
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from appliance.base.clock import now
+from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.role import Facts, Role
+from tests.support.memory_child import MemoryChild
+
+pytestmark = pytest.mark.anyio
 
 
-def process(*, lived: float) -> Any:
-    return SimpleNamespace(started=now() - lived, since="2026-01-01T00:00:00.000Z")
+def process(*, lived: float) -> ProcessHandle:
+    process = MemoryChild().handle
+    process.started -= lived
+    return process
 
 
 @pytest.fixture
@@ -18,7 +21,7 @@ def slot() -> ProcessSlot:
     return ProcessSlot(Role(name="relay", user="rosrv-relay", part="relay", entry="m:f", indexed=True), 1)
 
 
-def test_restarts_of_a_dying_process_wait_up_to_a_second(slot: ProcessSlot) -> None:
+async def test_restarts_of_a_dying_process_wait_up_to_a_second(slot: ProcessSlot) -> None:
     delays = []
     for _ in range(FAILING_AFTER):
         assert not slot.is_failing
@@ -28,7 +31,7 @@ def test_restarts_of_a_dying_process_wait_up_to_a_second(slot: ProcessSlot) -> N
     assert slot.is_failing
 
 
-def test_restarts_of_an_optional_process_wait_up_to_a_minute() -> None:
+async def test_restarts_of_an_optional_process_wait_up_to_a_minute() -> None:
     slot = ProcessSlot(
         Role(name="charon", user="rosrv-ipsec", part="ipsec", entry="m:f", dispensable=True), 0
     )
@@ -44,7 +47,7 @@ def test_restarts_of_an_optional_process_wait_up_to_a_minute() -> None:
     assert (slot.short_runs, slot.reason) == (0, "")
 
 
-def test_a_process_that_ran_long_is_restarted_at_once(slot: ProcessSlot) -> None:
+async def test_a_process_that_ran_long_is_restarted_at_once(slot: ProcessSlot) -> None:
     for _ in range(FAILING_AFTER):
         slot.record_death(process(lived=0.1))
     assert slot.record_death(process(lived=60)) == pytest.approx(60, abs=5)
