@@ -1,20 +1,20 @@
 import signal
 import socket
 from pathlib import Path
-from typing import cast
 
 import pytest
 
 from appliance.base import clock
-from appliance.channel.messages import LeaseEnded, LeaseHeld, Message
+from appliance.channel.messages import LeaseEnded, LeaseHeld, Message, ServicePaused
 from appliance.features.standby.lease_watch import LeaseWatch
 from appliance.supervisor import supervisor as module
-from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.supervisor import Supervisor
-from tests.unit.supervisor.test_supervisor import CONTROL, StandIn
+from tests.support.memory_child import MemoryChild
 
-pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("local_sockets")]
+
+CONTROL = Role(name="control", user="rosrv", part="control", entry="m:f")
 
 
 @pytest.mark.parametrize("end", ["renewed", "a death", "a new epoch", "a stop"])
@@ -32,21 +32,23 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
     supervisor = Supervisor(roles, facts, admin=admin, ready=lambda _said: None, gate=LeaseWatch)
-    control, relay, lease, api = stand_ins = [StandIn() for _ in roles[:-1]]
-    for slot, process in zip(supervisor.slots[:-1], stand_ins, strict=True):
-        slot.process, process.ready, process.role = cast(ProcessHandle, process), True, slot.role.name
+    control, relay, lease, api = children = [
+        MemoryChild(role.name, supervisor.reports) for role in roles[:-1]
+    ]
+    for slot, child in zip(supervisor.slots[:-1], children, strict=True):
+        slot.process, child.handle.ready = child.handle, True
 
     def report(message: Message) -> None:
-        supervisor.reports.received(cast(ProcessHandle, lease), message, ())
+        supervisor.reports.received(lease.handle, message, ())
 
     report(LeaseHeld(clock.since_boot() + 60, 5))
     report(LeaseEnded(renewable=True))
-    assert [one.signals for one in stand_ins] == [[signal.SIGSTOP], [signal.SIGSTOP], [], []]
+    assert [child.signals for child in children] == [[signal.SIGSTOP], [signal.SIGSTOP], [], []]
     supervisor.start(supervisor.slots[1])
     assert supervisor.slots[1].due is not None  # a start that was due waits
     supervisor.slots[1].due.cancel()
     if end == "a death":
-        supervisor.died(cast(ProcessHandle, relay), -9)
+        relay.end(-9)
         supervisor.slots[1].due.cancel()
     elif end == "a stop":
 
@@ -59,8 +61,6 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
         report(LeaseHeld(clock.since_boot() + 60, 5 if end == "renewed" else 7))
     assert control.signals[1:] == [signal.SIGCONT if end == "renewed" else signal.SIGKILL]
     assert lease.signals == []
-    assert (api.told, signal.SIGSTOP in api.signals) == (
-        ["ServicePaused"] * (1 if end == "a stop" else 2),
-        False,
-    )
+    assert [type(message) for message in api.told] == [ServicePaused] * (1 if end == "a stop" else 2)
+    assert signal.SIGSTOP not in api.signals
     supervisor.kept.close()
