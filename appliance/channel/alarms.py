@@ -124,7 +124,7 @@ def _policy(status: Status) -> Iterator[_Condition]:
         text = f"the policy denies nothing by [{sections}]; denials are only recorded (audit-only)"
         yield "warning", "policy-audit-only", "policy", text
     if policy.file_refused:
-        text = f"revision {policy.revision} stays in force, {policy.file} is refused: {policy.file_refused}"
+        text = f"revision {policy.revision} stays in force, {policy.file} is rejected: {policy.file_refused}"
         yield "alarm", "policy-refused", "policy", text
     elif policy.differs_from_file:
         text = f"revision {policy.revision} differs from {policy.file}"

@@ -370,7 +370,7 @@ class Settings:
     site_keys: list[Annotated[str, AfterValidator(checked_key)]] = key(
         default=[],
         description="public keys (`ssh-ed25519 BASE64 COMMENT`); with any, a policy or specification that none of them"
-        " signed is refused",
+        " signed is rejected",
     )
     state: Path = key(
         default=Path("/var/lib/rosrv"),
@@ -421,7 +421,7 @@ class Settings:
     )
     api_names: list[str] = key(
         default=[],
-        description="names and addresses for the certificate; other names are refused, addresses are not",
+        description="names and addresses for the certificate; requests to other names are rejected, to addresses not",
     )
     api_notice: str = key(
         default="", max_length=4000, description="notice that the console shows before it asks for a token"

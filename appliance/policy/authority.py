@@ -20,11 +20,11 @@ from appliance.policy.policy_findings import Findings, Place, quoted
 from appliance.policy.sections import AUTHORITY
 from roswire.names import is_global_name
 
-DEFAULT_LEASE = 5.0
-SHORTEST_LEASE, LONGEST_LEASE = 2.0, 3600.0
-"""The bounds of a lease in seconds.
+DEFAULT_TIME = 5.0
+SHORTEST_TIME, LONGEST_TIME = 2.0, 3600.0
+"""The bounds of `release_after`, in seconds.
 
-Relays report once a second which publications move, so a shorter lease could end while its holder publishes.
+Relays report once a second which publications move, so a holder that publishes could lose the group in a shorter time.
 """
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}", re.ASCII)
 _SECONDS = re.compile(r"([0-9]{1,5}(?:\.[0-9]{1,3})?)s", re.ASCII)
@@ -48,8 +48,8 @@ class Claim(StrEnum):
     ASK = "ask"
 
 
-_LEASE, _RANK, _FREE = "lease", "rank", "free"
-_OPTIONS = (*Claim, _LEASE, _RANK, _FREE)
+_RELEASE_AFTER, _RANK, _FREE = "lease", "rank", "free"
+_OPTIONS = (*Claim, _RELEASE_AFTER, _RANK, _FREE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class RankMember:
 
 @dataclass(frozen=True, slots=True)
 class AuthorityGroup:
-    """A group; its authority ends after `lease` seconds of silence.
+    """A command group; its holder loses it after `release_after` seconds of silence.
 
     `ranks` are the members of each rank, the highest first; a group without them has holders. `free` is in seconds.
     """
@@ -72,7 +72,7 @@ class AuthorityGroup:
     names: frozenset[str]
     rule: Rule
     hosts: tuple[tuple[Claim, frozenset[Atom]], ...] = ()
-    lease: float = DEFAULT_LEASE
+    release_after: float = DEFAULT_TIME
     ranks: tuple[tuple[RankMember, ...], ...] = ()
     free: float = DEFAULT_FREE
 
@@ -170,7 +170,7 @@ def _check_ranked(group: AuthorityGroup, options: list[tuple[str, str, Entry]], 
         text = f"{quoted(group.name)} has a rank, so its name is a part of a topic's name: a letter, then letters,"
         findings.error(place, f"{text} digits and _")
     for option, name, entry in options:
-        if name == group.name and option in (*Claim, _LEASE):
+        if name == group.name and option in (*Claim, _RELEASE_AFTER):
             text = f"a group has either a rank or {option}: in {group.name}, the node drives that moves"
             findings.error(entry.key, text)
 
@@ -217,14 +217,14 @@ def _with_option(
     group: AuthorityGroup, option: str, entry: Entry, groups: HostGroups, findings: Findings
 ) -> AuthorityGroup:
     word = entry.key
-    if option == _LEASE:
+    if option == _RELEASE_AFTER:
         text = " ".join(value.text for value in entry.values)
         number = _SECONDS.fullmatch(text)
-        if number is None or not SHORTEST_LEASE <= float(number[1]) <= LONGEST_LEASE:
-            fault = f"{quoted(text)} is not a valid time: give {SHORTEST_LEASE:g}s to {LONGEST_LEASE:g}s, such as 5s"
+        if number is None or not SHORTEST_TIME <= float(number[1]) <= LONGEST_TIME:
+            fault = f"{quoted(text)} is not a valid time: give {SHORTEST_TIME:g}s to {LONGEST_TIME:g}s, such as 5s"
             findings.error(word, fault)
             return group
-        return replace(group, lease=float(number[1]))
+        return replace(group, release_after=float(number[1]))
     if option == _RANK:
         return replace(group, ranks=_read_rank(entry, groups, findings))
     if option == _FREE:

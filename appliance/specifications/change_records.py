@@ -76,9 +76,7 @@ class ChangeRecords:
         self._trail.happened("specifications refused", text, findings=findings[:_MOST_FINDINGS], who=who)
 
     def folder_refused(self, revision: int, findings: Sequence[str]) -> None:
-        text = (
-            f"revision {revision} of the specifications stays in force, because the start refused the folder"
-        )
+        text = f"revision {revision} of the specifications stays in force, because the folder has errors"
         _log.error(text, findings=findings[:_MOST_FINDINGS])
         self._trail.happened(
             "specifications refused",

@@ -80,7 +80,7 @@ class PolicyState(msgspec.Struct, frozen=True):
         Moment | None, doc("when it came into force, or null if a version that did not store it made it")
     ] = None
     file_refused: Annotated[
-        str, doc("why the file was refused at the last start or reload, or empty if it was not")
+        str, doc("why the file was rejected at the last start or reload, or empty if it was not")
     ] = ""
 
 

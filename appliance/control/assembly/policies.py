@@ -292,7 +292,7 @@ class Policies(Revisions[RevisionRow]):
 
     def _file_refused(self, error: PolicyRefusedError) -> None:
         self._note_refused(error.findings[0])
-        text = f"revision {self.revision} stays in force, because the start refused {self.file}"
+        text = f"revision {self.revision} stays in force, because {self.file} is rejected"
         _log.error(text, findings=error.findings[:100])
         self._trail.happened(
             "policy file refused",

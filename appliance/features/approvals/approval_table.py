@@ -74,13 +74,13 @@ class ApprovalEntry:
     """Monotonic seconds."""
     state: ApprovalState = ApprovalState.WAITS
     once: bool = False
-    """An approval is for one call; otherwise it is a lease for all calls of this host and name until its end."""
+    """An approval is for one call; otherwise for all calls of this host and name until its end."""
     who: str = ""
     credentials: frozenset[str] = frozenset()
     """The ids of the approver's tokens and sessions; the approval ends with the last of them."""
 
     @property
-    def lease(self) -> bool:
+    def for_some_time(self) -> bool:
         return self.state is ApprovalState.APPROVED and not self.once
 
 
@@ -153,7 +153,7 @@ class ApprovalTable:
             replace(
                 entry,
                 call=call,
-                since=entry.since if entry.lease else now,
+                since=entry.since if entry.for_some_time else now,
                 state=ApprovalState.APPROVED,
                 once=seconds is None,
                 who=who,
@@ -187,11 +187,11 @@ class ApprovalTable:
             self.pool.give_back(entry.charged)
 
     def approved(self) -> frozenset[Approval]:
-        """Return the leases on topics and parameters. Calls of services are decided one by one."""
+        """Return the approvals for some time on topics and parameters. Calls of services are decided one by one."""
         return frozenset(
             entry.call.approval
             for entry in self._entries.values()
-            if entry.lease and entry.call.category is not Category.CALL
+            if entry.for_some_time and entry.call.category is not Category.CALL
         )
 
     def _put(self, entry: ApprovalEntry, seconds: float) -> ApprovalEntry:

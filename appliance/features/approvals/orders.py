@@ -1,7 +1,7 @@
 """Hold calls that need an approval, and give and end approvals.
 
-A lease on a topic or a parameter is enforced like a change of the policy. A service call is decided here, because the
-relay asks about each request. Nothing is stored, so a restart or a takeover ends all approvals.
+An approval of a topic or a parameter is enforced like a change of the policy. A service call is decided here, because
+the relay asks about each request. Nothing is stored, so a restart or a takeover ends all approvals.
 """
 
 import asyncio
@@ -37,10 +37,10 @@ from appliance.store.ends import EndTable
 from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
 CHECK_SECONDS = 0.25
-LEASE_SECONDS = 60.0
-"""The default duration of a lease on a topic or a parameter."""
+APPROVED_SECONDS = 60.0
+"""The default time of an approval on a topic or a parameter."""
 SILENT_SECONDS = 5.0
-"""The silence that ends a lease on a motion outside the groups of `[Authority]`."""
+"""The silence that ends an approval of a motion outside the groups of `[Authority]`."""
 UNANSWERED_SECONDS = 600.0
 
 
@@ -77,10 +77,10 @@ class ApprovalOrders:
         self._table = ApprovalTable(first, ends, held)
         self._unanswered: list[float] = []
         self._cut_off: list[ApprovalEntry] = []  # by a change of the policy
-        self._moved: dict[int, float] = {}  # of leases: the last message, even after its publisher ended
+        self._moved: dict[int, float] = {}  # the last message, even after its publisher ended
         self._still: dict[
             int, float
-        ] = {}  # of leases: the last message before a silence about which guards were asked
+        ] = {}  # of approvals for some time: the last message before a silence about which guards were asked
         self.approved = self._table.approved
 
     # --- calls ---
@@ -157,17 +157,16 @@ class ApprovalOrders:
         seconds = request.seconds
         if request.waits and entry.state is not ApprovalState.WAITS:
             raise SenselessError(f"approval {entry.number} is already {entry.state} by {entry.who}")
-        if seconds is None and entry.lease and entry.call.category is Category.CALL:
+        if seconds is None and entry.for_some_time and entry.call.category is Category.CALL:
             raise SenselessError(
                 f"approval {entry.number} is for some time: give its new time with --for, or run:"
                 f" rosrv approval refuse {entry.number}"
             )
         if seconds is None and entry.call.category is not Category.CALL:
-            seconds = LEASE_SECONDS  # a publisher registers once, so only a lease bounds its messages
-        if seconds is not None and not requests.SHORTEST_LEASE <= seconds <= requests.LONGEST_LEASE:
+            seconds = APPROVED_SECONDS  # a publisher registers once, so only a time bounds its messages
+        if seconds is not None and not requests.SHORTEST <= seconds <= requests.LONGEST:
             raise SenselessError(
-                f"an approval cannot last {seconds:g} s: give {requests.SHORTEST_LEASE:g}s to"
-                f" {requests.LONGEST_LEASE:g}s"
+                f"an approval cannot last {seconds:g} s: give {requests.SHORTEST:g}s to {requests.LONGEST:g}s"
             )
         if not self._asks(entry):
             raise SenselessError(
@@ -217,11 +216,11 @@ class ApprovalOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End expired approvals, those of an earlier approver, and leases of silent hosts.
+        """End expired approvals, those of an earlier approver, and those of silent hosts.
 
         All of them end before the first wait for a relay.
 
-        Silence only ends leases on motions: topics of a group of `[Authority]`, or with a safe message of an enabled
+        Silence only ends approvals of motions: topics of a group of `[Authority]`, or with a safe message of an enabled
         guard.
         """
         ended, still = self._cut_off.copy(), []
@@ -266,12 +265,12 @@ class ApprovalOrders:
 
     def _silence(self, entry: ApprovalEntry) -> str:
         moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)
-        seconds = SILENT_SECONDS if group is None else group.lease
+        seconds = SILENT_SECONDS if group is None else group.release_after
         silent = moved > entry.since and clock.now() - moved >= seconds
         return f"its host was silent for {seconds:g} s" if silent else ""
 
     async def _end_if_guarded(self, entry: ApprovalEntry) -> None:
-        """End the lease if a guard has a safe message for its topic. `check` calls this once in each silence."""
+        """End the approval if a guard has a safe message for its topic. `check` calls this once in each silence."""
         guards = await self._guards(entry.call.resource)
         present = self._table.entry(entry.number)
         if guards is None:
@@ -282,7 +281,7 @@ class ApprovalOrders:
             await self._stop_motion(present)
 
     def _last_message(self, entry: ApprovalEntry) -> float:
-        if not entry.lease or entry.call.category is not Category.PUBLISH:
+        if not entry.for_some_time or entry.call.category is not Category.PUBLISH:
             return 0.0
         moved = self._signs.moved(entry.call.host, frozenset({entry.call.resource}))
         self._moved[entry.number] = max(moved, self._moved.get(entry.number, 0.0))
@@ -311,7 +310,7 @@ class ApprovalOrders:
         node that has ended.
         """
         call = entry.call
-        if not entry.lease or call.category is not Category.PUBLISH:
+        if not entry.for_some_time or call.category is not Category.PUBLISH:
             return
         await self._carried_out({call.resource})
         if self._policy().may_command(call.resource, call.host):
@@ -324,8 +323,8 @@ class ApprovalOrders:
         entries = self._table.entries()
         waiting = [entry for entry in entries if entry.state is ApprovalState.WAITS]
         oldest = max((clock.now() - entry.since for entry in waiting), default=0.0)
-        leases = sum(entry.lease for entry in entries)
-        return ApprovalCounts(len(waiting), round(oldest, 1), leases, len(self._unanswered))
+        for_some_time = sum(entry.for_some_time for entry in entries)
+        return ApprovalCounts(len(waiting), round(oldest, 1), for_some_time, len(self._unanswered))
 
     def limits(self) -> tuple[LimitUse, ...]:
         pool = self._table.pool
@@ -361,7 +360,7 @@ class ApprovalOrders:
         call = entry.call
         return requests.Approval(
             entry.number,
-            "lease" if entry.lease else entry.state.value,
+            "lease" if entry.for_some_time else entry.state.value,
             str(call.host),
             entry.caller_id,
             call.category.value,  # type: ignore[arg-type]  # only these categories ask

@@ -8,7 +8,7 @@ from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_operation import parameter, rest
 
-SHORTEST_LEASE, LONGEST_LEASE = 1.0, 3600.0
+SHORTEST, LONGEST = 1.0, 3600.0
 _PROBLEMS = {
     404: "No call has this number any longer.",
     422: "The approval cannot last so long, or another operator has answered the call.",
@@ -16,11 +16,11 @@ _PROBLEMS = {
 Number = Annotated[int, parameter("number of the held call", ge=1, le=10**15, examples=[48213])]
 
 
-class LeaseSeconds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ApprovalTime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How long the approval lasts; by default one call of a service, or 60 s for a topic or a parameter."""
 
     seconds: Annotated[
-        Annotated[float, msgspec.Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)] | None,
+        Annotated[float, msgspec.Meta(ge=SHORTEST, le=LONGEST)] | None,
         doc("for all calls of the same host and name in this time, with any arguments"),
     ] = None
     waits: Annotated[
@@ -66,7 +66,7 @@ class ApprovalsWanted(AdminRequest[Approvals], frozen=True, tag="approvals"):
 
 
 @rest(
-    "operator", "POST", "/v1/approvals/{number}/approve", name="approve", body=LeaseSeconds, problems=_PROBLEMS
+    "operator", "POST", "/v1/approvals/{number}/approve", name="approve", body=ApprovalTime, problems=_PROBLEMS
 )  # fmt: skip
 class ApproveCall(WaitingRequest[Approval], frozen=True, tag="approve"):
     """Approve a held call, once or for some time."""

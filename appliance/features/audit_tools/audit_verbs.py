@@ -228,7 +228,7 @@ def checkpoints(
     """Write the signed checkpoints as NDJSON. Keep them on another machine for `verify --checkpoints`.
 
     With --follow, an appliance that restarts is asked again until it answers. Exit status: 1 if the reader of the
-    output ends, 2 if the token is refused.
+    output ends, 2 if the token is rejected.
 
     Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
     """

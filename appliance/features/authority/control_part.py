@@ -49,7 +49,7 @@ async def begin(core: Core) -> ControlPart:
             RequestMethod(requests.DriveAsk, orders.ask, who=True, full_disk=True),
         ),
         {
-            "the leases of command authority": orders.watch,
+            "the silence of holders": orders.watch,
             "the stop of drivers that were lost": ranked.stop_lost,
             "the stop of what was commanded before groups ended": at_start,
         },

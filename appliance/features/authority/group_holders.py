@@ -88,11 +88,12 @@ class GroupHolders:
         self._waiting.get(group, {}).pop(host, None)
 
     def seconds_left(self, group: AuthorityGroup, now: float, moved: float) -> float | None:
-        """Return the seconds until silence ends the authority. `moved` is the time of the holder's last message to
-        the group.
+        """Return the seconds until a silent holder loses the group.
+
+        `moved` is the time of its last message to the group.
         """
         holding = self._held.get(group.name)
-        return None if holding is None else max(holding.renewed, moved) + group.lease - now
+        return None if holding is None else max(holding.renewed, moved) + group.release_after - now
 
     def loss(self, group: AuthorityGroup, now: float, *, moved: float, live: bool) -> str:
         """Return why the holder loses the group, or an empty string. `live` is whether it has a live node."""
@@ -106,7 +107,7 @@ class GroupHolders:
         if holding.had_node and not live:
             return "its nodes ended"
         left = self.seconds_left(group, now, moved)
-        return f"it was silent for {group.lease:g} s" if left is not None and left <= 0 else ""
+        return f"it was silent for {group.release_after:g} s" if left is not None and left <= 0 else ""
 
     def successor(self, group: AuthorityGroup, now: float) -> Address | None:
         able = (Claim.TAKE, Claim.OVERRIDE)

@@ -1,4 +1,4 @@
-"""Hand groups of `[Authority]` over: operators order it, nodes call for it, and leases expire.
+"""Hand groups of `[Authority]` over: operators order it, nodes call for it, and silent holders lose it.
 
 The earlier holder is cut off on every relay before the next host holds the group. Nothing is stored: after a restart
 or a takeover, each group is free.
@@ -133,7 +133,7 @@ class DriveOrders:
         text = f"{host} gave {', '.join(done)}" if done else f"{host} holds no group"
         return OwnServiceAnswered(call.number, bool(done), text, repeats=False)
 
-    # --- the end of a lease ---
+    # --- the end of a holding ---
 
     async def watch(self) -> None:
         async with asyncio.TaskGroup() as checks:
@@ -305,7 +305,7 @@ class DriveOrders:
             sorted(group.names),
             "" if holding is None else str(holding.host),
             None if holding is None else round(now - holding.since, 1),
-            group.lease,
+            group.release_after,
             None if left is None else round(max(0.0, left), 1),
             [str(host) for host in self._groups.waiting(group, now)],
         )

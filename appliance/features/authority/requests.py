@@ -36,7 +36,7 @@ class GroupState(msgspec.Struct, frozen=True):
     lease: Annotated[
         float, doc("seconds of silence after which a holder loses the group, or 0 if the group has a rank")
     ]
-    left_seconds: Annotated[float | None, doc("until silence ends the authority")]
+    left_seconds: Annotated[float | None, doc("until the holder loses the group by silence")]
     waiting: Annotated[list[str], doc("addresses of the hosts that asked for it, the first one first")]
     ranks: Annotated[
         list[str], doc("the hosts and nodes of each rank, the highest first; empty without a rank")

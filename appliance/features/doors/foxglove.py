@@ -140,7 +140,7 @@ class Foxglove:
             operation = FOXGLOVE_OPERATION.decode(frame)
             return self._carry_out[type(operation)](operation)
         except (PeerError, ValueError, RecursionError) as error:
-            self._refuse(f"the operation is refused: {error}")
+            self._refuse(f"the operation is rejected: {error}")
             return []
 
     def _subscribe(self, operation: FoxgloveSubscribe) -> list[DoorRequest]:

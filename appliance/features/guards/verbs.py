@@ -309,7 +309,7 @@ def upgrade(
     """Replace guards of an older version by those of the present presets, with the same topics and values.
 
     Each guard starts without its state: the base is stopped until the next command. A guard whose value or topic the
-    present version refuses is not upgraded, and is named; the others are.
+    present version rejects is not upgraded, and is named; the others are.
 
     Example: rosrv guard upgrade --dry-run
     """

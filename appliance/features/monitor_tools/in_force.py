@@ -225,7 +225,7 @@ def set_given(
 ) -> None:
     """Set constants that are given to a monitor while it runs. Without values, print everything given to it.
 
-    The monitor keeps its text and its state. A value outside its range is refused. Topics are set by a load.
+    The monitor keeps its source and its state. A value outside its range is rejected. Topics are set by a load.
 
     Example: rosrv monitor set speed vMax=0.3
     """

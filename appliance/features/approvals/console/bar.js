@@ -17,7 +17,7 @@ import { Link } from "#console/router.js";
 import { session } from "#console/session.js";
 import { useStore } from "#console/store.js";
 import { decide, held, useHeldCalls } from "./held.js";
-import { LEASES, wants } from "./call.js";
+import { TIMES, wants } from "./call.js";
 import { asleep, placed, pruned, waitingOf } from "./slots.js";
 import { Sound } from "./sound.js";
 
@@ -64,6 +64,6 @@ function Call(/** @type {{slot: import("./slots.js").Slot, now: number}} */ { sl
     <div class="waiting-what"><${Host} value=${call.host} /> <span class="muted">wants to</span> ${wants(call)}</div>
     <div class="waiting-left nowrap" data-left>${ended || html`<b>${lasting(seconds)}</b> left`}</div>
     <div class="row waiting-buttons">${call.category === "call" && html`<${Button} small role="operator" tone="primary" ...${off} onClick=${() => decide(number, "approve")}>Approve once</${Button}>`}
-      ${LEASES.map((lease) => html`<${Button} key=${lease} small role="operator" ...${off} onClick=${() => decide(number, "approve", lease)}>For ${lasting(lease)}</${Button}>`)}
+      ${TIMES.map((seconds) => html`<${Button} key=${seconds} small role="operator" ...${off} onClick=${() => decide(number, "approve", seconds)}>For ${lasting(seconds)}</${Button}>`)}
       <${Button} small role="operator" ...${off} onClick=${() => decide(number, "refuse")}>Refuse</${Button}></div></div>`;
 }

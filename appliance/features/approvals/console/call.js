@@ -3,7 +3,7 @@
 import { html } from "#console/html.js";
 import { Given } from "#console/parts/given.js";
 
-export const LEASES = [30, 300]; // seconds
+export const TIMES = [30, 300]; // seconds
 const SHOWN = 160; // characters; the number of bytes tells that the arguments have more
 
 /** What a held call does, with its arguments. @param {any} one */

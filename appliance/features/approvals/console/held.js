@@ -77,7 +77,7 @@ export async function decide(number, verb, seconds) {
   const json = verb === "approve" ? { seconds, waits: true } : undefined;
   try {
     const { body } = await ask("POST", `/v1/approvals/${number}/${verb}`, { json, match: "*" });
-    done(`Approval ${body.number}: ${body.state}`, `${body.host} ${body.resource}`);
+    done(`Approval ${body.number}: ${body.state === "lease" ? "approved" : body.state}`, `${body.host} ${body.resource}`);
   } catch (failure) {
     failed(failure);
   }

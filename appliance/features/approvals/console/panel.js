@@ -8,7 +8,7 @@ import { Given } from "#console/parts/given.js";
 import { Host } from "#console/parts/host.js";
 import { Failure } from "#console/parts/notice.js";
 import { useStore } from "#console/store.js";
-import { LEASES, wants } from "./call.js";
+import { TIMES, wants } from "./call.js";
 import { again, decide, held } from "./held.js";
 import { WAKES } from "./slots.js";
 import { Sound } from "./sound.js";
@@ -54,8 +54,8 @@ function Row(/** @type {{one: any, steady: {awake: boolean, now: () => boolean}}
   return html`<tr data-approval=${one.number}>
     <td class="first"><${Host} value=${one.host} /><div class="muted small"><${Given} value=${one.caller_id} mono most=${64} /></div></td>
     <td data-label="Wants to"><div>${wants(one)}</div></td>
-    <td data-label="State"><div><${Badge} word=${one.state} tone=${waits ? "warn" : one.state === "refused" ? "deny" : "allow"} /><div class="muted small">approval ${one.number}, ${lasting(one.left_seconds)} left${one.who && ` (${one.who})`}</div></div></td>
+    <td data-label="State"><div><${Badge} word=${one.state === "lease" ? "approved" : one.state} tone=${waits ? "warn" : one.state === "refused" ? "deny" : "allow"} /><div class="muted small">approval ${one.number}, ${lasting(one.left_seconds)} left${one.who && ` (${one.who})`}</div></div></td>
     <td><div class="row row-end">${once && html`<${Button} small role="operator" tone="primary" ...${off} onClick=${order("approve")}>Approve once</${Button}>`}
-      ${waits && LEASES.map((seconds) => html`<${Button} key=${seconds} small role="operator" ...${off} onClick=${order("approve", seconds)}>For ${lasting(seconds)}</${Button}>`)}
+      ${waits && TIMES.map((seconds) => html`<${Button} key=${seconds} small role="operator" ...${off} onClick=${order("approve", seconds)}>For ${lasting(seconds)}</${Button}>`)}
       ${one.state !== "refused" && html`<${Button} small role="operator" ...${off} onClick=${order("refuse")}>${waits ? "Refuse" : "End"}</${Button}>`}</div></td></tr>`;
 }

@@ -108,7 +108,7 @@ def test_a_call_is_held_approved_used_once_and_held_again(
     assert appliance.recorded("--event", "approval given", count=2)
 
 
-def test_a_publication_lasts_for_its_lease(appliance: Appliance, robot: Host, tmp_path: Path) -> None:
+def test_a_publication_lasts_for_its_time(appliance: Appliance, robot: Host, tmp_path: Path) -> None:
     advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
     publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
     with RosSession(appliance.master_uri, tmp_path, robot) as ros:
@@ -137,7 +137,7 @@ def test_a_publication_lasts_for_its_lease(appliance: Appliance, robot: Host, tm
         eventually(
             lambda: "no call waits" in appliance.rosrv("approve", check=False).stdout, "nothing is kept"
         )
-        eventually(lambda: "held for" in robot.run(lambda: refused(publish)), "the lease is over")
+        eventually(lambda: "held for" in robot.run(lambda: refused(publish)), "its time is over")
 
 
 def test_a_door_that_is_added_again_has_no_approval(appliance: Appliance, robot: Host) -> None:
@@ -168,7 +168,7 @@ def refused(publish: dict[str, Any]) -> str:
     return text
 
 
-def test_a_parameter_is_written_while_a_lease_lasts(appliance: Appliance, robot: Host) -> None:
+def test_a_parameter_is_written_while_an_approval_lasts(appliance: Appliance, robot: Host) -> None:
     write = {
         "op": "call_service",
         "service": "/rosapi/set_param",
@@ -182,7 +182,7 @@ def test_a_parameter_is_written_while_a_lease_lasts(appliance: Appliance, robot:
 MOTION = POLICY + "[Authority]\nbase = /cmd_vel\ntake base = site agent\nlease base = 2s\n"
 
 
-def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
+def test_an_approved_motion_ends_by_silence_and_the_guard_stops_the_robot(
     appliance: Appliance, robot: Host, tmp_path: Path
 ) -> None:
     appliance.reload(MOTION)
@@ -208,7 +208,7 @@ def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
         stops = appliance.recorded("--event", "motion stopped", count=1)
         assert "speed on /cmd_vel" in stops[0]["reason"], stops
         echo.wait_for_text(STOPS, since=mark)
-        appliance.reload(MOTION.replace("2s", "60s"))  # the lease does not end by silence
+        appliance.reload(MOTION.replace("2s", "60s"))  # the approval does not end by silence
         drive()
         mark = echo.mark()
         appliance.kill("control")

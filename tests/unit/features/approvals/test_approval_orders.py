@@ -15,7 +15,7 @@ from appliance.channel.messages import RequestHeld
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.approvals.approval_table import WAIT_SECONDS
-from appliance.features.approvals.orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
+from appliance.features.approvals.orders import APPROVED_SECONDS, CHECK_SECONDS, ApprovalOrders
 from appliance.features.approvals.requests import Approval, ApprovalsWanted, ApproveCall, RefuseCall
 from appliance.features.approvals.view import APPROVALS_VIEW
 from appliance.master.endpoints.host_signs import HostSigns
@@ -154,7 +154,7 @@ async def test_an_approval_of_one_call_is_used_once(site: Site) -> None:
     assert site.events().count("used") == 1
 
 
-async def test_a_lease_of_a_service_is_for_any_arguments_until_its_time(site: Site) -> None:
+async def test_an_approval_of_a_service_for_some_time_is_for_any_arguments_until_its_time(site: Site) -> None:
     number = number_in(await site.call(b"1"))
     await site.orders.approve(ApproveCall(number, 10.0), "ann")
     assert [await site.call(body) for body in (b"1", b"2", b"1")] == ["", "", ""]
@@ -165,7 +165,7 @@ async def test_a_lease_of_a_service_is_for_any_arguments_until_its_time(site: Si
     assert number_in(await site.call(b"1")) != number
 
 
-async def leased_call(site: Site) -> int:
+async def call_approved_for_some_time(site: Site) -> int:
     number = number_in(await site.call(b"1"))
     await site.orders.approve(ApproveCall(number, 10.0), "ann")
     return number
@@ -176,20 +176,20 @@ async def test_a_topic_and_a_parameter_are_approved_for_some_time(site: Site, ca
     number = number_in(site.publish("/x", category))
     assert number_in(site.publish("/x", category)) == number
     assert number_in(site.publish("/y", category)) != number
-    assert (await site.orders.approve(ApproveCall(number), "ann")).left_seconds == LEASE_SECONDS
+    assert (await site.orders.approve(ApproveCall(number), "ann")).left_seconds == APPROVED_SECONDS
     assert site.publish("/x", category) == ""
-    await site.pass_time(LEASE_SECONDS - 1)
+    await site.pass_time(APPROVED_SECONDS - 1)
     assert site.publish("/x", category) == ""
     await site.pass_time(1)
     assert number_in(site.publish("/x", category)) != number
     with pytest.raises(SenselessError, match="is for some time"):
-        await site.orders.approve(ApproveCall(await leased_call(site)), "ann")
+        await site.orders.approve(ApproveCall(await call_approved_for_some_time(site)), "ann")
     for seconds in (0.5, 3601.0, float("nan")):
         with pytest.raises(SenselessError, match="cannot last"):
             await site.orders.approve(ApproveCall(number_in(site.publish("/x", category)), seconds), "ann")
 
 
-async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot(site: Site) -> None:
+async def test_an_approved_motion_ends_by_silence_and_the_guards_stop_the_robot(site: Site) -> None:
     """A motion is a topic in a group or with a guard. Silence counts from the first message."""
     site.guarded = ["/arm"]
     for topic in ("/cmd_vel", "/arm", "/other"):
@@ -211,7 +211,7 @@ async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot
     assert site.stops[2:] == [(str(AGENT), {"/other"})], "its guards stop it too, if there are any"
 
 
-async def test_a_relay_that_hangs_delays_the_end_of_no_other_lease(site: Site) -> None:
+async def test_a_relay_that_hangs_delays_the_end_of_no_other_approval(site: Site) -> None:
     site.guarded, site.hanging = ["/arm", "/b"], {"/a", "/arm"}
     approved = [asyncio.ensure_future(approve(site, topic, 2.0)) for topic in ("/a", "/b")]
     approved.append(asyncio.ensure_future(approve(site, "/arm", 60.0)))
@@ -239,7 +239,7 @@ async def approve(site: Site, topic: str, seconds: float) -> None:
     await site.orders.approve(ApproveCall(number_in(site.publish(topic)), seconds), "ann")
 
 
-async def test_a_lease_that_is_extended_still_ends_by_silence(site: Site) -> None:
+async def test_an_approval_that_is_extended_still_ends_by_silence(site: Site) -> None:
     number = number_in(site.publish("/cmd_vel"))
     await site.orders.approve(ApproveCall(number, 60.0), "ann")
     await site.pass_time(1)
@@ -251,7 +251,7 @@ async def test_a_lease_that_is_extended_still_ends_by_silence(site: Site) -> Non
     assert site.stops
 
 
-async def test_the_end_of_a_lease_stops_the_robot_without_a_report_of_a_message(site: Site) -> None:
+async def test_the_end_of_an_approval_stops_the_robot_without_a_report_of_a_message(site: Site) -> None:
     """Relays report once a second, and never for a node that has ended. A host without the group moved nothing."""
     for holder in (AGENT, OTHER):
         site.text = replace(site.text, holders={"base": holder})
@@ -281,12 +281,12 @@ async def test_an_operator_refuses_a_call_and_ends_an_approval(site: Site) -> No
     assert first == again
     assert f"an operator refused approval {number}" in again
     await site.pass_time(WAIT_SECONDS)
-    lease = number_in(site.publish("/x"))
-    await site.orders.approve(ApproveCall(lease), "ann")
-    await site.orders.refuse(RefuseCall(lease), "ann")
-    assert number_in(site.publish("/x")) != lease
+    approval = number_in(site.publish("/x"))
+    await site.orders.approve(ApproveCall(approval), "ann")
+    await site.orders.refuse(RefuseCall(approval), "ann")
+    assert number_in(site.publish("/x")) != approval
     for order in (
-        site.orders.approve(ApproveCall(lease), "ann"),
+        site.orders.approve(ApproveCall(approval), "ann"),
         site.orders.refuse(RefuseCall(number), "ann"),
     ):
         with pytest.raises(UnknownThingError, match="rosrv approve lists all"):
@@ -376,7 +376,7 @@ async def test_a_call_is_refused_as_soon_as_its_approver_has_lost_the_role(
 
 
 async def test_an_approval_outlives_one_of_two_tokens_of_its_approver_and_any_other(site: Site) -> None:
-    """The admin socket needs no token. A later approval of the same lease replaces the approver."""
+    """The admin socket needs no token. A later approval of the same call replaces the approver."""
     site.bearers = [bearer("1", "ann"), bearer("2", "ann"), bearer("3", "bob", "admin")]
     numbers = [number_in(site.publish(topic)) for topic in ("/a", "/b", "/c")]
     for number, who in zip(numbers, ("ann", "operator", "ann"), strict=True):
@@ -424,7 +424,7 @@ async def test_many_addresses_leave_another_host_its_calls(site: Site) -> None:
 async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None:
     chance = random.Random(11)  # noqa: S311  a history by seed
     once: list[tuple[Address, bytes]] = []
-    leases: dict[Address, float] = {}
+    ends: dict[Address, float] = {}
     for _ in range(2000):
         host, body = chance.choice((AGENT, OTHER)), chance.choice((b"1", b"2", b"3"))
         match chance.randrange(4):
@@ -436,12 +436,12 @@ async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None
                         assert one.size == 1
                         once.append((address_of(one.host), bytes.fromhex(one.arguments)))
                     else:
-                        leases[address_of(one.host)] = clock.now() + seconds
+                        ends[address_of(one.host)] = clock.now() + seconds
             case 1:
                 await site.pass_time(chance.choice((0.25, 1, 2)))
             case _:
-                leased = leases.get(host, 0.0) > clock.now()
-                if not await site.call(body, host) and not leased:
+                approved = ends.get(host, 0.0) > clock.now()
+                if not await site.call(body, host) and not approved:
                     once.remove((host, body))
 
 

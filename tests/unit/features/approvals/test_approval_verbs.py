@@ -52,11 +52,11 @@ def test_an_operator_sees_every_byte_of_the_arguments(
 
 def test_a_watched_call_is_shown_when_it_comes_changes_and_ends() -> None:
     call = Approval(7, "waits", *REST, "", 0, 60.0, "")  # type: ignore[arg-type]  # of a tuple
-    lease = msgspec.structs.replace(call, state="lease", who="ann")
+    timed = msgspec.structs.replace(call, state="lease", who="ann")
     assert list(changes({}, [call])) == [call]
     assert list(changes({7: call}, [msgspec.structs.replace(call, left_seconds=50.0)])) == []
-    assert list(changes({7: call}, [lease])) == [lease]
-    assert list(changes({7: lease}, [])) == [msgspec.structs.replace(lease, left_seconds=0.0)]
+    assert list(changes({7: call}, [timed])) == [timed]
+    assert list(changes({7: timed}, [])) == [msgspec.structs.replace(timed, left_seconds=0.0)]
 
 
 def test_the_watch_goes_on_while_the_appliance_restarts(

@@ -27,14 +27,14 @@ from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
 PILOT, SECOND, BOSS, AGENT, STRANGER = (f"10.0.0.{number}" for number in range(1, 6))
-LEASE = 5.0
+RELEASE_AFTER = 5.0
 TEXT = f"""
 [Authority]
 base = /cmd_vel
 take base = {PILOT} {SECOND}
 override base = {BOSS}
 ask base = {AGENT}
-lease base = {LEASE:g}s
+lease base = {RELEASE_AFTER:g}s
 """
 
 
@@ -124,7 +124,7 @@ def site() -> Iterator[Site]:
 
 
 @pytest.mark.parametrize("number", [2_000, pytest.param(100_000, marks=pytest.mark.nightly)])
-async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: Site, number: int) -> None:
+async def test_never_two_holders_and_never_none_for_longer_than_a_silence(site: Site, number: int) -> None:
     chance, hosts, hand_overs = site.chance, (PILOT, SECOND, BOSS, AGENT, STRANGER), 0
     orders, moves = site.orders, set[str]()
     kinds = (
@@ -143,7 +143,7 @@ async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: 
         (moves.add if chance.random() < 0.5 else moves.discard)(host)
         (site.live.add if chance.random() < 0.8 else site.live.discard)(address_of(host))
         if chance.random() < 0.3:
-            await site.pass_time(chance.choice((0.25, 1.0, LEASE + 0.5)), moves)
+            await site.pass_time(chance.choice((0.25, 1.0, RELEASE_AFTER + 0.5)), moves)
         hand_overs += len(site.handed_over())
         site.trail.records.clear()
         state = await site.state()
@@ -154,7 +154,7 @@ async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: 
             )
         else:
             assert state.left_seconds is not None
-            assert state.left_seconds <= LEASE
+            assert state.left_seconds <= RELEASE_AFTER
 
 
 async def test_the_next_holder_of_a_group(site: Site) -> None:
@@ -189,10 +189,10 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
 async def test_a_holder_loses_a_group(site: Site) -> None:
     take = DriveTake("base", PILOT)
     await site.orders.take(take, "op")
-    await site.pass_time(3 * LEASE, [PILOT])
-    await site.pass_time(LEASE - 1)
+    await site.pass_time(3 * RELEASE_AFTER, [PILOT])
+    await site.pass_time(RELEASE_AFTER - 1)
     await site.orders.take(take, "op")  # takes it again
-    await site.pass_time(LEASE - 1)
+    await site.pass_time(RELEASE_AFTER - 1)
     assert (await site.state()).holder == PILOT
     await site.pass_time(1)
     await site.orders.take(take, "op")
@@ -237,7 +237,7 @@ async def test_a_relay_that_hangs_delays_the_end_of_no_other_group(site: Site) -
     for group in ("base", "arm"):
         await site.orders.take(DriveTake(group, PILOT), "op")
     site.hanging = {"/cmd_vel"}
-    site.time.advance(LEASE)
+    site.time.advance(RELEASE_AFTER)
     check = asyncio.ensure_future(site.orders.check())
     for _ in range(9):
         await asyncio.sleep(0)

@@ -6,7 +6,7 @@ from appliance.features.authority.group_holders import MOST_WAITING, GroupHolder
 from appliance.policy.authority import Claim
 from appliance.policy.model import Address
 
-GROUP: Any = SimpleNamespace(name="base", lease=2.0)
+GROUP: Any = SimpleNamespace(name="base", release_after=2.0)
 DRIVERS: dict[Address, Claim] = {IPv4Address("10.0.0.1"): Claim.TAKE, IPv4Address("10.0.0.2"): Claim.OVERRIDE}
 
 
