@@ -46,7 +46,16 @@ def make_core(base: Foundation, parts: Parts, bearers: Bearers, alarms: Alarms) 
         rest=RestServices(),
         own_services=OwnServices(base.own_services),
         bearers=bearers,
-        limits=ResourceUses(OwnUses(parts, base.settings, base.listener_limits)),
+        limits=ResourceUses(
+            OwnUses(
+                parts.core.registry,
+                parts.core.carried,
+                lambda: parts.endpoints.places.taken,
+                base.listener_limits.connection_table.connected,
+                parts.core.parameters.charges.pool,
+                base.settings,
+            )
+        ),
         alarms=alarms,
     )
 
@@ -61,11 +70,11 @@ def _graph_facts(base: Foundation, parts: Parts) -> GraphFacts:
         return "" if (node := registry.by_key(key)) is None else node.name
 
     return GraphFacts(
-        present=partial(graph_of, parts),
+        present=partial(graph_of, registry, ends.relay),
         host_of=host_of,
         name_of=name_of,
         machines=registry.machines,
-        connected=partial(hosts_connected, parts),
+        connected=partial(hosts_connected, registry, parts.core.carried),
         live_rights=parts.core.revocation.live,
         expel=ends.enforcement.expel,
         signs=host_signs(registry, parts.core.carried),

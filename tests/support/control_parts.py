@@ -4,24 +4,21 @@ Models of everything else record their calls, and give the answers that a test s
 """
 
 import asyncio
-import contextlib
 import ipaddress
-import itertools
-from collections.abc import Callable, Iterable
-from types import SimpleNamespace
-from typing import Any, NamedTuple, Self, cast
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
 
 from appliance.audit.log.record import AuditRecord
 from appliance.channel import messages
 from appliance.configuration import settings
-from appliance.master.calls.call import ApiUri, Caller
 from appliance.master.calls.parameter_calls import ParameterRights
-from appliance.master.endpoints.delivery import NodeApiClient, NodeCall
-from appliance.master.endpoints.node_ports import NodePorts
-from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.calls.registration import Arrivals
+from appliance.master.endpoints.delivery import Delivery, NodeCall
+from appliance.master.endpoints.node_ports import AdvertisedAddresses
+from appliance.master.endpoints.relay_control import OwnAnswer, OwnCall, RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
-from appliance.master.graph.registry import Change, Incarnation, Kind, Life, Registry, new_key
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry, new_key
 from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
@@ -31,17 +28,20 @@ from appliance.master.rosmaster import Answer, MasterRegistrations, RosMaster, W
 from appliance.policy.model import Address, Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
-from appliance.rpc.server import HttpRequest, Peer
-from appliance.rpc.xmlrpc_client import RefusedError, UnansweredError
+from appliance.rpc.server import Handler, HttpRequest, Peer
+from appliance.rpc.xmlrpc_client import XmlRpcClient
 from appliance.specifications.allocation import Allocation
+from appliance.specifications.specification_files import CheckedSpecifications
 from appliance.store.state_file import StateStore
 from roswire.parameter_tree import standing_at
-from roswire.uris import node_uri, parse_node_uri
+from roswire.uris import NodeUri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
 from tests.support.core import FakeTrail
-from tests.support.idle import idle
 from tests.support.master_api import MasterApi
+from tests.support.memory_channel import HeldChannel
+from tests.support.memory_ports import face, memory_ports
 from tests.support.parameters import mirror, put
+from tests.support.scripted_nodes import ScriptedNodes
 
 HOST = ipaddress.ip_address("10.0.0.5")
 POLICY = "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}default=*\n[Commands]\ndefault=*\n"
@@ -123,7 +123,9 @@ class Records(FakeTrail):
             self.refused.append(f"{record.event}: {caller_id} {category} {resource}")
 
 
-class Deliveries:
+class Deliveries(Delivery):
+    """Notes each call, and makes none. `told` has the calls with the names of their nodes."""
+
     def __init__(self, note: Callable[[Seen], None]) -> None:
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
         self._note = note
@@ -164,47 +166,38 @@ class Deliveries:
         self._note(Ended("drop what waits for", incarnation))
 
 
-class RelayEnd:
-    def __init__(self, note: Callable[[messages.Message], None], full: Callable[[], bool]) -> None:
-        self._note = note
-        self._full = full
-
-    @property
-    def crowded(self) -> bool:
-        return self._full()
-
-    def attach(self, *_given: object) -> None:
-        """Act as `Channel`."""
-
-    def close(self) -> None:
-        """Act as `Channel`."""
-
-    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        self._note(message)
-
-
-class RelayPorts:
-    def socket(self, port: int) -> Any:
-        return SimpleNamespace(fileno=lambda: port)
-
-    def policy_changed(self, _ports: range) -> None:
-        """Act as `NodePorts`."""
-
-
 class NoSpecifications:
-    checked = SimpleNamespace(of_topic=lambda _topic: False, of_service=lambda _service: False)
+    """Specifications without a monitor. `lost` has the relays that ended."""
+
+    def __init__(self) -> None:
+        self.checked = CheckedSpecifications()
+        self.lost: list[int] = []
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return messages.SpecificationsStated(0, b"", {}, restarted=False)
 
-    def relay_lost(self, _relay: int) -> None:
-        """Act as `SpecificationManager`."""
+    def received(self, message: messages.Message, relay: int) -> None:
+        raise AssertionError(f"relay {relay} reports of no monitor: {message}")
+
+    def relay_lost(self, relay: int) -> None:
+        self.lost.append(relay)
 
 
-class HiddenMaster:
+class HiddenMaster(XmlRpcClient):
+    """The connections to a ROS master that carries out each call in this process.
+
+    `requests` has the method of each request, and `calls` all calls. Requests wait for `go`; then they get `failure`
+    or `answer`, if these are set.
+    """
+
     def __init__(self, note: Callable[[Seen], None]) -> None:
+        super().__init__(NodeUri("http", "127.0.0.1", 1, "/"), timeout=1.0)
         self._note = note
         self.calls: list[tuple[Value, ...]] = []
+        self.requests: list[str] = []
+        self.under_way = self.most_under_way = 0
+        self.failure: Exception | None = None
+        self.answer: Value = None
         self.tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in _TABLES.values()}
         self.nodes: dict[str, str] = {}
         self.parameters: dict[str, Value] = {"run_id": "1"}
@@ -213,11 +206,22 @@ class HiddenMaster:
         self.go.set()
 
     async def call(self, method: str, *params: Value) -> Value:
-        await asyncio.sleep(0)
-        await self.go.wait()
+        self.requests.append(method)
+        self.under_way += 1
+        self.most_under_way = max(self.most_under_way, self.under_way)
+        try:
+            await asyncio.sleep(0)
+            await self.go.wait()
+            answer = self._carry_out_all(method, params)
+        finally:
+            self.under_way -= 1
+        if self.failure is not None:
+            raise self.failure
+        return answer if self.answer is None else self.answer
+
+    def _carry_out_all(self, method: str, params: tuple[Any, ...]) -> Value:
         if method == "system.multicall":
-            parts = cast(list[dict[str, Any]], params[0])
-            return [[self.carry_out(part["methodName"], *part["params"])] for part in parts]
+            return [[self.carry_out(part["methodName"], *part["params"])] for part in params[0]]
         return self.carry_out(method, *params)
 
     def carry_out(self, method: str, *params: Value) -> Answer:
@@ -294,74 +298,14 @@ class HiddenMaster:
         return list(self.tables[kind].get(resource, {}))
 
 
-class Inner:
-    def __init__(self, registry: Registry, note: Callable[[Seen], None]) -> None:
-        self._registry = registry
-        self._note = note
-        self._ports = itertools.count(20_001)
-        self.go = asyncio.Event()
-        self.go.set()
-
-    def flush(self, changed: Iterable[Change]) -> None:
-        ProxyEndpoints.flush(cast(Any, self), changed)
-
-    def close(self, incarnation: Incarnation) -> None:
-        self._note(Ended("close", incarnation))
-
-    def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        return self._registry.find(caller.caller_id, caller.peer.host, api.text)
-
-    async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        await self.go.wait()
-        known = self.known(caller, api)
-        if known is None:
-            outer, relay = next(self._ports), next(self._ports)
-            known = Incarnation(
-                new_key(), caller.caller_id, caller.peer.host, api.uri, api.text, "10.0.0.1", outer, relay,
-                own=caller.own,
-            )  # fmt: skip
-            self._registry.add(known)
-        return known
-
-    def inner_uri(self, incarnation: Incarnation) -> str:
-        return node_uri("127.0.0.1", _INNER_PORT, f"/{incarnation.key}/")
-
-    def by_inner_uri(self, text: str) -> Incarnation | None:
-        return self._registry.by_key(text.rstrip("/").rpartition("/")[2])
-
-
-class Clients:
-    def __init__(self) -> None:
-        self.silent: set[str] = set()
-        self.gone: set[str] = set()
-
-    def client(self, incarnation: Incarnation) -> "Clients":
-        self._asked = incarnation.name
-        return self
-
-    async def refuses(self, _seconds: float) -> bool:
-        return self._asked in self.gone
-
-    async def call(self, _method: str, *_params: Value) -> Value:
-        if self._asked in self.gone:
-            raise RefusedError("nobody is there")
-        if self._asked in self.silent:
-            raise UnansweredError("no answer")
-        return [1, "", 1]
-
-
-class Addresses:
-    async def learn(self, _peer: Peer) -> None:
-        """Do nothing."""
-
-    def address_for(self, _peer: Peer) -> str:
-        return "10.0.0.1"
+async def no_own_call(asked: OwnCall) -> OwnAnswer:
+    raise AssertionError(f"a relay asks {asked}")
 
 
 class ControlParts:
     """The connected parts. `reload(text)` puts another policy in force, and `settle()` waits for its consequences."""
 
-    def __init__(self, *, silent: float = 0.0) -> None:
+    def __init__(self, *, silent: float = 0.0, store: StateStore | None = None) -> None:
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
         self.seen: list[Seen] = []
@@ -370,40 +314,43 @@ class ControlParts:
         self.registry = Registry()
         self.grants = Grants(self.registry.mark, set)
         self.records, self.watchlist = Records(note), Watchlist()
-        self.hidden, self.clients = HiddenMaster(note), Clients()
-        self.deliveries, self.store = Deliveries(note), idle(StateStore)
-        cast(Any, self.store).database = SimpleNamespace(together=contextlib.nullcontext)
-        self.faces = Inner(self.registry, note)
-        self.nodes = NodeApiClient(self.registry, timeout=3.0)
-        cast(Any, self.nodes).client = self.clients.client
+        self.hidden, self.nodes = HiddenMaster(note), ScriptedNodes(self.registry)
+        self.deliveries = Deliveries(note)
+        self.delivery: Delivery = self.deliveries
+        self.specifications = NoSpecifications()
+        self.go = asyncio.Event()  # arriving nodes wait for it
+        self.go.set()
+        self.places = memory_ports(lambda: self.current)
+        self.faces = ProxyEndpoints(self.registry, self.places, _INNER_PORT, self._face)
         self.surround()
-        self.addresses, self.parameters = Addresses(), mirror()
+        self.addresses, self.parameters = AdvertisedAddresses((), None, "10.0.0.1"), mirror()
         rights = self._connect_relay()
-        self._connect_master()
+        self._connect_master(store)
         self._connect_liveness(silent)
         self._connect_calls(rights)
 
     def _connect_relay(self) -> ParameterRights:
         rights = ParameterRights(lambda: self.current, self.records)
         self.graph = RosGraph(self.registry, self.grants, self.records)
+        self.carried = RelayTraffic(self.records, self.registry, 1, self.watchlist.cut_off)
         self.relay = RelayControl(
             self.registry,
             self.grants,
-            cast(Any, RelayPorts()),
+            lambda port: port,
             self.nodes,
-            idle(RelayTraffic),
+            self.carried,
             allocation=Allocation(1),
             policy=lambda: self.current,
-            monitors=lambda: cast(Any, NoSpecifications()),
+            monitors=lambda: self.specifications,
             broken=lambda _node: None,
             own_topics={},
-            own_call=cast(Any, None),
+            own_call=no_own_call,
         )
         self.subscribers = Subscribers(
             self.registry,
             self.grants,
             self.relay,
-            cast(Any, self.deliveries),
+            self.delivery,
             lambda: self.parameters.tree,
             may_read_value=rights.may_read_value,
             may_know_value=rights.may_know_value,
@@ -413,21 +360,21 @@ class ControlParts:
         )
         return rights
 
-    def _connect_master(self) -> None:
+    def _connect_master(self, store: StateStore | None) -> None:
         self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
-        self.rosmaster.calls = cast(Any, self.hidden)
+        self.rosmaster.calls = self.hidden
         self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
         self.sinks = Sinks(
             self.registry,
             (
-                StoredGraph(self.grants, self.store),
+                *([StoredGraph(self.grants, store)] if store is not None else []),
                 self.subscribers,
                 self.entries,
                 self.relay,
                 self.faces,
             ),
         )
-        self.enforcement = Enforcement(self.revocation, self.sinks.flush, self.relay, idle(NodePorts))
+        self.enforcement = Enforcement(self.revocation, self.sinks.flush, self.relay, self.places)
         self.start_relay()
         self.reconciler = Reconciler(
             self.rosmaster,
@@ -465,7 +412,16 @@ class ControlParts:
             mirror=self.parameters,
             trail=self.records,
             rights=rights,
-            arrivals=self.arrivals(),
+            arrivals=Arrivals(
+                self.registry,
+                self.graph,
+                self.sinks.flush,
+                self.liveness,
+                self.places,
+                self.faces,
+                self.addresses,
+                serve=lambda node: self._api.handler(target=node),
+            ),
             relay=self.relay,
             addresses=self.addresses,
             liveness=self.liveness,
@@ -476,8 +432,12 @@ class ControlParts:
 
     def surround(self) -> None: ...
 
-    def arrivals(self) -> Any:
-        return self.faces
+    def _face(self, sock: Any, _handler: Handler) -> Any:
+        port = sock.getsockname()[1]
+        return self._face_of(next(node for node in self.registry.all() if node.outer_port == port))
+
+    def _face_of(self, node: Incarnation) -> Any:
+        return face(lambda: self.seen.append(Ended("close", node)), self.go)
 
     @classmethod
     async def begun(cls) -> Self:
@@ -493,6 +453,7 @@ class ControlParts:
         uri = f"http://{host}:{4000 + number}/"
         node = Incarnation(new_key(), name, host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
         self.registry.add(node)
+        self.faces.servers[node.key] = self._face_of(node)
         return node
 
     async def ask(
@@ -521,7 +482,7 @@ class ControlParts:
         return self.enforcement.policy_changed(self.current)
 
     def start_relay(self) -> None:
-        self.relay.attach(0, cast(Any, RelayEnd(self.seen.append, lambda: self.full)))
+        self.relay.attach(0, HeldChannel(self.seen.append, full=lambda: self.full))
 
     async def round(self) -> None:
         await self.reconciler.round()

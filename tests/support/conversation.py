@@ -190,10 +190,10 @@ class Conversation:
                 parts.enforcement.expel(ipaddress.ip_address(host), "the host was expelled")
             case ["registering", "calls", "wait"]:
                 self._held = True
-                parts.faces.go.clear()
+                parts.go.clear()
             case ["registering", "calls", "go", "on"]:
                 self._held = False
-                parts.faces.go.set()
+                parts.go.set()
             case ["a", "round"]:
                 self._held = False
                 await parts.round()
@@ -237,8 +237,8 @@ class Conversation:
             case ["is", "forgotten"]:
                 self.parts.graph.forgotten(node)
             case ["dies"] | ["is", "silent"] | ["answers"]:
-                clients = self.parts.clients
-                for names, word in ((clients.gone, "dies"), (clients.silent, "silent")):
+                nodes = self.parts.nodes
+                for names, word in ((nodes.gone, "dies"), (nodes.silent, "silent")):
                     (names.add if happening[-1] == word else names.discard)(node.name)
                 await self.parts.look(node)
             case _:
@@ -263,8 +263,11 @@ class Conversation:
         ]
 
     def _owner(self, name: str) -> str:
-        node = self.parts.faces.by_inner_uri(self.parts.hidden.nodes[name])
+        node = self._at_inner_uri(self.parts.hidden.nodes[name])
         return name if node is None else self._names[node.key]
+
+    def _at_inner_uri(self, uri: str) -> Incarnation | None:
+        return self.parts.registry.by_key(uri.rstrip("/").rpartition("/")[2])
 
     def _node(self, name: str) -> Incarnation:
         keys = [key for key, known in self._names.items() if known == name]
@@ -293,7 +296,7 @@ class Conversation:
             case messages.Message():
                 return self._stated(seen)
         method, (caller, about, *_detail, uri) = seen
-        registered = self.parts.faces.by_inner_uri(str(uri))
+        registered = self._at_inner_uri(str(uri))
         name = caller if registered is None else self._names[registered.key]
         kind = next(kind for kind, calls in CALLS.items() if method in calls)
         ended = " no more" if method == CALLS[kind][1] else ""

@@ -47,7 +47,9 @@ class MasterApi:
     def handler(self, *, own: bool = False, target: Incarnation | None = None) -> Handler:
         """Return the handler of RVMaster, of its listener for our own node, or of the node `target`."""
         gate = CallGate(self.policy, self.registry, HostLimits())
-        parameters = ParameterCalls(self.rosmaster, self.mirror, self.subscribers, self.rights, self.offload)
+        parameters = ParameterCalls(
+            self.rosmaster, self.mirror, self.subscribers.parameter_set, self.rights, self.offload
+        )
         pipeline = self._pipeline(gate, parameters)
         if target is not None:
             parts = (self.registry, self.graph, self.relay, self.addresses, self.nodes, self.liveness)

@@ -81,3 +81,45 @@ def memory_link(union: Any) -> tuple[MemoryChannel, MemoryChannel]:
     here, there = MemoryChannel(union), MemoryChannel(union)
     here.peer, there.peer = there, here
     return here, there
+
+
+class HeldChannel(Channel):
+    """Control's end of a link whose other end is the test.
+
+    `sent` has the messages with their descriptors. The test speaks with `say`, and ends the link with `end`.
+    """
+
+    def __init__(
+        self,
+        note: Callable[[Message], None] = lambda _message: None,
+        *,
+        full: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.sent: list[tuple[Message, tuple[int, ...]]] = []
+        self.say: Callable[[Message], None] = lambda _message: None
+        self.end: Callable[[], None] = lambda: None
+        self._note, self._full = note, full
+
+    @property
+    def crowded(self) -> bool:
+        return self._full()
+
+    def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
+        self.sent.append((message, descriptors))
+        self._note(message)
+
+    def attach(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        received: Callable[[Any, tuple[int, ...]], None],
+        closed: Callable[[], None],
+        refused: Callable[[str], None] | None = None,
+    ) -> None:
+        self.say, self.end = (lambda message: received(message, ())), closed
+
+    def close(self) -> None: ...
+
+    def heard(self) -> list[Message]:
+        """Take what was sent since the last call."""
+        sent, self.sent = [message for message, _descriptors in self.sent], []
+        return sent

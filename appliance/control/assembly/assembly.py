@@ -54,7 +54,7 @@ def assemble(base: Foundation) -> Parts:
     parameters = ParameterCalls(
         ends.rosmaster,
         core.parameters,
-        ends.subscribers,
+        ends.subscribers.parameter_set,
         core.rights,
         int(base.settings.limits.offload_bytes),
     )

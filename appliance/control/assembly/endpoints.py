@@ -156,7 +156,7 @@ def _make_relay(
     return RelayControl(
         core.registry,
         core.grants,
-        places,
+        lambda port: places.socket(port).fileno(),
         nodes,
         core.carried,
         allocation=Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text)),

@@ -2,15 +2,15 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.listener_limits import ListenerLimits
+from appliance.master.endpoints.traffic import RelayTraffic
+from appliance.master.graph.registry import Registry
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
 
@@ -21,37 +21,35 @@ Holder = TypeVar("Holder")
 class OwnUses:
     """Yields the use of each resource of the core, for `rosrv limits`; features add their own."""
 
-    parts: Parts
+    registry: Registry
+    carried: RelayTraffic
+    ports: Callable[[], Pool[Any]]
+    connected: Pool[Any]
+    parameters: Pool[Any]
     settings: Settings
-    listeners: ListenerLimits
 
     def __call__(self) -> Iterator[LimitUse]:
         yield from (*self._registry(), *self._pools(), *self._relays(), *self._stored())
 
     def _registry(self) -> Iterator[LimitUse]:
-        registry, limits = self.parts.core.registry, self.settings.limits
-        nodes = Counter(one.host for one in registry.all() if not one.own)
+        limits = self.settings.limits
+        nodes = Counter(one.host for one in self.registry.all() if not one.own)
         yield _by_host("nodes", None, "limits.nodes_per_host", nodes, limits.nodes_per_host)
         yield _by_host(
             "registrations",
             NAMES.bounds.whole,
             "limits.topics_per_host",
-            dict(registry.registrations_by_host()),
+            dict(self.registry.registrations_by_host()),
             limits.topics_per_host,
         )
 
     def _pools(self) -> Iterator[LimitUse]:
-        core = self.parts.core
-        yield _of_pool("ports of nodes", "[Ports] range", self.parts.endpoints.places.taken)
-        yield _of_pool(
-            "connections to RVMaster and nodes",
-            "limits.connections",
-            self.listeners.connection_table.connected,
-        )
-        yield _of_pool("bytes of parameters", "limits.parameter_bytes", core.parameters.charges.pool)
+        yield _of_pool("ports of nodes", "[Ports] range", self.ports())
+        yield _of_pool("connections to RVMaster and nodes", "limits.connections", self.connected)
+        yield _of_pool("bytes of parameters", "limits.parameter_bytes", self.parameters)
 
     def _relays(self) -> Iterator[LimitUse]:
-        carried, limits = self.parts.core.carried, self.settings.relay
+        carried, limits = self.carried, self.settings.relay
         allowed = limits.connections * self.settings.relays
         yield LimitUse("connections to the relays", len(carried.connections), allowed, "relay.connections")
         for kind, (resource, row) in _MEMORY.items():

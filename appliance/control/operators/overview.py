@@ -5,14 +5,13 @@ from collections.abc import Iterator
 from msgspec.structs import asdict
 
 from appliance.channel.answers.graph_answers import Connection, Graph, Node, Publisher, Service, Topic
-from appliance.control.assembly.assembly import Parts
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.registry import Incarnation, Kind, Life
+from appliance.master.endpoints.traffic import RelayTraffic
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.specifications.allocation import SERVICE, TOPIC
 
 
-def graph_of(parts: Parts) -> Graph:
-    registry = parts.core.registry
+def graph_of(registry: Registry, relay: RelayControl) -> Graph:
     shown = [
         incarnation
         for incarnation in registry.all()
@@ -22,14 +21,13 @@ def graph_of(parts: Parts) -> Graph:
     names = {incarnation.key: incarnation.name for incarnation in shown}
     return Graph(
         [_node(incarnation) for incarnation in sorted(shown, key=lambda incarnation: incarnation.name)],
-        _topics(parts, live, names),
-        _services(parts, live, names),
+        _topics(registry, relay, live, names),
+        _services(relay, live, names),
     )
 
 
-def hosts_connected(parts: Parts) -> Iterator[set[str]]:
-    registry = parts.core.registry
-    for connection in parts.core.carried.connections.values():
+def hosts_connected(registry: Registry, carried: RelayTraffic) -> Iterator[set[str]]:
+    for connection in carried.connections.values():
         holder = registry.by_key(connection.key)
         yield {connection.host} if holder is None else {connection.host, str(holder.host)}
 
@@ -45,8 +43,10 @@ def _node(incarnation: Incarnation) -> Node:
     )
 
 
-def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Topic]:
-    relay, connections = parts.endpoints.relay, _connections(parts.endpoints.relay, TOPIC, names)
+def _topics(
+    registry: Registry, relay: RelayControl, live: list[Incarnation], names: dict[str, str]
+) -> list[Topic]:
+    connections = _connections(relay, TOPIC, names)
     publishers: dict[str, list[Publisher]] = {}
     subscribers: dict[str, list[str]] = {}
     for incarnation in live:
@@ -62,8 +62,8 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
     return [
         Topic(
             name,
-            parts.core.registry.type_of(name),
-            mediated=parts.endpoints.relay.carries_topic(name),
+            registry.type_of(name),
+            mediated=relay.carries_topic(name),
             publishers=publishers.get(name, []),
             subscribers=subscribers.get(name, []),
             connections=connections.get(name, []),
@@ -72,14 +72,14 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
     ]
 
 
-def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Service]:
-    relay, connections = parts.endpoints.relay, _connections(parts.endpoints.relay, SERVICE, names)
+def _services(relay: RelayControl, live: list[Incarnation], names: dict[str, str]) -> list[Service]:
+    connections = _connections(relay, SERVICE, names)
     return [
         Service(
             **asdict(relay.carried.flow(incarnation.key, registration.resource)),
             name=registration.resource,
             node=incarnation.name,
-            mediated=parts.endpoints.relay.carries_service(registration.resource),
+            mediated=relay.carries_service(registration.resource),
             connections=connections.get(registration.resource, []),
         )
         for incarnation in live

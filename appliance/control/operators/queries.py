@@ -76,7 +76,7 @@ class Queries:
         return msgspec.structs.replace(found, in_use=used)
 
     async def graph(self, _request: admin.GraphWanted) -> Graph:
-        return graph_of(self.parts)
+        return graph_of(self.parts.core.registry, self.parts.endpoints.relay)
 
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
         return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)

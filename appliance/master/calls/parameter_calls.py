@@ -16,7 +16,7 @@ from appliance.master.calls.call import Attempt, Caller, denial_text
 from appliance.master.graph.registry import Incarnation
 from appliance.master.parameter_charges import APPLIANCE, NAME_WEIGHT, LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror, Reservation
-from appliance.master.reconcile.subscribers import Subscribers, settled
+from appliance.master.reconcile.subscribers import settled
 from appliance.master.rosmaster import Answer, RosMaster, Wanted
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
@@ -92,7 +92,7 @@ class ParameterCalls:
 
     rosmaster: RosMaster
     mirror: ParameterMirror
-    subscribers: Subscribers
+    changed: Callable[[str, Value, str | None, Value], None]
     rights: ParameterRights
     large: int
 
@@ -237,10 +237,10 @@ class ParameterCalls:
         before, _ = standing_at(self.mirror.tree, write.key)
         if reserved is not None and _is_set(outcome, write):
             self.mirror.set(write.key, write.value, reserved)
-            self.subscribers.parameter_set(write.key, write.value, write.caller.caller_id, before)
+            self.changed(write.key, write.value, write.caller.caller_id, before)
         elif reserved is None and outcome[0] == 1:
             self.mirror.delete(write.key)
-            self.subscribers.parameter_deleted(write.key, before)
+            self.changed(write.key, {}, None, before)
 
     async def _call_rosmaster(self, calls: list[Wanted]) -> list[Answer | Exception]:
         if not calls:

@@ -42,8 +42,10 @@ class NodePorts:
         drop: Callable[[str], None],
         policy: Callable[[], Policy],
         relays: int = 1,
+        listen: Callable[[str, int], sockets.socket] = listen,
     ) -> None:
         self._each = 1 + relays
+        self._listen = listen
         self._host = host
         self._keep = keep
         self._drop = drop
@@ -139,7 +141,7 @@ class NodePorts:
         name = f"port:{port}"
         if name not in self._sockets:
             try:
-                sock = listen(self._host, port)
+                sock = self._listen(self._host, port)
             except OSError:
                 return False
             self.adopt(name, sock)
@@ -174,7 +176,7 @@ class NodePorts:
         for _ in range(len(self.unused)):
             port = self.unused.popleft()
             try:
-                return listen(self._host, port)
+                return self._listen(self._host, port)
             except OSError as error:
                 self.unused.append(port)
                 if error.errno not in (errno.EADDRINUSE, errno.EACCES):  # these: another program has the port

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Protocol
 
 import structlog
 
@@ -17,7 +18,6 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.master.endpoints.delivery import NodeApiClient
-from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.rank_states import RankStates
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
@@ -29,7 +29,7 @@ from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
 from appliance.policy.rights import asks_to_call
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
-from appliance.specifications.specification_manager import SpecificationManager
+from appliance.specifications.specification_files import CheckedSpecifications
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 
@@ -78,22 +78,36 @@ _WORDS = {kind: word for word, kind in _KINDS.items()}
 _log = structlog.get_logger()
 
 
+class RelayMonitors(Protocol):
+    """The specifications, as far as the relays are concerned."""
+
+    @property
+    def checked(self) -> CheckedSpecifications: ...
+
+    def statement(self, relay: int) -> messages.SpecificationsStated: ...
+
+    def received(self, message: messages.Message, relay: int) -> None: ...
+
+    def relay_lost(self, relay: int) -> None: ...
+
+
 @dataclass(slots=True)
 class RelayControl:
     """Control's end of the links to the relays.
 
+    `descriptor` returns that of the socket that listens at a port of a node.
     `own_call` answers calls of the appliance's own service, and decides monitors' calls and requests that need an
     approval. `own_topics` are the headers of what the appliance's own node publishes, except for monitors.
     """
 
     registry: Registry
     grants: Grants
-    places: NodePorts
+    descriptor: Callable[[int], int]
     nodes: NodeApiClient
     carried: RelayTraffic
     allocation: Allocation
     policy: Callable[[], Policy]
-    monitors: Callable[[], SpecificationManager]
+    monitors: Callable[[], RelayMonitors]
     broken: Callable[[Incarnation], None]
     own_topics: dict[str, messages.OwnHeaderStated]
     own_call: Callable[[OwnCall], Awaitable[OwnAnswer]]
@@ -297,9 +311,9 @@ class RelayControl:
             del post.stated[node.key][fact]
 
     def _place_node(self, post: RelayOutbox, node: Incarnation) -> None:
-        listening = self.places.socket(node.relay_ports[post.index])
+        listening = self.descriptor(node.relay_ports[post.index])
         placed = messages.NodePlaced(node.key, node.name, str(node.host), node.of_monitors)
-        post.send(placed, (listening.fileno(),), soon=True)
+        post.send(placed, (listening,), soon=True)
         post.stated[node.key] = {}
 
     def _carries(self, post: RelayOutbox, resource: Resource) -> bool:

@@ -166,11 +166,8 @@ class Subscribers:
     def value_given(self, subscriber: Incarnation, key: str) -> None:
         self._valued.setdefault(subscriber, set()).add(key)
 
-    def parameter_deleted(self, key: str, before: Value) -> None:
-        self.parameter_set(key, {}, None, before)
-
     def parameter_set(self, key: str, value: Value, caller_id: str | None, before: Value) -> None:
-        """Send a value to the subscribers; `before` is the earlier one, or None.
+        """Send a value to the subscribers: {} if it was deleted; `before` is the earlier one, or None.
 
         The node that set it gets no update of the same key.
         """

@@ -1,97 +1,98 @@
-import asyncio
-from typing import Any, cast
-
 import pytest
 
 from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
 from appliance.control.monitor_call_gate import MonitorCallGate, own_host
-from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.policy.model import address_of
+from appliance.master.graph.registry import Kind
 from appliance.policy.policy_compiler import compile_policy
-from roswire.uris import parse_node_uri
+from appliance.store.state_file import PermissionRow
+from tests.support.control_parts import ControlParts
 
+pytestmark = pytest.mark.anyio
 ALLOWED = "[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 127.0.0.1\n"
 
 
-class Control:
-    strict = False
-
-    def __init__(
-        self,
-        policy: str,
-        *,
-        offered: bool = True,
-        carries: bool = True,
-        full: bool = False,
-        host: str = "127.0.0.1",
-    ) -> None:
-        self.records: list[tuple[str, str, bool]] = []
-        self.granted: list[str] = []
-        self.carries, self.strict, self._full = carries, full, full
-        registry, uri = Registry(), "http://10.0.0.5:4000/"
-        node = Incarnation("key", "/node", address_of("10.0.0.5"), parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
-        registry.add(node)
-        if offered:
-            registry.register(node, Kind.SERVICE, "/arm", "4001")
-        compiled, own = compile_policy(policy, file="p.ini"), cast(Any, self)
-        self.gate = MonitorCallGate(registry, own, lambda: None, lambda: compiled, own, own, "/rosrv", host)
-
-    def decided(self, asker: Any, method: str, _category: str, resource: str, decision: Any) -> str:
-        self.records.append((f"{asker.host} {asker.caller_id} {method}", resource, decision.allowed))
-        return "18ff"
-
-    async def durable(self) -> str | None:
-        return "the disk is full" if self._full else None
-
-    def carries_service(self, _service: str) -> bool:
-        return self.carries
-
-    def port(self, *_given: object) -> int:
-        return 4711
-
-    def service_granted(self, provider: Incarnation, service: str, host: object, caller_id: str) -> None:
-        self.granted.append(f"{provider.key} {host} {caller_id} {service}")
-
-    def answer(self) -> MonitorCallAnswered:
-        return asyncio.run(self.gate.answer(MonitorCallWanted(7, "/arm")))
+def world_with(*services: str) -> ControlParts:
+    world = ControlParts()
+    node = world.node("/node")
+    for service in services:
+        world.registry.register(node, Kind.SERVICE, service, "4001")
+    return world
 
 
-def test_an_allowed_call_is_recorded_and_granted() -> None:
+async def asked(world: ControlParts, policy: str = ALLOWED, host: str = "127.0.0.1") -> MonitorCallAnswered:
+    compiled = compile_policy(policy, file="p.ini")
+    gate = MonitorCallGate(
+        world.registry,
+        world.graph,
+        world.sinks.flush,
+        lambda: compiled,
+        world.records,
+        world.relay,
+        "/rosrv",
+        host,
+    )
+    return await gate.answer(MonitorCallWanted(7, "/arm"))
+
+
+async def test_an_allowed_call_is_recorded_and_granted() -> None:
     """The grant is like a client's, so its revocation by another policy cuts the call."""
-    control = Control(ALLOWED)
-    assert control.answer() == MonitorCallAnswered(7, "127.0.0.1", 4711, "/rosrv", "")
-    assert control.records == [("127.0.0.1 /rosrv lookupService", "/arm", True)]
-    assert control.granted == ["key 127.0.0.1 /rosrv /arm"]
+    world = world_with("/arm")
+    [node] = world.registry.all()
+    assert await asked(world) == MonitorCallAnswered(7, "127.0.0.1", node.relay_port, "/rosrv", "")
+    [record] = world.records.records
+    assert (record.host, record.caller_id, record.detail["call"]) == (
+        "127.0.0.1",
+        "/rosrv",
+        "lookupService",
+    )
+    assert (record.resource, record.decision) == ("/arm", "allow")
+    assert world.grants.all() == [PermissionRow(node.key, "service", "/arm", "127.0.0.1", "/rosrv")]
 
 
 @pytest.mark.parametrize(
     ("listen", "host"),
     [("0.0.0.0", "127.0.0.1"), ("::", "127.0.0.1"), ("10.0.0.9", "10.0.0.9"), ("::1", "::1")],
 )
-def test_the_client_is_the_address_that_a_relay_connects_from(listen: str, host: str) -> None:
+async def test_the_client_is_the_address_that_a_relay_connects_from(listen: str, host: str) -> None:
     """A relay that listens on one address cannot be reached on the loopback."""
     assert own_host(listen) == host
-    control = Control(ALLOWED.replace("127.0.0.1", host), host=host)
-    assert control.answer() == MonitorCallAnswered(7, host, 4711, "/rosrv", "")
-    assert (control.records[0][0], control.granted) == (
-        f"{host} /rosrv lookupService",
-        [f"key {host} /rosrv /arm"],
-    )
+    world = world_with("/arm")
+    answer = await asked(world, ALLOWED.replace("127.0.0.1", host), host)
+    assert (answer.refused, answer.host) == ("", host)
+    assert [record.host for record in world.records.records] == [host]
+    assert [row.host for row in world.grants.all()] == [host]
 
 
 @pytest.mark.parametrize(
-    ("policy", "options", "reason"),
+    "policy",
     [
-        ("[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 10.0.0.9\n", {}, "[18ff]"),
-        ("[Commands]\nlookupService = 10.0.0.9\n", {}, "[18ff]"),
-        (ALLOWED, {"offered": False}, "no node offers the service"),
-        (ALLOWED, {"carries": False}, "the relay does not carry the service"),
-        (ALLOWED, {"full": True}, "denied: "),
+        "[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 10.0.0.9\n",
+        "[Commands]\nlookupService = 10.0.0.9\n",
     ],
 )
-def test_another_call_is_not_granted(policy: str, options: dict[str, Any], reason: str) -> None:
-    control = Control(policy, **options)
-    answer = control.answer()
-    assert reason in answer.refused
-    assert not control.granted
-    assert len(control.records) == 1
+async def test_a_denied_call_is_not_granted(policy: str) -> None:
+    world = world_with("/arm")
+    answer = await asked(world, policy)
+    [record] = world.records.records
+    assert answer.refused.startswith("denied: ") and answer.refused.endswith(f" [{record.id}]")
+    assert (record.decision, world.grants.all()) == ("deny", [])
+
+
+async def test_a_call_of_no_service_is_not_granted() -> None:
+    world = world_with()
+    assert (await asked(world)).refused == "no node offers the service"
+    assert (len(world.records.records), world.grants.all()) == (1, [])
+
+
+async def test_a_call_that_the_relay_does_not_carry_is_not_granted() -> None:
+    world = world_with("/arm")
+    world.relay.relay_all = False
+    assert (await asked(world)).refused == "the relay does not carry the service"
+    assert (len(world.records.records), world.grants.all()) == (1, [])
+
+
+async def test_a_call_that_cannot_be_recorded_is_not_granted() -> None:
+    world = world_with("/arm")
+    world.records.strict, world.records.log.failure = True, "the disk is full"
+    assert (await asked(world)).refused.startswith("denied: ")
+    assert (len(world.records.records), world.grants.all()) == (1, [])

@@ -1,33 +1,33 @@
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.config_sources import read
 from appliance.control.operators.limit_use import OwnUses
+from appliance.master.endpoints.traffic import RelayTraffic
+from appliance.master.graph.registry import Kind, Registry
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
+from tests.support.core import FakeTrail
+from tests.support.incarnations import incarnation
 
 
 def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
     pool: Pool[str] = Pool("ports", Bounds(100, 75, 10, 0), lambda _host: QuotaClass.REGISTERED)
     pool.charge("10.0.0.9/32", 40)
     pool.charge("10.0.0.8/32", 2)
-    nodes = [
-        SimpleNamespace(host=host, own=host == "here")
-        for host in ("10.0.0.9", "10.0.0.9", "10.0.0.8", "here")
-    ]
-    registry = SimpleNamespace(all=lambda: nodes, registrations_by_host={"10.0.0.9": 7}.items)
-    core: Any = SimpleNamespace(
-        registry=registry,
-        carried=SimpleNamespace(connections={}, memory=memory),
-        parameters=SimpleNamespace(charges=SimpleNamespace(pool=pool)),
-    )
-    parts: Any = SimpleNamespace(core=core, endpoints=SimpleNamespace(places=SimpleNamespace(taken=pool)))
-    listeners: Any = SimpleNamespace(connection_table=SimpleNamespace(connected=pool))
+    registry = Registry()
+    for number, host in enumerate(("10.0.0.9", "10.0.0.9", "10.0.0.8", "127.0.0.1")):
+        registry.add(incarnation(f"/node{number}", 4000 + number, host=host))
+    *_others, own = registry.all()
+    own.own = True
+    for number in range(7):
+        registry.register(registry.all()[0], Kind.PUBLICATION, f"/t{number}", "std_msgs/String")
+    carried = RelayTraffic(FakeTrail(), registry, 2, lambda _node, _topic: None)
+    carried.memory = memory
     settings = read({"state": str(state), "audit": {"retention_bytes": 4 << 20}, "relays": 2})
-    return {row.resource: row for row in OwnUses(parts, settings, listeners)()}
+    uses = OwnUses(registry, carried, lambda: pool, pool, pool, settings)
+    return {row.resource: row for row in uses()}
 
 
 def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> None:

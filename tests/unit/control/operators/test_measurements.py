@@ -1,6 +1,3 @@
-import ipaddress
-from typing import Any, cast
-
 import pytest
 
 from appliance.channel.messages import TopicTraffic
@@ -8,12 +5,11 @@ from appliance.control.assembly.monitor_states import published_now
 from appliance.control.operators.measurements import by_resource, carried_of, from_zero
 from appliance.master.endpoints import traffic
 from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import Kind, Registry
 from appliance.specifications.live_topics import LiveType
-from roswire.uris import parse_node_uri
+from tests.support.core import FakeTrail
+from tests.support.incarnations import incarnation
 from tests.support.virtual_clock import let_time_pass
-
-API = parse_node_uri("http://10.0.0.5:4000/")
 
 
 def test_sums_by_name() -> None:
@@ -41,11 +37,10 @@ def test_few_topics_have_their_own_histogram() -> None:
 
 def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
-    registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
+    registry = Registry()
     for number in range(4):
-        uri = f"http://10.0.0.5:400{number}/"
-        registry.add(Incarnation(f"k{number}", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2))
-    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+        registry.add(incarnation("/node", 4000 + number, key=f"k{number}"))
+    counted = RelayTraffic(FakeTrail(), registry, 1, lambda _node, _topic: None)
     for number in range(4):
         rows = [
             TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),
@@ -65,10 +60,10 @@ def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPa
 
 def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
     registry = Registry()
-    node = Incarnation("k", "/node", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2)
+    node = incarnation("/node", key="k")
     registry.add(node)
     registry.register(node, Kind.PUBLICATION, "/a", "std_msgs/String")
-    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+    counted = RelayTraffic(FakeTrail(), registry, 1, lambda _node, _topic: None)
     assert published_now(registry, counted) == {"/a": {"/node": LiveType("std_msgs/String")}}
     for md5sum in ("992c", ""):
         counted.reported([TopicTraffic("k", "/a", 1, 1, 0, 1, md5sum=md5sum)])
@@ -78,8 +73,8 @@ def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None
 def test_a_topic_moves_for_a_minute_after_its_last_message() -> None:
     """In the first minute every topic counts as moving, because an earlier control may have seen messages."""
     registry = Registry()
-    registry.add(Incarnation("k", "/n", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2))
-    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+    registry.add(incarnation("/n", key="k"))
+    counted = RelayTraffic(FakeTrail(), registry, 1, lambda _node, _topic: None)
     seen = []
     for messages in (None, None, 1, 0, None):
         if messages is not None:

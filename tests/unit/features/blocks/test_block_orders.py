@@ -159,13 +159,13 @@ async def test_audit_only_sections_deny_a_blocked_host(tmp_path: Path) -> None:
 
 async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: Path) -> None:
     async with control(tmp_path) as made:
-        made.faces.go.clear()
+        made.go.clear()
         call = asyncio.create_task(
             made.ask("registerPublisher", "/talker", "/scan", "t/T", f"http://{NODE}:4001/")
         )
         await until(lambda: ("allow", "/scan") in made.records.pairs)
         assert (await made.block(NODE)).ended.publications == 0
-        made.faces.go.set()
+        made.go.set()
         await call
         await made.settle()
         assert ("registered", "/scan") in made.records.pairs

@@ -1,66 +1,33 @@
 import asyncio
-from typing import Any, cast
+import errno
+import os
+from collections import deque
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from appliance.master.calls.registration import Arrivals
-from appliance.master.endpoints import node_ports
-from appliance.master.endpoints.node_ports import NodePorts, NoPortError
-from appliance.master.graph.registry import Incarnation, Registry
-from appliance.master.reconcile.sinks import ProxyEndpoints
-from appliance.policy.model import Address
-from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy import DEFAULT_PORTS
+from appliance.store.state_file import StateStore
 from tests.support.control_parts import ControlParts
+from tests.support.engines import InlineDatabase
 
 pytestmark = pytest.mark.anyio
 _NODES = 4
 
 
-def _serve(_incarnation: Incarnation) -> Any:
-    return None
-
-
-class FewPorts:
-    def __init__(self, registry: Registry) -> None:
-        self._registry = registry
-
-    def open(self, _host: Address) -> tuple[int, ...]:
-        taken = {port for node in self._registry.all() for port in node.ports}
-        free = [port for port in range(1, 2 * _NODES + 1) if port not in taken]
-        if not free:
-            raise NoPortError("all ports are in use")
-        return tuple(free[:2])
-
-
-class SlowFaces:
-    async def open(self, _incarnation: Incarnation, _handler: object) -> None:
-        for _turn in range(3):
-            await asyncio.sleep(0)
-
-
-class NoFaces:
-    async def open(self, incarnation: Incarnation, _handler: object) -> None:
-        raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")
-
-
-async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
+async def world_with(ports: int) -> ControlParts:
     world = await ControlParts.begun()
-    arrivals = Arrivals(
-        world.registry,
-        world.graph,
-        world.sinks.flush,
-        world.liveness,
-        places=cast(Any, FewPorts(world.registry)),
-        faces=cast(Any, faces),
-        addresses=cast(Any, world.addresses),
-        serve=_serve,
-    )
-    cast(Any, world.faces).incarnation_for = arrivals.incarnation_for
+    world.places.unused = deque(DEFAULT_PORTS[:ports])
     return world
 
 
-async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
-    world = await world_with(NoFaces())
+async def test_a_node_without_a_proxy_endpoint_is_not_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    def exhausted(_port: int) -> Any:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    world = await ControlParts.begun()
+    monkeypatch.setattr(world.places, "socket", exhausted)
     answer: Any = await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", "http://10.0.0.5:4000/")
     assert (answer[0], "no proxy endpoint for /n: Too many open files" in answer[1]) == (0, True)
     assert world.registry.all() == []
@@ -68,12 +35,13 @@ async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
 
 @pytest.mark.parametrize("count", [2, 8])
 @pytest.mark.parametrize(
-    ("limit", "reason"), [(500, "all ports are in use"), (_NODES, "has 4 nodes, the limit for one host")]
+    ("limit", "reason"),
+    [(500, "has 8 ports (2 per node), and 2 are left"), (_NODES, "has 4 nodes, the limit for one host")],
 )
 async def test_simultaneous_arrivals_do_not_take_each_others_room(
     monkeypatch: pytest.MonkeyPatch, count: int, limit: int, reason: str
 ) -> None:
-    world = await world_with(SlowFaces())
+    world = await world_with(ports=2 * _NODES + 2)
     monkeypatch.setattr(world.registry, "_most_of_host", limit)
 
     async def come(number: int) -> Any:
@@ -82,8 +50,12 @@ async def test_simultaneous_arrivals_do_not_take_each_others_room(
 
     for number in range(_NODES - 1):
         assert (await come(number))[0] == 1
-    async with asyncio.timeout(10):
-        answers = await asyncio.gather(*(come(number) for number in range(10, 10 + count)))
+    world.go.clear()
+    arriving = [asyncio.create_task(come(number)) for number in range(10, 10 + count)]
+    await asyncio.sleep(1.0)
+    assert sum(task.done() for task in arriving) == count - 1
+    world.go.set()
+    answers = await asyncio.gather(*arriving)
     assert [answer[0] for answer in answers] == [1] + [0] * (count - 1)
     assert reason in answers[1][1]
     assert [node.name for node in world.registry.all()] == ["/n0", "/n1", "/n2", "/n10"]
@@ -91,8 +63,8 @@ async def test_simultaneous_arrivals_do_not_take_each_others_room(
 
 
 async def test_a_node_of_another_machine_is_refused() -> None:
-    world = await world_with(SlowFaces())
-    world.clients.gone |= {"/far", "/here"}
+    world = await ControlParts.begun()
+    world.nodes.gone |= {"/far", "/here"}
     call = ("/t", "std_msgs/String")
     answer: Any = await world.ask("registerPublisher", "/far", *call, "http://robot2:4000/")
     assert answer[0] == 0
@@ -109,12 +81,12 @@ async def test_a_node_of_another_machine_is_refused() -> None:
 
 @pytest.mark.parametrize("lost", [False, True])
 async def test_a_node_that_reaches_another_address_gets_its_lists_with_it(
-    monkeypatch: pytest.MonkeyPatch, lost: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost: bool
 ) -> None:
     """The address is stored as well, for the lists after a restart of control."""
-    world = await world_with(SlowFaces())
-    stored = list[str]()
-    monkeypatch.setattr(world.store, "save_incarnation", lambda row: stored.append(row.told))
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
+    world = ControlParts(store=store)
+    await world.round()
     call, uri = ("std_msgs/String", "http://10.0.0.5:4000/"), "http://10.0.0.5:4001/"
     await world.ask("registerPublisher", "/talker", "/t", call[0], uri)
     await world.ask("registerSubscriber", "/ear", "/t", *call)
@@ -123,78 +95,36 @@ async def test_a_node_that_reaches_another_address_gets_its_lists_with_it(
         world.graph.lost(world.registry.all()[-1], "away")
         await world.settle()
     world.deliveries.told.clear()
-    stored.clear()
     monkeypatch.setattr(world.addresses, "address_for", lambda _peer: "10.0.0.2")
     await world.ask("registerPublisher", "/ear", "/more", *call)
     port = world.registry.all()[0].outer_port
     assert [given for name, _method, given in world.deliveries.told if name == "/ear"] == [
         ("/t", [f"http://10.0.0.2:{port}/"])
     ]
-    assert set(stored) == {"10.0.0.2"}
+    assert {row.told for row in store.load_registry()[0] if row.name == "/ear"} == {"10.0.0.2"}
+    store.close()
 
 
-class Listening:
-    def __init__(self, _host: str, port: int) -> None:
-        self.port = port
-
-    def getsockname(self) -> tuple[str, int]:
-        return "10.0.0.1", self.port
-
-    def dup(self) -> "Listening":
-        return self
-
-    async def start(self) -> None:
-        await asyncio.sleep(0)
-
-    def close(self) -> None: ...
-
-
-NAMING = compile_policy("", file="a.ini")
-
-
-async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlParts, NodePorts]:
-    monkeypatch.setattr(node_ports, "listen", Listening)
-    world = await ControlParts.begun()
-    places = NodePorts(
-        "10.0.0.1", range(1, 1 + 2 * _NODES), keep=lambda *_: None, drop=lambda _: None,
-        policy=lambda: NAMING,
-    )  # fmt: skip
-    faces = ProxyEndpoints(world.registry, places, 9, lambda sock, _: cast(Any, sock))
-    arrivals = Arrivals(
-        world.registry,
-        world.graph,
-        world.sinks.flush,
-        world.liveness,
-        places,
-        faces,
-        cast(Any, world.addresses),
-        _serve,
-    )
-    monkeypatch.setattr(world.faces, "incarnation_for", arrivals.incarnation_for)
-    monkeypatch.setattr(world.faces, "close", faces.close)
-    return world, places
-
-
-async def test_a_refused_node_keeps_no_ports(monkeypatch: pytest.MonkeyPatch) -> None:
-    world, places = await world_with_ports(monkeypatch)
-    world.clients.gone.add("/far")
+async def test_a_refused_node_keeps_no_ports() -> None:
+    world = await world_with(ports=2 * _NODES)
+    world.nodes.gone.add("/far")
     for _attempt in range(2 * _NODES):
         answer: Any = await world.ask(
             "registerPublisher", "/far", "/t", "std_msgs/String", "http://robot2:4000/"
         )
         assert "has no node on port 4000" in answer[1]
     world.sinks.flush()
-    assert len(places.unused) == 2 * _NODES
+    assert len(world.places.unused) == 2 * _NODES
 
 
 async def test_a_node_beyond_a_limit_takes_the_ports_of_one_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    world, places = await world_with_ports(monkeypatch)
+    world = await ControlParts.begun()
     monkeypatch.setattr(world.registry, "_most_of_host", _NODES - 1)
     for number in range(_NODES - 1):
         uri = f"http://10.0.0.5:{4000 + number}/"
         await world.ask("registerPublisher", f"/n{number}", "/t", "std_msgs/String", uri)
         world.graph.lost(world.registry.all()[-1], "away")
-    places.unused.clear()
+    world.places.unused.clear()
     answer: Any = await world.ask(
         "registerPublisher", "/new", "/t", "std_msgs/String", "http://10.0.0.5:5000/"
     )

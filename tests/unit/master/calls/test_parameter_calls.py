@@ -5,21 +5,25 @@ import copy
 import ipaddress
 import json
 import subprocess
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.master.calls.call import Caller
-from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterRights, ParameterWrite
 from appliance.master.parameter_charges import LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror
+from appliance.master.rosmaster import RosMaster
+from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.errors import EncodingError, ProtocolError
+from roswire.xmlrpc import Value, XmlRpcLimits
 from tests.support import autojump
+from tests.support.control_parts import OPEN, ControlParts
+from tests.support.core import FakeTrail
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 from tests.support.parameters import mirror, put
@@ -103,21 +107,21 @@ def test_key_and_value_together_are_bounded_in_depth() -> None:
         measure({"b": [None]})
 
 
-class OrderedServer:
+class OrderedServer(RosMaster):
+    """A ROS master with the tree `tree`, and the calls that change it. `told` has the changes that were told."""
+
     def __init__(self, there: ParameterMirror) -> None:
+        super().__init__(1, limits=XmlRpcLimits())
         self.tree = mirror()
         self.requests: list[list[str]] = []
         self.parameters = there
-        me = cast(Any, self)
-        self.calls = ParameterCalls(me, there, me, cast(Any, None), 1 << 20)
+        rights = ParameterRights(lambda: compile_policy("", file="p.ini"), FakeTrail())
+        self.writes = ParameterCalls(self, there, self._told, rights, 1 << 20)
         self.broken: Exception | None = None
         self.told: list[tuple[str, str | None]] = []
 
-    def parameter_set(self, key: str, _value: Any, caller_id: str, _before: Any) -> None:
+    def _told(self, key: str, _value: Value, caller_id: str | None, _before: Value) -> None:
         self.told.append((key, caller_id))
-
-    def parameter_deleted(self, key: str, _before: Any) -> None:
-        self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:
         return (await self.call_in_order([(method, params)]))[0]
@@ -145,7 +149,7 @@ def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
     peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
     caller = Caller(peer, "/me", 0)
     writes = [ParameterWrite(caller, key, value[0] if value else None) for _method, key, *value in calls]
-    return autojump.run(server.calls.write(writes))
+    return autojump.run(server.writes.write(writes))
 
 
 def test_a_run_is_one_request_in_its_order() -> None:
@@ -245,17 +249,20 @@ def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
     else:
         peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
         for _method, *arguments in calls:
-            autojump.run(server.calls.set_param(Caller(peer, "/me", 0), *arguments))
+            autojump.run(server.writes.set_param(Caller(peer, "/me", 0), *arguments))
     assert server.parameters.tree == {name: value for name, value in tree.items() if name != "run_id"}
     assert server.parameters.weight == measure(server.parameters.tree)[0]
 
 
 async def test_the_loop_runs_while_thousands_of_names_are_decided() -> None:
-    there = mirror(tree={"mine": {f"p{number}": 1 for number in range(5000)}, "hidden": {"key": 1}})
-    none: Any = None
-    master = SimpleNamespace(reachable=True)
-    rights = SimpleNamespace(to_find=lambda _caller, name: SimpleNamespace(allowed="hidden" not in name))
-    calls = ParameterCalls(cast(Any, master), there, none, cast(Any, rights), 1 << 30)
+    world = await ControlParts.begun()
+    world.reload(f"{OPEN}[Parameters]\nread /hidden/**=\nread default=*\n")
+    put(world.parameters, "/mine", {f"p{number}": 1 for number in range(5000)}, HOST)
+    put(world.parameters, "/hidden", {"key": 1}, HOST)
+    rights = ParameterRights(lambda: world.current, world.records)
+    calls = ParameterCalls(
+        world.rosmaster, world.parameters, world.subscribers.parameter_set, rights, large=1 << 30
+    )
     turns = 0
 
     async def others() -> None:
@@ -265,7 +272,7 @@ async def test_the_loop_runs_while_thousands_of_names_are_decided() -> None:
             await asyncio.sleep(0)
 
     other = asyncio.create_task(others())
-    answer = await calls.get_param_names(Caller(Peer(HOST, str(HOST), "10.0.0.2"), "/me", 0))
-    assert answer[2] == [f"/mine/p{number}" for number in range(5000)]
+    answer: Any = await calls.get_param_names(Caller(Peer(HOST, str(HOST), "10.0.0.2"), "/me", 0))
+    assert answer[2] == ["/run_id", *(f"/mine/p{number}" for number in range(5000))]
     assert turns >= 5
     other.cancel()

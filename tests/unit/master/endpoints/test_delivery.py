@@ -2,8 +2,7 @@ import asyncio
 import ipaddress
 from collections.abc import Callable
 from random import Random
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -19,36 +18,36 @@ pytestmark = pytest.mark.anyio
 LONG = [f"http://10.0.0.1:{19001 + number}/" for number in range(500)]
 
 
-class Node:
-    def __init__(self) -> None:
-        self.answers = asyncio.Event()
-        self.fails = False
-        self.fault: Exception | None = None
-        self.heard: list[Value] = []
-        self.lists: list[tuple[str, list[Value]]] = []
-        self.receives: Callable[[str, list[Value]], None] = lambda _topic, _publishers: None
-
-    async def call(self, _method: str, _caller: str, topic: str, publishers: list[Value]) -> None:
-        self.receives(topic, publishers)
-        await self.answers.wait()
-        if self.fails:
-            raise CallFailedError("it does not answer") from self.fault
-        self.heard.append(topic)
-        self.lists.append((topic, publishers))
-
-
 class Post:
+    """The calls to nodes whose answers wait for `answers`; `lists` has what arrived."""
+
     def __init__(self, **bounds: Any) -> None:
-        self.node, self.lost = Node(), list[tuple[str, Value]]()
+        self.answers = asyncio.Event()
+        self.failure: CallFailedError | None = None
+        self.lost, self.lists = list[tuple[str, Value]](), list[tuple[str, Value]]()
+        self.receives: Callable[[str, Any], None] = lambda _topic, _publishers: None
         self.world = ControlParts()
+        self.world.nodes.answer = self.answer
         self.delivery = Delivery(
             self.world.nodes,
             troubled=self._troubled,
             quota_class=lambda _host: QuotaClass.REGISTERED,
             **bounds,
         )
-        cast(Any, self.world.nodes).call = lambda _incarnation, *call: self.node.call(*call)
         self.incarnation = self.world.node("/n")
+
+    async def answer(self, _node: Incarnation, _method: str, parameters: tuple[Value, ...]) -> Value:
+        topic, publishers = str(parameters[1]), parameters[2]
+        self.receives(topic, publishers)
+        await self.answers.wait()
+        if self.failure is not None:
+            raise self.failure
+        self.lists.append((topic, publishers))
+        return [1, "", 0]
+
+    @property
+    def heard(self) -> list[str]:
+        return [topic for topic, _publishers in self.lists]
 
     def _troubled(self, incarnation: Incarnation, call: NodeCall, _why: str) -> None:
         self.lost.append((incarnation.name, call.parameters[0]))
@@ -68,10 +67,10 @@ async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
     post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)
     assert post.delivery.waiting < 8
     assert len(post.lost) == 50 - post.delivery.waiting
-    post.node.answers.set()
+    post.answers.set()
     await post.world.settle()
-    assert len(post.node.heard) < 8
-    assert post.node.heard[-1] == "/t49"
+    assert len(post.heard) < 8
+    assert post.heard[-1] == "/t49"
     assert post.delivery.weight == 0
 
 
@@ -81,14 +80,14 @@ async def test_a_dropped_queue_frees_its_bytes() -> None:
     assert post.delivery.weight > 20_000
     post.delivery.drop(post.incarnation)
     assert (post.delivery.weight, post.delivery.waiting) == (0, 0)
-    post.node.answers.set()
+    post.answers.set()
     await post.world.settle()
 
 
 async def test_a_call_that_stays_undelivered_is_reported() -> None:
     post = Post(tries=2)
-    post.node.fails = True
-    post.node.answers.set()
+    post.failure = CallFailedError("it does not answer")
+    post.answers.set()
     post.push("/a", publishers=[])
     await post.world.settle()
     assert post.lost == [("/n", "/a")]
@@ -96,8 +95,9 @@ async def test_a_call_that_stays_undelivered_is_reported() -> None:
 
 async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
     post = Post(tries=2)
-    post.node.fails, post.node.fault = True, FaultReceived(1, "not for me")
-    post.node.answers.set()
+    post.failure = CallFailedError("it answers with a fault")
+    post.failure.__cause__ = FaultReceived(1, "not for me")
+    post.answers.set()
     post.push("/a", publishers=[])
     await post.world.settle()
     assert post.lost == []
@@ -105,19 +105,19 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
 
 async def test_a_publisher_is_added_some_time_after_its_removal() -> None:
     post = Post()
-    post.node.answers.set()
+    post.answers.set()
     began = asyncio.get_running_loop().time()
     for publishers in ([], ["a"], ["a", "b"], ["a"], ["a", "b", "c"]):
         post.push("/t", publishers=publishers)
     post.push("/other", publishers=["a"])
     await asyncio.sleep(0.25)
-    assert post.node.lists == [("/t", []), ("/other", ["a"])]
+    assert post.lists == [("/t", []), ("/other", ["a"])]
     post.push("/late", publishers=["a"])
     await asyncio.sleep(0.01)
-    assert post.node.lists[2:] == [("/late", ["a"])]
-    while len(post.node.lists) < 4:
+    assert post.lists[2:] == [("/late", ["a"])]
+    while len(post.lists) < 4:
         await asyncio.sleep(0.01)
-    assert post.node.lists[3:] == [("/t", ["a", "b", "c"])]
+    assert post.lists[3:] == [("/t", ["a", "b", "c"])]
     assert 0.29 < asyncio.get_running_loop().time() - began < 0.35
 
 
@@ -128,9 +128,9 @@ async def test_a_slow_node_gets_only_the_newest_of_the_lists_that_wait() -> None
     for number in range(500):
         post.push("/t", publishers=["a", *map(str, range(number))])
     assert post.delivery.waiting == 1
-    post.node.answers.set()
+    post.answers.set()
     await post.world.settle()
-    assert [len(publishers) for _topic, publishers in post.node.lists] == [1, 500]
+    assert [len(publishers) for _topic, publishers in post.lists] == [1, 500]
 
 
 async def test_the_answer_to_a_registration_replaces_a_list_that_waits() -> None:
@@ -140,42 +140,42 @@ async def test_the_answer_to_a_registration_replaces_a_list_that_waits() -> None
     await asyncio.sleep(1)
     post.push("/t", publishers=[])
     post.delivery.answered(post.incarnation, "/t", ("a", "b"))
-    post.node.answers.set()
+    post.answers.set()
     await asyncio.sleep(1)
-    assert [publishers for _topic, publishers in post.node.lists] == [["a"], ["b"], ["a", "b"]]
+    assert [publishers for _topic, publishers in post.lists] == [["a"], ["b"], ["a", "b"]]
 
 
 async def test_the_first_publisher_after_an_empty_answer_is_sent_at_once() -> None:
     post = Post()
-    post.node.answers.set()
+    post.answers.set()
     post.delivery.answered(post.incarnation, "/t", ())
     post.push("/t", publishers=["a"])
     await asyncio.sleep(0.01)
-    assert post.node.lists == [("/t", ["a"])]
+    assert post.lists == [("/t", ["a"])]
 
 
 async def test_a_list_that_did_not_arrive_told_no_removal() -> None:
     post = Post(tries=1)
-    post.node.answers.set()
+    post.answers.set()
     post.push("/t", publishers=["a", "b"])
     await asyncio.sleep(1)
-    post.node.fails = True
+    post.failure = CallFailedError("it does not answer")
     post.push("/t", publishers=["b"])
     await asyncio.sleep(1)
-    post.node.fails = False
+    post.failure = None
     post.push("/t", publishers=["a", "b"])
     await asyncio.sleep(1)
-    assert [publishers for _topic, publishers in post.node.lists] == [["a", "b"], ["b"], ["a", "b"]]
+    assert [publishers for _topic, publishers in post.lists] == [["a", "b"], ["b"], ["a", "b"]]
 
 
 async def test_a_removal_comes_first_even_if_the_list_of_the_node_is_unknown() -> None:
     """After a takeover, `Delivery` knows no list, and roscpp would ignore an unchanged one."""
     post = Post()
-    post.node.answers.set()
+    post.answers.set()
     post.delivery.remove_first(post.incarnation, "/t", frozenset({"a"}))
     post.push("/t", publishers=["a", "b"])
     await asyncio.sleep(1)
-    assert [publishers for _topic, publishers in post.node.lists] == [["b"], ["a", "b"]]
+    assert [publishers for _topic, publishers in post.lists] == [["b"], ["a", "b"]]
 
 
 async def test_no_list_is_sent_for_a_topic_that_is_not_subscribed_to_any_more() -> None:
@@ -185,9 +185,9 @@ async def test_no_list_is_sent_for_a_topic_that_is_not_subscribed_to_any_more() 
     post.push("/t", "/other", publishers=["a", "b"])
     post.delivery.drop_list(post.incarnation, "/t")
     post.delivery.drop_list(post.incarnation, "/never")
-    post.node.answers.set()
+    post.answers.set()
     await post.world.settle()
-    assert post.node.lists == [("/t", ["a"]), ("/other", ["a", "b"])]
+    assert post.lists == [("/t", ["a"]), ("/other", ["a", "b"])]
     assert (post.delivery.weight, post.delivery.waiting) == (0, 0)
 
 
@@ -202,7 +202,7 @@ async def test_a_node_sees_each_removal_and_ends_with_the_newest_list(seed: int)
         assert not gone[topic].intersection(publishers), "a publisher returned, and its removal was not told"
         gone[topic].clear()
 
-    post.node.receives = received
+    post.receives = received
     for _ in range(60):
         topic = random.choice(list(wanted))
         publishers: list[Value] = [one for one in "abcd" if random.random() < 0.6]
@@ -212,11 +212,11 @@ async def test_a_node_sees_each_removal_and_ends_with_the_newest_list(seed: int)
         wanted[topic] = publishers
         post.delivery.push_list(post.incarnation, topic, tuple(map(str, publishers)))
         assert post.delivery.waiting <= 2
-        random.choice((post.node.answers.set, post.node.answers.clear))()
+        random.choice((post.answers.set, post.answers.clear))()
         await asyncio.sleep(random.choice((0, 0, 0.05, 0.4)))
-    post.node.answers.set()
+    post.answers.set()
     await asyncio.sleep(2)
-    assert dict(post.node.lists) == wanted
+    assert dict(post.lists) == wanted
     assert (post.delivery.weight, post.delivery.waiting, post.lost) == (0, 0, [])
 
 
@@ -229,18 +229,22 @@ async def test_a_host_loses_only_its_own_calls() -> None:
     assert post.delivery.weight <= 400_000
     assert post.lost
     assert {name.partition("_")[0] for name, _topic in post.lost} == {"/guest"}
-    post.node.answers.set()
+    post.answers.set()
     await post.world.settle()
-    assert {"/a", "/b"} <= set(post.node.heard)
+    assert {"/a", "/b"} <= set(post.heard)
 
 
 async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
     post = Post()
-    robot = Node()
-    robot.answers.set()
-    cast(Any, post.world.nodes).call = lambda incarnation, *call: (
-        robot if incarnation.name == "/robot" else post.node
-    ).call(*call)
+    arrived = list[Value]()
+
+    async def answer(node: Incarnation, method: str, parameters: tuple[Value, ...]) -> Value:
+        if node.name != "/robot":
+            return await post.answer(node, method, parameters)
+        arrived.append(parameters[1])
+        return [1, "", 0]
+
+    post.world.nodes.answer = answer
     for number in range(2 * NODE_CALLS_UNDER_WAY.bounds.whole):
         guest = post.node_on("10.0.0.66", f"/guest_{number}")
         post.delivery.push_list(guest, "/t", ())
@@ -249,32 +253,27 @@ async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
     post.delivery.push_list(post.node_on("10.0.0.5", "/robot"), "/t", ())
     for _ in range(5):
         await asyncio.sleep(0)
-    assert robot.heard == ["/t"]
-    assert not post.node.heard
-    post.node.answers.set()
+    assert arrived == ["/t"]
+    assert not post.heard
+    post.answers.set()
     await post.world.settle()
 
 
 async def test_a_question_is_asked_once_in_turn_and_its_answer_may_be_long() -> None:
-    post, asked, used = Post(at_once=Bounds(1, 1, 0, 0)), list[tuple[str, str]](), list[Any]()
-    free = asyncio.Event()
+    post, asked = Post(at_once=Bounds(1, 1, 0, 0)), list[tuple[str, *tuple[Value, ...]]]()
 
-    async def call(method: str, caller: str) -> Value:
-        asked.append((method, caller))
-        await free.wait()
+    async def answer(_node: Incarnation, method: str, parameters: tuple[Value, ...]) -> Value:
+        asked.append((method, *parameters))
+        await post.answers.wait()
         raise CallFailedError("it does not answer")
 
-    def client(_incarnation: Incarnation, *, limits: Any) -> Any:
-        used.append(limits)
-        return SimpleNamespace(call=call)
-
-    cast(Any, post.world.nodes).client = client
+    post.world.nodes.answer = answer
     questions = [asyncio.create_task(post.delivery.ask(post.incarnation, "getBusInfo")) for _ in range(2)]
     await asyncio.sleep(1.0)
     assert asked == [("getBusInfo", "/master")]  # the other one waits for its turn
-    free.set()
+    post.answers.set()
     for question in questions:
         with pytest.raises(CallFailedError):
             await question
-    assert len(asked) == 2 and used == [LONG_ANSWER] * 2
+    assert len(asked) == 2 and [used.limits for used in post.world.nodes.used] == [LONG_ANSWER] * 2
     assert LONG_ANSWER.elements > 7 * 1000

@@ -1,12 +1,10 @@
 import asyncio
-from typing import Any, cast
 
 import pytest
 
 from appliance.master.endpoints.delivery import Delivery, NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.quotas.pool import QuotaClass
-from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -14,16 +12,12 @@ pytestmark = pytest.mark.anyio
 
 class Street(ControlParts):
     def surround(self) -> None:
-        self.heard: list[tuple[int, str]] = []
-        self.process = 1
-        cast(Any, self.nodes).client = lambda node, **_: _Door(self, node)
         self.delivery = Delivery(
             self.nodes,
             troubled=self.watchlist.could_not_tell,
             quota_class=lambda _host: QuotaClass.REGISTERED,
             tries=1,
         )
-        self.deliveries = cast(Any, self.delivery)
 
     async def two_at_one_address(self) -> tuple[Incarnation, Incarnation]:
         await self.round()
@@ -34,24 +28,13 @@ class Street(ControlParts):
         return first, second
 
 
-class _Door:
-    def __init__(self, street: Street, node: Incarnation) -> None:
-        self._street, self._port = street, node.api.port
-
-    def close(self) -> None: ...
-
-    async def call(self, method: str, *_params: Value) -> Value:
-        self._street.heard.append((self._port, method))
-        return [1, "", self._street.process]
-
-
 async def test_the_name_of_a_dead_node_is_registered_again() -> None:
     street = Street()
     dead, heir = await street.two_at_one_address()
     await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
     await street.settle()
     assert dead.life is Life.REPLACED
-    assert "shutdown" not in {method for _port, method in street.heard}
+    assert "shutdown" not in {method for _port, method in street.nodes.heard}
     assert heir.life is Life.LIVE
 
 
@@ -61,13 +44,13 @@ async def test_the_earlier_incarnation_is_shut_down() -> None:
     await street.register(street.node("/first", 1), Kind.SUBSCRIPTION, "/t")
     await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
     await street.settle()
-    assert (4001, "shutdown") in street.heard
+    assert (4001, "shutdown") in street.nodes.heard
 
 
 async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
     street = Street()
     dead, heir = await street.two_at_one_address()
-    street.process = 2
+    street.nodes.process = 2
     for node in (dead, heir, dead):
         await street.look(node)
     assert (dead.life, heir.life) == (Life.SHADOW, Life.LIVE)
@@ -80,7 +63,7 @@ async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
 async def test_a_node_that_restarts_at_its_address() -> None:
     street = Street()
     node, _other = await street.two_at_one_address()
-    street.process = 2
+    street.nodes.process = 2
     node.touched += 1  # as each registering call does
     await street.look(node)
     await street.look(node)
@@ -97,35 +80,31 @@ async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> 
         await street.look(node)
         await street.look(node)
     assert [node.life for node in nodes] == [Life.LIVE, Life.LIVE]
-    street.heard.clear()
+    street.nodes.heard.clear()
     for node in nodes:
         street.delivery.push(node, telling)
         await street.settle()
-    assert street.heard == [(4001, telling.method)] * 2
+    assert street.nodes.heard == [(4001, telling.method)] * 2
 
 
 async def test_a_connection_is_kept_for_the_next_call_but_not_to_find_out_whether_a_node_is_there() -> None:
     """On its old connection, a process that is gone would seem silent."""
     street = Street()
-    made: list[tuple[str, int]] = []
-    closed: list[str] = []
-
-    class Recorded(_Door):
-        def __init__(self, node: Incarnation, pool: int) -> None:
-            super().__init__(street, node)
-            made.append((node.name, pool))
-            self.close = lambda: closed.append(node.name)  # type: ignore[method-assign]  # to see the end of the connection
-
-    cast(Any, street.nodes).client = lambda node, *, pool=0: Recorded(node, pool)
+    nodes = street.nodes
     first, second = street.node("/first", 1), street.node("/second", 2)
     for method in ("requestTopic", "publisherUpdate", "getPid", "paramUpdate", "shutdown"):
-        await street.nodes.call(first, method)
-    await street.nodes.call(second, "requestTopic")
-    assert made == [("/first", 1), ("/first", 0), ("/first", 0), ("/second", 1)]
+        await nodes.call(first, method)
+    await nodes.call(second, "requestTopic")
+    assert [(used.node, used.pool) for used in nodes.used] == [
+        ("/first", 1),
+        ("/first", 0),
+        ("/first", 0),
+        ("/second", 1),
+    ]
     await asyncio.sleep(1.5)
-    await street.nodes.call(second, "requestTopic")
-    assert (len(made), closed) == (4, [])
+    await nodes.call(second, "requestTopic")
+    assert (len(nodes.used), nodes.closed) == (4, [])
     await asyncio.sleep(1)
-    assert closed == ["/first"]
+    assert nodes.closed == ["/first"]
     await asyncio.sleep(2)
-    assert closed == ["/first", "/second"]
+    assert nodes.closed == ["/first", "/second"]

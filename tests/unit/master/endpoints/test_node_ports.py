@@ -3,11 +3,10 @@ import ipaddress
 import os
 import socket
 from collections import deque
-from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from appliance.master.endpoints import node_ports
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
@@ -15,32 +14,13 @@ from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.table import NODE_PORTS
 from roswire.uris import parse_node_uri
+from tests.support.memory_ports import listening, memory_ports
 
 FIRST = 20_000
 
 
-class Listening:
-    def __init__(self, _host: str, port: int) -> None:
-        self.port = port
-
-    def getsockname(self) -> tuple[str, int]:
-        return "127.0.0.1", self.port
-
-    def close(self) -> None: ...
-
-
-@pytest.fixture(autouse=True)
-def without_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(node_ports, "listen", Listening)
-
-
-def places(
-    relays: int = 1, first: int = FIRST, count: int = 8, drop: Callable[[str], None] = lambda _name: None
-) -> NodePorts:
-    return NodePorts(
-        "127.0.0.1", range(first, first + count), keep=lambda *_: None, drop=drop, policy=lambda: NAMING,
-        relays=relays,
-    )  # fmt: skip
+def places(relays: int = 1, first: int = FIRST, count: int = 8, **more: Any) -> NodePorts:
+    return memory_ports(lambda: NAMING, range(first, first + count), relays=relays, **more)
 
 
 NAMING = compile_policy("[Nodes]\n/** = 10.0.0.1 10.1.0.0/24\n", file="a.ini")
@@ -101,19 +81,16 @@ def test_another_number_of_relays_after_a_restart() -> None:
     assert node.ports == had[:2]
 
 
-def test_a_restored_node_whose_port_another_program_has_gets_an_unused_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_restored_node_whose_port_another_program_has_gets_an_unused_one() -> None:
     """Such as a process of the earlier appliance that has not ended yet: a ROS 1 node never registers twice."""
     taken = {FIRST, FIRST + 1, FIRST + 3}
 
-    def busy(host: str, port: int) -> Listening:
+    def busy(host: str, port: int) -> Any:
         if port in taken:
             raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
-        return Listening(host, port)
+        return listening(host, port)
 
-    monkeypatch.setattr(node_ports, "listen", busy)
-    here = places()
+    here = places(listen=busy)
     first, second = incarnation((FIRST, FIRST + 1)), incarnation((FIRST + 2, FIRST + 3), HOSTS[1])
     here.reserve((*first.ports, *second.ports))
     here.reopen(first)
@@ -123,23 +100,20 @@ def test_a_restored_node_whose_port_another_program_has_gets_an_unused_one(
     taken.clear()
     assert [here.open(HOSTS[2]), here.taken.total] == [(FIRST + 7, FIRST), 6]
     lost = incarnation((FIRST + 20, FIRST + 21))
-    with monkeypatch.context() as patch, pytest.raises(NoPortError, match="in use"):
-        taken.update(range(FIRST, FIRST + 30))
-        patch.setattr(here, "unused", deque([FIRST + 1]))
+    taken.update(range(FIRST, FIRST + 30))
+    here.unused = deque([FIRST + 1])
+    with pytest.raises(NoPortError, match="in use"):
         here.reopen(lost)
 
 
-def test_no_port_is_lost_while_none_can_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    held = places()
-
+def test_no_port_is_lost_while_none_can_be_opened() -> None:
     def exhausted(_host: str, _port: int) -> socket.socket:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    with monkeypatch.context() as patch:
-        patch.setattr(node_ports, "listen", exhausted)
-        for _try in range(20):
-            with pytest.raises(NoPortError, match="Too many open files"):
-                held.open(HOSTS[0])
+    held = places(listen=exhausted)
+    for _try in range(20):
+        with pytest.raises(NoPortError, match="Too many open files"):
+            held.open(HOSTS[0])
     assert sorted(held.unused) == list(range(FIRST, FIRST + 8))
 
 

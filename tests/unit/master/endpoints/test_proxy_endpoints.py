@@ -1,28 +1,30 @@
 import ipaddress
-from typing import Any, cast
 
-from appliance.master.graph.registry import Incarnation
-from appliance.master.reconcile.sinks import ProxyEndpoints
+import pytest
+
+from appliance.master.graph.registry import Incarnation, Registry
+from appliance.master.reconcile.sinks import MasterSideApi, ProxyEndpoints
+from appliance.policy.policy_compiler import compile_policy
 from roswire.uris import parse_node_uri
+from tests.support.memory_ports import face, memory_ports
+
+POLICY = compile_policy("", file="a.ini")
 
 
-class Told:
-    def __init__(self) -> None:
-        self.calls: list[tuple[str, Any]] = []
-
-    def close(self, *given: Any) -> None:
-        self.calls.append(("close", given))
-
-
-def test_ports_are_closed_once() -> None:
+@pytest.mark.anyio
+async def test_ports_are_closed_once() -> None:
     """A node is closed when it is replaced, and again when it is forgotten: then another node may have its ports."""
-    places, server = Told(), Told()
-    faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 2)
-    faces.servers["key"] = cast(Any, server)
-    uri = "http://10.0.0.5:4000/"
-    host = ipaddress.ip_address("10.0.0.5")
-    node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
+    uri, host = "http://10.0.0.5:4000/", ipaddress.ip_address("10.0.0.5")
+    dropped, ended = list[str](), list[str]()
+    places = memory_ports(lambda: POLICY, drop=dropped.append)
+    outer, relay = places.open(host)
+    node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", outer, relay)
+    faces = ProxyEndpoints(
+        Registry(), places, 9, lambda _sock, _handler: face(lambda: ended.append("closed"))
+    )
+    await faces.open(node, MasterSideApi(Registry()).handle)
     faces.close(node)
+    places.unused.extendleft((relay, outer))
+    assert places.open(host) == node.ports
     faces.close(node)
-    assert places.calls == [("close", (node,))]
-    assert server.calls == [("close", ())]
+    assert (dropped, ended) == ([f"port:{outer}", f"port:{relay}"], ["closed"])

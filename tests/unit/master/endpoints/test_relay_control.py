@@ -2,17 +2,11 @@
 
 import asyncio
 import ipaddress
-from collections.abc import Callable
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
 from appliance.audit.log.record import RuleReference
 from appliance.channel import messages
-from appliance.channel.channel import Channel
-from appliance.master.endpoints.delivery import NodeApiClient
-from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
@@ -24,41 +18,13 @@ from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, AllocationPlan, Move
 from roswire.uris import parse_node_uri
+from tests.support.control_parts import NoSpecifications, no_own_call
 from tests.support.core import FakeTrail
-from tests.support.stated import stated
+from tests.support.memory_channel import HeldChannel
+from tests.support.scripted_nodes import ScriptedNodes
 
 pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
-_UNUSED = object()  # a part that is not used
-
-
-class Ports:
-    def socket(self, port: int) -> Any:
-        return SimpleNamespace(fileno=lambda: port)
-
-
-class NoDelivery:
-    pass
-
-
-class Link:
-    crowded = False
-
-    def __init__(self) -> None:
-        self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
-        self.end: Callable[[], None] = lambda: None
-
-    def attach(self, _loop: Any, received: Any, closed: Callable[[], None], _refused: object) -> None:
-        self.say, self.end = received, closed
-
-    def send(self, message: messages.Message, descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        self.told.append((message, descriptors))
-
-    def close(self) -> None: ...
-
-    def heard(self) -> list[messages.Message]:
-        told, self.told = [message for message, _descriptors in self.told], []
-        return told
 
 
 def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
@@ -68,13 +34,12 @@ def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
 class World:
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.trail = FakeTrail()
-        self.lost: list[int] = []
+        self.specifications = NoSpecifications()
         self.cut_off: list[tuple[str, str]] = []
         self.registry = Registry()
         self.allocation = Allocation(2)
         self.policy = policy()
         self.put(left=0, right=1)
-        self.ports = Ports()
         self.relay = self._relay_control(grants)
         self.graph = RosGraph(self.registry, self.grants, self.trail)
         uri = "http://10.0.0.5:4000/"
@@ -82,9 +47,9 @@ class World:
             "key", "/node", HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, more_relay_ports=(3,)
         )
         self.registry.add(self.node)
-        self.links = [Link(), Link()]
+        self.links = [HeldChannel(), HeldChannel()]
         for index, link in enumerate(self.links):
-            self.relay.attach(index, cast(Channel, link))
+            self.relay.attach(index, link)
         for kind, name, detail in (
             (Kind.PUBLICATION, "/left", "std_msgs/String"),
             (Kind.PUBLICATION, "/right", "std_msgs/String"),
@@ -104,22 +69,16 @@ class World:
         return RelayControl(
             self.registry,
             self.grants,
-            cast(NodePorts, self.ports),
-            cast(NodeApiClient, NoDelivery()),
+            lambda port: port,
+            ScriptedNodes(self.registry),
             carried,
             allocation=self.allocation,
             policy=lambda: self.policy,
-            monitors=lambda: cast(Any, self),
+            monitors=lambda: self.specifications,
             broken=lambda _incarnation: None,
             own_topics={},
-            own_call=cast(Any, None),
+            own_call=no_own_call,
         )
-
-    def statement(self, _relay: int) -> messages.SpecificationsStated:
-        return stated(1, [], {}, {}, restarted=False)
-
-    def relay_lost(self, relay: int) -> None:
-        self.lost.append(relay)
 
     def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
         self.graph.topic_granted(self.node, topic, host, caller_id)
@@ -156,14 +115,14 @@ async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> No
 
     one, other = await waiting(), await waiting()
     assert [link.heard()[-1] for link in world.links] == [messages.OrdersAsked()] * 2
-    first.say(messages.OrdersCarriedOut(), ())
-    second.say(messages.OrdersCarriedOut(), ())
+    first.say(messages.OrdersCarriedOut())
+    second.say(messages.OrdersCarriedOut())
     await one
     assert not other.done()
-    relay.attach(0, cast(Channel, Link()))
+    relay.attach(0, HeldChannel())
     second.end()
     await other
-    relay.attach(0, cast(Channel, again := Link()))
+    relay.attach(0, again := HeldChannel())
     again.end()
     await relay.carried_out()
 
@@ -175,7 +134,7 @@ async def test_a_relay_that_hangs_delays_only_what_it_carries(world: World) -> N
     asked = asyncio.ensure_future(relay.taps.stoppers("/a"))
     await asyncio.sleep(0)
     for _ in range(2):
-        second.say(messages.OrdersCarriedOut(), ())
+        second.say(messages.OrdersCarriedOut())
     await other
     assert first.heard()[-1] == messages.StopWanted(1, "/a", begin=False)
     assert await asked is None, "not that there is no guard"
@@ -187,8 +146,8 @@ async def test_a_relay_that_hangs_delays_only_what_it_carries(world: World) -> N
 async def test_each_relay_receives_its_topics(world: World) -> None:
     relay, node, (first, second) = world.relay, world.node, world.links
     placed = messages.NodePlaced("key", "/node", "10.0.0.5")
-    assert (placed, (2,)) in first.told
-    assert (placed, (3,)) in second.told
+    assert (placed, (2,)) in first.sent
+    assert (placed, (3,)) in second.sent
     assert messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001) in first.heard()
     assert messages.PublicationPlaced("key", "/right", "std_msgs/String") == second.heard()[-1]
     assert [relay.port(node, Kind.PUBLICATION, name) for name in ("/left", "/right")] == [2, 3]
@@ -196,10 +155,10 @@ async def test_each_relay_receives_its_topics(world: World) -> None:
     world.grant_topic("/right", HOST, "/ear")
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear")
     assert (first.heard(), second.heard()) == ([], [grant])
-    again = Link()
-    relay.attach(1, cast(Channel, again))
+    again = HeldChannel()
+    relay.attach(1, again)
     assert again.heard() == [
-        world.statement(1), messages.StateBegan(2), placed,
+        world.specifications.statement(1), messages.StateBegan(2), placed,
         messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
         messages.StateEnded(2),
     ]  # fmt: skip
@@ -281,42 +240,42 @@ async def test_a_subscriber_that_lost_its_connection(
     world.registry.add(ear)
     world.registry.register(ear, Kind.SUBSCRIPTION, "/left", "std_msgs/String")
     link = world.links[0]
-    link.say(messages.ConnectionOpened(7, "key", "/left", "topic", "10.0.0.5", "/ear"), ())
+    link.say(messages.ConnectionOpened(7, "key", "/left", "topic", "10.0.0.5", "/ear"))
     if ended is not None:
         leaving = {Kind.PUBLICATION: world.node, Kind.SUBSCRIPTION: ear}[ended]
         world.registry.unregister(leaving, ended, "/left")
-    link.say(messages.ConnectionClosed(7, "broken"), ())
+    link.say(messages.ConnectionClosed(7, "broken"))
     assert world.cut_off == cut_off
 
 
 async def test_a_lost_relay_loses_its_connections(world: World) -> None:
     relay, (first, second) = world.relay, world.links
     for link, topic in ((first, "/left"), (second, "/right")):
-        link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
+        link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"))
     assert len({one.number for one in relay.carried.connections.values()}) == 2
     second.end()
     assert [one.resource for one in relay.carried.connections.values()] == ["/left"]
-    assert (world.lost, relay.presence) == ([1], "1 of 2 are away")
+    assert (world.specifications.lost, relay.presence) == ([1], "1 of 2 are away")
     first.end()
     assert relay.presence == "away"
 
 
 async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World) -> None:
     say = world.links[0].say
-    say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
+    say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"))
     assert world.trail.records == []
-    say(messages.UpstreamLost("key", "/left", "a message of 1 GiB is declared", "limit exceeded"), ())
+    say(messages.UpstreamLost("key", "/left", "a message of 1 GiB is declared", "limit exceeded"))
     [record] = world.trail.records
     assert (record.event, record.reason) == ("limit exceeded", "a message of 1 GiB is declared")
     assert (record.host, record.caller_id, record.resource) == ("10.0.0.5", "/node", "/left")
     assert record.decision == "deny"
-    say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"), ())
+    say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"))
     assert len(world.trail.records) == 1
 
 
 async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
     row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
-    world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
+    world.links[0].say(messages.TrafficReported([row], 40.0, 7))
     assert world.relay.carried.traffic["key", "/left"].messages_per_second == 10
     [record] = world.trail.records
     assert (record.event, record.detail["lost"]) == ("records lost", 7)
@@ -343,7 +302,7 @@ async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: Wor
     assert (first.heard(), second.heard()) == ([], [placed, grant])
     world.use(policy(line))
     assert second.heard() == []
-    relay.attach(1, cast(Channel, second))
+    relay.attach(1, second)
     told = second.heard()
     assert placed in told
     assert grant in told
@@ -360,7 +319,7 @@ async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None
         messages.LimitedRow("key", "/left", "publisher", "10.0.0.5", "/node", 7, 70),
         messages.LimitedRow("key", "/left", "subscriber", "10.0.0.6", "/ear", 3, 30),
     ]
-    world.links[0].say(messages.MessagesLimited(rows), ())
+    world.links[0].say(messages.MessagesLimited(rows))
     one, other = world.trail.rows[-2:]
     assert (one["event"], one["severity"], other["severity"]) == ("rate limited", "warning", "info")
     assert (one["rule"], one["count"], one["bytes"]) == (RuleReference("Limits", "/left", "p.ini", 2), 7, 70)

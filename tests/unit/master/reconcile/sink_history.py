@@ -71,10 +71,10 @@ def history(seed: int) -> list[Step]:
 class SlowNodes(Deliveries):
     def __init__(self, note: Callable[[Seen], None]) -> None:
         super().__init__(note)
-        self.waiting: list[Told] = []
+        self.held: list[Told] = []
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
-        self.waiting.append(Told(incarnation, call))
+        self.held.append(Told(incarnation, call))
 
     def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
         self.drop_list(incarnation, topic)
@@ -82,18 +82,18 @@ class SlowNodes(Deliveries):
 
     def drop_list(self, incarnation: Incarnation, topic: str) -> None:
         super().drop_list(incarnation, topic)
-        self.waiting = [
+        self.held = [
             one
-            for one in self.waiting
+            for one in self.held
             if (one.node, one.call.method, one.call.parameters[0]) != (incarnation, "publisherUpdate", topic)
         ]
 
     def drop(self, incarnation: Incarnation) -> None:
         self.forget_lists(incarnation)
-        self.waiting = [one for one in self.waiting if one.node is not incarnation]
+        self.held = [one for one in self.held if one.node is not incarnation]
 
     def arrive(self) -> None:
-        for one in self.waiting:
+        for one in self.held:
             assert one.node.life is Life.LIVE or one.call.method == "shutdown", f"to a node that ended: {one}"
             if one.call.method == "publisherUpdate":
                 subscription = Kind.SUBSCRIPTION, str(one.call.parameters[0])
@@ -101,7 +101,7 @@ class SlowNodes(Deliveries):
                     f"not subscribed any more: {one}"
                 )
             super().push(*one)
-        self.waiting.clear()
+        self.held.clear()
 
 
 class StrictMaster(HiddenMaster):
@@ -123,13 +123,12 @@ class History(ControlParts):
     """Control with a real store, in which nodes come and go. `/a` has two lives."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.store = StateStore(folder, failed=pytest.fail, kind=InlineDatabase)
         self.made: list[Incarnation] = []
-        super().__init__()
+        super().__init__(store=self.store)
 
     def surround(self) -> None:
-        self.store = StateStore(self._folder, failed=pytest.fail, kind=InlineDatabase)
-        self.deliveries = self.slow = SlowNodes(self.seen.append)
+        self.delivery = self.deliveries = self.slow = SlowNodes(self.seen.append)
         self.hidden = self.strict = StrictMaster(self.seen.append)
 
     async def step(self, what: str, *about: Any) -> None:
@@ -206,7 +205,7 @@ class History(ControlParts):
             self.seen.append(Told(node, NodeCall("paramUpdate", (f"{topic}/", self.value(topic)))))
         self.sinks.flush()
         name = topic if kind is Kind.SUBSCRIPTION else f"{topic}/"
-        assert not [one for one in self.slow.waiting if one.node is node and one.call.parameters[0] == name]
+        assert not [one for one in self.slow.held if one.node is node and one.call.parameters[0] == name]
 
     def value(self, key: str) -> Value:
         present, _ = standing_at(self.parameters.tree, key)

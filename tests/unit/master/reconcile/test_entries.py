@@ -1,5 +1,5 @@
 import asyncio
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -15,36 +15,11 @@ def uri(number: int = 1) -> str:
     return f"http://10.0.0.5:{4000 + number}/"
 
 
-class Requests:
-    def __init__(self, world: ControlParts) -> None:
-        self._hidden = world.hidden
-        self.methods: list[str] = []
-        self.held = asyncio.Event()
-        self.held.set()
-        self.failure: Exception | None = None
-        self.answer: Any = None
-        self.at_once = self.most = 0
-        world.rosmaster.calls = cast(Any, self)
-
-    async def call(self, method: str, *params: Any) -> Any:
-        self.methods.append(method)
-        self.at_once += 1
-        self.most = max(self.most, self.at_once)
-        try:
-            await self.held.wait()
-            answer = await self._hidden.call(method, *params)
-        finally:
-            self.at_once -= 1
-        if self.failure is not None:
-            raise self.failure
-        return answer if self.answer is None else self.answer
-
-
-async def started() -> tuple[ControlParts, Requests]:
+async def started() -> ControlParts:
     world = await ControlParts.begun()
-    requests = Requests(world)
     world.hidden.calls.clear()
-    return world, requests
+    world.hidden.requests.clear()
+    return world
 
 
 def changes(world: ControlParts) -> list[tuple[Any, Any]]:
@@ -52,7 +27,7 @@ def changes(world: ControlParts) -> list[tuple[Any, Any]]:
 
 
 async def test_many_changes_go_in_order_in_few_requests() -> None:
-    world, requests = await started()
+    world = await started()
     node = world.node("/n")
     for number in range(200):
         world.graph.registered(node, Kind.PUBLICATION, f"/t{number}", TYPE)
@@ -61,26 +36,26 @@ async def test_many_changes_go_in_order_in_few_requests() -> None:
             world.graph.unregistered(node, Kind.PUBLICATION, f"/t{number}")
     await world.settle()
     assert changes(world) == [("registerPublisher", f"/t{number}") for number in range(0, 200, 2)]
-    assert (requests.methods, requests.most) == (["system.multicall"] * 2, 1)
+    assert (world.hidden.requests, world.hidden.most_under_way) == (["system.multicall"] * 2, 1)
 
 
 async def test_a_change_while_its_registration_is_under_way_follows() -> None:
-    world, requests = await started()
+    world = await started()
     node = world.node("/n")
-    requests.held.clear()
+    world.hidden.go.clear()
     world.graph.registered(node, Kind.PUBLICATION, "/t", TYPE)
-    while not requests.methods:
+    while not world.hidden.requests:
         await asyncio.sleep(0.01)
     world.graph.unregistered(node, Kind.PUBLICATION, "/t")
     await asyncio.sleep(1.0)
-    requests.held.set()
+    world.hidden.go.set()
     await world.settle()
     assert changes(world) == [("registerPublisher", "/t"), ("unregisterPublisher", "/t")]
     assert not world.hidden.has(Kind.PUBLICATION, "/t")
 
 
 async def test_a_new_type_of_a_topic_reaches_the_ros_master() -> None:
-    world, _requests = await started()
+    world = await started()
     node = world.node("/n")
     for type_name in ("*", TYPE, TYPE):
         await world.register(node, Kind.PUBLICATION, "/t", type_name)
@@ -91,23 +66,27 @@ async def test_a_new_type_of_a_topic_reaches_the_ros_master() -> None:
     "failure", [BrokenOffError("gone"), UnansweredError("late"), CallFailedError("fault")]
 )
 async def test_a_failed_change_is_not_repeated(failure: Exception) -> None:
-    world, requests = await started()
-    requests.failure = failure
+    world = await started()
+    world.hidden.failure = failure
     await world.ask("registerPublisher", "/n", "/t", TYPE, uri())
     await asyncio.wait_for(world.rosmaster.doubtful.wait(), 10)
     assert not world.rosmaster.reachable
     world.hidden.restart()
     await world.ask("registerPublisher", "/n", "/later", TYPE, uri())
     world.hidden.calls.clear()
-    requests.failure = None
+    world.hidden.failure = None
     await world.round()
     await world.settle()
     assert changes(world) == [("registerPublisher", "/t"), ("registerPublisher", "/later")]
 
 
 async def test_a_rejected_change_causes_a_round() -> None:
-    world, requests = await started()
-    requests.answer = [[[1, "", []]], {"faultCode": 1, "faultString": "no such thing"}, [[-1, "invalid", 0]]]
+    world = await started()
+    world.hidden.answer = [
+        [[1, "", []]],
+        {"faultCode": 1, "faultString": "no such thing"},
+        [[-1, "invalid", 0]],
+    ]
     world.rosmaster.doubtful.clear()
     for number in range(3):
         await world.ask("registerPublisher", "/n", f"/t{number}", TYPE, uri())
@@ -117,7 +96,7 @@ async def test_a_rejected_change_causes_a_round() -> None:
 
 async def test_a_host_fills_no_queue_while_the_ros_master_is_away() -> None:
     """The changes that wait have the bounds of the registry, so calls need not wait for the ROS master."""
-    world, _requests = await started()
+    world = await started()
     world.rosmaster.shut()
     for number in range(2000):
         for call, *about in (("registerPublisher", TYPE), ("unregisterPublisher",)):
@@ -130,7 +109,7 @@ async def test_a_host_fills_no_queue_while_the_ros_master_is_away() -> None:
 
 
 async def test_a_round_replaces_the_waiting_changes() -> None:
-    world, _requests = await started()
+    world = await started()
     old, new = world.node("/n", 1), world.node("/n", 2)
     world.rosmaster.shut()
     for node, topic in ((new, "/kept"), (old, "/old"), (new, "/new")):
@@ -144,7 +123,7 @@ async def test_a_round_replaces_the_waiting_changes() -> None:
 
 
 async def test_the_ros_master_has_what_the_registry_has() -> None:
-    world, _requests = await started()
+    world = await started()
     for name, number in (("/a", 1), ("/b", 2), ("/a", 3), ("/c", 4)):
         await world.ask("registerPublisher", name, "/t", TYPE, uri(number))
         await world.ask("registerSubscriber", name, f"/of_{number}", TYPE, uri(number))

@@ -1,11 +1,10 @@
 import asyncio
 import ipaddress
-from typing import Any, cast
 
 import pytest
 
 from appliance.base.clock import using
-from appliance.master.graph.registry import Kind, Life
+from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reconcile import liveness
 from appliance.master.reconcile.liveness import Presence
 from appliance.rpc.xmlrpc_client import RefusedError
@@ -20,11 +19,11 @@ async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
-    world.clients.silent = {"/n"}
+    world.nodes.silent = {"/n"}
     await world.look(node)
     with using(ShiftedClock(365 * 86_400)):
         await world.look(node)
-        world.clients.silent = set()
+        world.nodes.silent = set()
         await world.look(node)
     assert (node.life, world.hidden.has(Kind.PUBLICATION, "/a")) == (Life.LIVE, ["/n"])
 
@@ -34,10 +33,10 @@ async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytes
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
-    world.clients.silent = {"/n"}
+    world.nodes.silent = {"/n"}
     await world.look(node)
     assert world.lives == [Life.SHADOW]
-    world.clients.silent = set()
+    world.nodes.silent = set()
     running = asyncio.create_task(world.liveness.run())
     try:
         async with asyncio.timeout(world.liveness.settings.interval / 2):
@@ -55,16 +54,16 @@ async def test_a_refusal_of_a_robot_that_shuts_out_loses_no_node(monkeypatch: py
     await world.register(ear, Kind.SUBSCRIPTION, "/t")
     await world.register(mouth, Kind.PUBLICATION, "/t")
     world.deliveries.told.clear()
-    world.shut_out, world.clients.gone = True, {"/ear"}
+    world.shut_out, world.nodes.gone = True, {"/ear"}
     assert (await world.liveness.probe(ear)).presence is Presence.SILENT
     world.watchlist.cut_off(ear, "/t")
     world.liveness.look_at_watched()
     await world.settle()
     assert (world.lives, world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
-    world.shut_out, world.clients.gone = False, set()
+    world.shut_out, world.nodes.gone = False, set()
     await asyncio.sleep(2 * liveness.RECENTLY_LOST_SECONDS)
     assert len(world.deliveries.told) == 2
-    world.clients.gone = {"/ear"}
+    world.nodes.gone = {"/ear"}
     await world.look(ear)
     assert world.lives == [Life.SHADOW, Life.LIVE]
 
@@ -76,12 +75,12 @@ async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.Mo
     await world.register(node, Kind.PUBLICATION, "/secret")
     world.reload(POLICY.format("/secret=\n", ""))
     await world.settle()
-    world.clients.silent = {"/n", "/idle"}
+    world.nodes.silent = {"/n", "/idle"}
     await world.look(node)
     await world.look(idle)
     assert world.registry.all() == [node]
     world.reload(OPEN)
-    world.clients.silent = set()
+    world.nodes.silent = set()
     await world.look(node)
     assert world.lives == [Life.LIVE]
     assert world.hidden.has(Kind.PUBLICATION, "/secret") == ["/n"]
@@ -92,12 +91,12 @@ async def test_a_node_that_returns_during_its_removal_is_registered_again() -> N
     node = world.node("/n")
     for topic in ("/a", "/b", "/c"):
         await world.register(node, Kind.PUBLICATION, topic)
-    world.clients.silent = {"/n"}
+    world.nodes.silent = {"/n"}
     world.hidden.go.clear()
     await world.liveness.look(node)
     assert node.life is Life.SHADOW
     await asyncio.sleep(1.0)
-    world.clients.silent = set()
+    world.nodes.silent = set()
     world.liveness.revive(node)
     await asyncio.sleep(1.0)
     world.hidden.go.set()
@@ -110,7 +109,7 @@ async def test_a_node_that_returns_to_a_new_master_is_restored_by_the_rebuild() 
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
-    world.clients.silent = {"/n"}
+    world.nodes.silent = {"/n"}
     await world.look(node)
     world.rosmaster.shut()
     world.hidden.restart()
@@ -128,16 +127,13 @@ async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
     for guest in guests:
         guest.host = ipaddress.ip_address("10.0.0.66")
 
-    class Silent:
-        async def call(self, _method: str, *_params: Value) -> Value:
-            await silence.wait()
-            return [1, "", 1]
-
-    class Gone:
-        async def call(self, _method: str, *_params: Value) -> Value:
+    async def answer(node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
+        if node is robot:
             raise RefusedError("nobody is there")
+        await silence.wait()
+        return [1, "", 1]
 
-    cast(Any, world.nodes).client = lambda node: Gone() if node is robot else Silent()
+    world.nodes.answer = answer
     for guest in guests:
         world.liveness.look_at(guest)
     for _ in range(5):

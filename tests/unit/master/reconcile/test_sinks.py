@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -133,18 +132,17 @@ async def test_a_node_without_a_descriptor_delays_no_other_node(monkeypatch: pyt
     world = await ControlParts.begun()
     first, second = world.node("/first", 1), world.node("/second", 2)
     first.relay_port = 7
-    ports = world.relay.places.socket
 
-    def socket(port: int) -> Any:
+    def exhausted(port: int) -> int:
         if port == first.relay_port:
             raise OSError(24, "Too many open files")
-        return ports(port)
+        return port
 
     def placed() -> list[str]:
         return [seen.key for seen in world.seen if isinstance(seen, messages.PublicationPlaced)]
 
     with monkeypatch.context() as patched:
-        patched.setattr(world.relay.places, "socket", socket)
+        patched.setattr(world.relay, "descriptor", exhausted)
         for node in (first, second):
             world.graph.registered(node, Kind.PUBLICATION, "/t", "t")
         world.sinks.flush()

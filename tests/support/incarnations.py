@@ -1,0 +1,22 @@
+import ipaddress
+from typing import Any
+
+from appliance.master.graph.registry import Incarnation
+from roswire.uris import parse_node_uri
+
+
+def incarnation(
+    name: str,
+    port: int = 4000,
+    *,
+    host: str = "10.0.0.5",
+    key: str = "",
+    ports: tuple[int, int] = (19001, 19002),
+    **more: Any,
+) -> Incarnation:
+    """Return a node with its API at `port`; its `key` is "key of NAME" unless given."""
+    uri = f"http://{host}:{port}/"
+    address = ipaddress.ip_address(host)
+    return Incarnation(
+        key or f"key of {name}", name, address, parse_node_uri(uri), uri, "10.0.0.1", *ports, **more
+    )
