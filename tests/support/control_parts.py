@@ -130,7 +130,7 @@ class Deliveries(Delivery):
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
         self._note = note
         self._removed: dict[tuple[str, str], frozenset[str]] = {}
-        self._lists: dict[tuple[str, str], tuple[str, ...]] = {}
+        self._published: dict[tuple[str, str], tuple[str, ...]] = {}
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         self.told.append((incarnation.name, call.method, call.parameters))
@@ -140,10 +140,10 @@ class Deliveries(Delivery):
         self.push(incarnation, call)
 
     def list_of(self, incarnation: Incarnation, topic: str) -> tuple[str, ...] | None:
-        return self._lists.get((incarnation.key, topic))
+        return self._published.get((incarnation.key, topic))
 
     def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
-        self._lists[incarnation.key, topic] = publishers
+        self._published[incarnation.key, topic] = publishers
         if removed := self._removed.pop((incarnation.key, topic), None):
             without: list[Value] = [one for one in publishers if one not in removed]
             self.push(incarnation, NodeCall("publisherUpdate", (topic, without)))
@@ -153,13 +153,13 @@ class Deliveries(Delivery):
         self._removed[incarnation.key, topic] = publishers
 
     def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
-        self._lists[incarnation.key, topic] = publishers
+        self._published[incarnation.key, topic] = publishers
 
     def drop_list(self, incarnation: Incarnation, topic: str) -> None:
-        self._lists.pop((incarnation.key, topic), None)
+        self._published.pop((incarnation.key, topic), None)
 
     def forget_lists(self, incarnation: Incarnation) -> None:
-        self._lists = {key: one for key, one in self._lists.items() if key[0] != incarnation.key}
+        self._published = {key: one for key, one in self._published.items() if key[0] != incarnation.key}
 
     def drop(self, incarnation: Incarnation) -> None:
         self.forget_lists(incarnation)

@@ -24,7 +24,7 @@ class Post:
     def __init__(self, **bounds: Any) -> None:
         self.answers = asyncio.Event()
         self.failure: CallFailedError | None = None
-        self.lost, self.lists = list[tuple[str, Value]](), list[tuple[str, Value]]()
+        self.lost, self.lists = list[tuple[str, Value]](), list[tuple[str, Any]]()
         self.receives: Callable[[str, Any], None] = lambda _topic, _publishers: None
         self.world = ControlParts()
         self.world.nodes.answer = self.answer
