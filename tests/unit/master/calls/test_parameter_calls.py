@@ -108,7 +108,7 @@ def test_key_and_value_together_are_bounded_in_depth() -> None:
 
 
 class OrderedServer(RosMaster):
-    """A ROS master with the tree `tree`, and the calls that change it. `told` has the changes that were told."""
+    """A ROS master with the tree `tree`, and the calls that change it. `told` has the changes that subscribers get."""
 
     def __init__(self, there: ParameterMirror) -> None:
         super().__init__(1, limits=XmlRpcLimits())
