@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from appliance.control.core import Core, RelayOrders
+from appliance.control.core import Core
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
@@ -63,13 +63,15 @@ class MotionStop:
                 lost.update(published_before(core.store, concerns))
 
         core.policy.on_first(find)
-        return partial(self.at_start, lost, core.relay)
+        return partial(self.at_start, lost, core.relay.ready, core.relay.carried_out)
 
-    async def at_start(self, lost: Commands, relay: RelayOrders) -> None:
+    async def at_start(
+        self, lost: Commands, ready: Callable[[], bool], carried_out: Callable[[], Awaitable[None]]
+    ) -> None:
         """Stop topics whose hosts lost the right while control was away, once no relay serves these hosts."""
-        while lost and not relay.ready():
+        while lost and not ready():
             await asyncio.sleep(_READY_SECONDS)
-        await relay.carried_out()
+        await carried_out()
         while lost:
             host, topic = lost.pop()
             await self.after(host, {topic}, "RVMaster started again, and the right of the host is not kept")

@@ -55,7 +55,12 @@ def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> Quer
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead, stepped=base.hosts.tunnels.state_anew)
     base.ends.when_cut_short(clock.cut_short)
     switched_off = SwitchedOffWatch(
-        parts.monitors, base.policies, base.store, trail, settings.forgotten_after
+        lambda: parts.monitors.switches.switched_off(),  # noqa: PLW0108  of those in force then
+        parts.monitors.returns.until,
+        lambda: base.policies.current,
+        store=base.store,
+        trail=trail,
+        forgotten_after=settings.forgotten_after,
     )
     handled = HandledAlarms(base.store, base.ends)
     queries = Queries(
@@ -81,7 +86,6 @@ def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> Quer
 
 def make_operators(base: Foundation, made: QueryParts, features: FeatureParts) -> Operators:
     administration = Administration(
-        made.queries,
         features.methods()
         + request_methods(
             queries=made.queries,
@@ -89,6 +93,7 @@ def make_operators(base: Foundation, made: QueryParts, features: FeatureParts) -
             monitors=made.core.specifications,
             tokens=made.tokens,
         ),
+        in_force=lambda: (base.policies.revision, made.queries.parts.monitors.revision),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
     )

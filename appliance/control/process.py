@@ -34,8 +34,7 @@ from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.features.table import start_gate
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
-from appliance.master.graph.registry import Life
-from appliance.master.reconcile.sinks import restore
+from appliance.master.reconcile.sinks import restore_nodes
 from appliance.specifications.compiled_store import CompiledStore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from roswire.uris import node_uri
@@ -108,7 +107,10 @@ async def _start(
     await parts.monitors.start(restarted=restarted, taken_over=role.paired)
     features.add(await gate.begin(_starting(base, parts)))
     control = _Control(base, parts, features, make_operators(base, queries, features))
-    await _restore(base, parts)
+    core, ends = parts.core, parts.endpoints
+    await restore_nodes(base.sockets, base.store, core.graph, ends.faces, parts.serve)
+    # The policy's file may have changed while the appliance was down, or control may have died during a change.
+    ends.enforcement.policy_changed(base.policies.current)
     await control.serve()
     await parts.reconciler.ready.wait()
     await control.announce(restarted=restarted)
@@ -237,27 +239,3 @@ def _starting(base: Foundation, parts: Parts) -> StartingControl:
         relays=lambda: parts.endpoints.relay.presence,
         probe=lambda: base.lifeline.surroundings.probe,
     )
-
-
-async def _restore(base: Foundation, parts: Parts) -> None:
-    core, ends = parts.core, parts.endpoints
-    for name, sock in base.sockets.items():
-        if name.startswith("port:"):
-            ends.places.adopt(name, sock)
-    restore(core.registry, base.store)
-    core.grants.restore(base.store.permissions())
-    claimed: set[int] = set()
-    ends.places.reserve(port for node in core.registry.all() for port in node.ports)
-    for incarnation in core.registry.all():
-        if incarnation.life is Life.REPLACED:
-            continue
-        try:
-            await ends.faces.reopen(incarnation, parts.serve(incarnation))
-        except NoPortError as error:
-            core.graph.lost(incarnation, str(error))
-            core.graph.forgotten(incarnation)
-            continue
-        claimed |= set(incarnation.ports)
-    ends.places.close_unclaimed(claimed)
-    # The policy's file may have changed while the appliance was down, or control may have died during a change.
-    ends.enforcement.policy_changed(base.policies.current)

@@ -7,7 +7,6 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
 import httpx
@@ -57,6 +56,11 @@ _STATE = Settings().state
 _KIT = {"name": "laptop", "address": "10.9.0.2", "appliance": "10.9.0.1"}
 
 
+def _example_for(request: type) -> Any:
+    answer: Any = answer_to(request)
+    return example(answer)
+
+
 def _of_feature(verb: str, **fields: Any) -> dict[type, Any]:
     request = request_named(verb)
     return {} if request is None else {request: example(cast(Any, answer_to(request)), **fields)}
@@ -83,7 +87,7 @@ class Carried:
             if self.error is not None:
                 raise self.error
             self.orders.append((request, who))
-        return self.answers.get(type(request)) or example(cast(Any, answer_to(type(request))))
+        return self.answers.get(type(request)) or _example_for(type(request))
 
 
 class Tokens:
@@ -115,17 +119,13 @@ class RestWorld:
         self._runner.run(self._connect())
 
     async def _connect(self) -> None:
-        queries = idle(Queries)
-        object.__setattr__(queries, "policies", SimpleNamespace(revision=7))
-        object.__setattr__(queries, "parts", SimpleNamespace(monitors=SimpleNamespace(revision=3)))
         methods = idle_parts().methods() + request_methods(
-            queries=queries,
+            queries=idle(Queries),
             policies=idle(Policies),
             monitors=idle(SpecificationManager),
             tokens=idle(TokenOrders),
         )
         administration = Administration(
-            queries,
             [
                 *(replace(method, answer=self.carried.out) for method in methods),
                 *(
@@ -133,11 +133,12 @@ class RestWorld:
                     for request in answered_later()
                 ),
             ],
+            in_force=lambda: (7, 3),
             durable=self.trail.durable,
             require_room=lambda: None,
         )
         rest = RestLink(
-            administration, cast(Any, self.tokens), self.trail,
+            administration, self.tokens, self.trail,
             served=lambda _pin: None, certified=lambda _sha256: None, require_proof=False, uses=RestUses(),
         )  # fmt: skip
         rest.attach(self._ends[0])

@@ -16,7 +16,6 @@ from appliance.control.errors import (
     UnavailableError,
     UnknownThingError,
 )
-from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.hosts.host_table import (
     HostForbiddenError,
@@ -58,17 +57,20 @@ KEPT = ORDERS | {admin.TokenAdd, admin.TokenRotate}
 
 
 class Administration:
-    """Carries out requests. `require_room()` guards requests in `KEPT` without `full_disk`."""
+    """Carries out requests. `require_room()` guards requests in `KEPT` without `full_disk`.
+
+    `in_force` returns the revisions of the policy and of the specifications.
+    """
 
     def __init__(
         self,
-        queries: Queries,
         methods: Iterable[RequestMethod[object]],
         *,
+        in_force: Callable[[], tuple[int, int]],
         durable: Callable[[], Awaitable[object]],
         require_room: Callable[[], None],
     ) -> None:
-        self._queries = queries
+        self._revisions = in_force
         self._durable = durable
         self._require_room = require_room
         self._methods = {method.request: method for method in methods}
@@ -104,10 +106,10 @@ class Administration:
             return admin.AdminAnswer(False, error=str(error), trouble=_trouble(error))
 
     def _in_force(self, error: PolicyRefusedError | SpecificationsRefusedError) -> str:
+        policy, specifications = self._revisions()
         if isinstance(error, PolicyRefusedError):
-            return f"the policy was rejected; revision {self._queries.policies.revision} stays in force"
-        revision = self._queries.parts.monitors.revision
-        return f"rejected; revision {revision} of the specifications stays in force"
+            return f"the policy was rejected; revision {policy} stays in force"
+        return f"rejected; revision {specifications} of the specifications stays in force"
 
 
 def _trouble(error: Exception) -> admin.Trouble:

@@ -5,12 +5,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.settings import Settings
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Registry
+from appliance.policy.host_sets import Network
+from appliance.policy.model import Address
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
 
@@ -23,9 +25,9 @@ class OwnUses:
 
     registry: Registry
     carried: RelayTraffic
-    ports: Callable[[], Pool[Any]]
-    connected: Pool[Any]
-    parameters: Pool[Any]
+    ports: Callable[[], Pool[Network]]
+    connected: Pool[Address]
+    parameters: Pool[Address]
     settings: Settings
 
     def __call__(self) -> Iterator[LimitUse]:

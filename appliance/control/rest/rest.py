@@ -15,6 +15,7 @@ import asyncio
 import os
 from collections import deque
 from collections.abc import Callable
+from typing import Protocol
 
 import structlog
 
@@ -34,13 +35,13 @@ from appliance.channel.messages.api import (
     RequestWithdrawn,
     RestCalled,
     RestServed,
+    TokenKept,
     TokensStated,
     TokenUsed,
 )
 from appliance.channel.operations import ORDERS
 from appliance.control.operators.administration import Administration
-from appliance.control.operators.token_orders import TokenOrders
-from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
+from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError, UsableTokens
 from appliance.control.rest.rest_uses import RestUses
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -53,6 +54,14 @@ _MOST_SLOW = 16
 NO_WEBSOCKETS = (503, "this appliance opens no doors now")
 
 
+class RestTokens(UsableTokens, Protocol):
+    def usable(self) -> list[TokenKept]:
+        """Return the tokens that the api accepts."""
+
+    def used(self, token_id: str) -> None:
+        """Note that a token was used."""
+
+
 class RestLink:
     """The link to the api.
 
@@ -63,7 +72,7 @@ class RestLink:
     def __init__(
         self,
         administration: Administration,
-        tokens: TokenOrders,
+        tokens: RestTokens,
         trail: AuditTrail,
         *,
         served: Callable[[str], None],

@@ -11,7 +11,7 @@ incarnations, whose keys are the paths of its URIs. The *outer* (peer-side) endp
 
 import asyncio
 import socket
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -19,7 +19,7 @@ from typing import Protocol
 from appliance.base import clock
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.graph import Grants
+from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import (
     ENDED,
     PUBLISHER_PATH,
@@ -229,6 +229,35 @@ class ProxyEndpoints:
         """Stop serving; the ports stay open for the next control process."""
         for server in self.servers.values():
             server.close()
+
+
+async def restore_nodes(
+    sockets: Mapping[str, socket.socket],
+    store: StateStore,
+    graph: RosGraph,
+    faces: ProxyEndpoints,
+    serve: Callable[[Incarnation], Handler],
+) -> None:
+    """Restore the stored nodes with their ports. A node that gets no port is lost."""
+    places, registry = faces.places, graph.registry
+    for name, sock in sockets.items():
+        if name.startswith("port:"):
+            places.adopt(name, sock)
+    restore(registry, store)
+    graph.grants.restore(store.permissions())
+    claimed: set[int] = set()
+    places.reserve(port for node in registry.all() for port in node.ports)
+    for incarnation in registry.all():
+        if incarnation.life is Life.REPLACED:
+            continue
+        try:
+            await faces.reopen(incarnation, serve(incarnation))
+        except NoPortError as error:
+            graph.lost(incarnation, str(error))
+            graph.forgotten(incarnation)
+            continue
+        claimed |= set(incarnation.ports)
+    places.close_unclaimed(claimed)
 
 
 class MasterSideApi:

@@ -1,30 +1,32 @@
 import asyncio
-from types import SimpleNamespace
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from appliance.control.motion_stop import MotionStop, published_before
-from appliance.store.state_file import IncarnationRow, RegistrationRow
-from tests.support.core import FakeTrail
+from appliance.master.graph.graph import Grants
+from appliance.master.graph.registry import Kind, Registry
+from appliance.master.reconcile.sinks import StoredGraph
+from appliance.policy.policy_compiler import compile_policy
+from tests.support.core import Core, FakeTrail
+from tests.support.incarnations import incarnation
 
 pytestmark = pytest.mark.anyio
 
 
-def node(key: str, host: str, *, own: bool = False) -> IncarnationRow:
-    return IncarnationRow(key, f"/{key}", host, "http://x:1/", host, 1, 2, own, "live", 0.0)
-
-
-async def test_a_new_control_stops_what_was_commanded_once_the_relays_have_its_orders() -> None:
-    nodes = [node("a", "10.0.0.7"), node("b", "10.0.0.8"), node("own", "127.0.0.1", own=True)]
-    rows = [
-        RegistrationRow(key, kind, resource, "", 1)
-        for key in ("a", "own")
-        for kind in ("publication", "subscription")
-        for resource in ("/cmd_vel", "/other")
-    ]
-    store = cast(Any, SimpleNamespace(load_registry=lambda: (nodes, rows)))
-    lost = published_before(store, lambda _host, topic: topic == "/cmd_vel")
+async def test_a_new_control_stops_what_was_commanded_once_the_relays_have_its_orders(tmp_path: Path) -> None:
+    core, before = Core(tmp_path), Registry()
+    commander = incarnation("/a", 4000, host="10.0.0.7")
+    own = incarnation("/own", 4001, host="127.0.0.1", own=True)
+    for node in (commander, own, incarnation("/b", 4002, host="10.0.0.8")):
+        before.add(node)
+    for node in (commander, own):
+        for topic in ("/cmd_vel", "/other"):
+            before.register(node, Kind.PUBLICATION, topic, "geometry_msgs/Twist")
+            before.register(node, Kind.SUBSCRIPTION, topic, "geometry_msgs/Twist")
+    StoredGraph(Grants(before.mark, set), core.store).flush(before.take_changes())
+    lost = published_before(core.store, lambda _host, topic: topic == "/cmd_vel")
     assert lost == {("10.0.0.7", "/cmd_vel")}
     done: list[Any] = []
 
@@ -35,12 +37,14 @@ async def test_a_new_control_stops_what_was_commanded_once_the_relays_have_its_o
     async def carried_out() -> None:
         done.append("carried out")
 
-    relay = SimpleNamespace(ready=lambda: False, carried_out=carried_out)
+    ready = asyncio.Event()
     trail = FakeTrail(lambda record: done.append((record.event, record.host)))
-    work = MotionStop(stop, trail, cast(Any, None)).at_start(lost, cast(Any, relay))
-    task = asyncio.ensure_future(work)
+    policy = compile_policy("", file="p.ini")
+    stopping = MotionStop(stop, trail, lambda: policy).at_start(lost, ready.is_set, carried_out)
+    task = asyncio.ensure_future(stopping)
     await asyncio.sleep(10)
     assert done == []
-    relay.ready = lambda: True
+    ready.set()
     await task
     assert done == ["carried out", "/cmd_vel", ("motion stopped", "10.0.0.7")]
+    core.store.close()

@@ -4,7 +4,6 @@ import ipaddress
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
 
@@ -182,7 +181,8 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
 )
 def test_a_request_that_is_not_http_exceeds_no_limit(status: str, event: str) -> None:
     trail = FakeTrail()
-    limits = ListenerLimits(Settings(), trail, cast(Any, None), lambda _host: QuotaClass.NAMED)
+    policy = compile_policy("", file="a.ini")
+    limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.NAMED)
     peer = Peer(ipaddress.ip_address("10.0.0.9"), "10.0.0.9", "10.0.0.1")
     report = limits.troubled if exceeds_limit(status.encode()) else limits.malformed
     report(peer, "10.0.0.9 sent something")

@@ -3,7 +3,7 @@ import contextlib
 import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -13,8 +13,8 @@ from appliance.channel.answers.policy_answers import PolicyConfirmed
 from appliance.cli.connection import admin_client
 from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket, NotRunningError
 from appliance.control.operators.admin_socket import AdminServer
-from appliance.control.operators.administration import Administration
 from appliance.control.operators.request_method import RequestMethod
+from tests.support.administrations import administration_of
 
 pytestmark = pytest.mark.anyio
 
@@ -38,12 +38,8 @@ class Slow:
 
 @contextlib.asynccontextmanager
 async def served(state: Path) -> AsyncIterator[Slow]:
-    async def durable() -> None: ...
-
     slow = Slow()
-    methods = [RequestMethod(PolicyConfirm, slow.confirm, who=True)]
-    looks: Any = object()
-    administration = Administration(looks, methods, durable=durable, require_room=lambda: None)
+    administration = administration_of(RequestMethod(PolicyConfirm, slow.confirm, who=True))
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listening.bind(str(state / ADMIN_SOCKET))
     listening.listen()
@@ -127,11 +123,11 @@ def _then(method: Any, after: Any) -> Any:
 
 
 async def test_an_order_that_ends_by_a_defect_is_answered() -> None:
-    class Broken:
-        async def carry_out(self, _request: object, *, who: str) -> AdminAnswer[Any]:
-            raise FileNotFoundError(f"no presets for {who}")
+    async def confirm(_request: PolicyConfirm, who: str) -> PolicyConfirmed:
+        raise FileNotFoundError(f"no presets for {who}")
 
-    answer = await AdminServer(cast(Any, Broken())).answer(encode(PolicyConfirm()))
+    server = AdminServer(administration_of(RequestMethod(PolicyConfirm, confirm, who=True)))
+    answer = await server.answer(encode(PolicyConfirm()))
     assert (answer.ok, answer.trouble) == (False, "failed")
     assert "a defect in rosrv, please report it" in str(answer.error)
     assert "no presets for operator" in str(answer.error)

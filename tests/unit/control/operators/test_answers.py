@@ -1,7 +1,7 @@
 import inspect
 import typing
 from collections import Counter
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -11,12 +11,12 @@ from appliance.channel.channel import ChannelFullError
 from appliance.channel.messages import api
 from appliance.channel.operations import AnyRequest, RestRequest
 from appliance.control.assembly.policies import Policies
-from appliance.control.operators.administration import Administration
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.specifications.specification_manager import SpecificationManager
+from tests.support.administrations import administration_of
 from tests.support.feature_parts import answered_later, idle_parts
 
 CLASSES: dict[str, Any] = {
@@ -80,7 +80,7 @@ def test_one_method_answers_each_request() -> None:
 
 @pytest.mark.anyio
 async def test_a_request_without_its_feature_is_unknown() -> None:
-    administration = Administration(cast(Any, None), (), durable=cast(Any, None), require_room=lambda: None)
+    administration = administration_of()
     answer = await administration.carry_out(admin.StatusWanted(), who="operator")
     assert (answer.ok, answer.trouble) == (False, "unknown")
 
@@ -90,10 +90,7 @@ async def test_an_order_to_a_process_that_does_not_read_is_answered() -> None:
     async def answer(_request: admin.StatusWanted) -> Any:
         raise ChannelFullError("a process of the appliance does not read: 9 bytes wait for it")
 
-    async def durable() -> None: ...
-
-    method = RequestMethod(admin.StatusWanted, answer)
-    administration = Administration(cast(Any, None), [method], durable=durable, require_room=lambda: None)
+    administration = administration_of(RequestMethod(admin.StatusWanted, answer))
     given = await administration.carry_out(admin.StatusWanted(), who="operator")
     assert (given.ok, given.trouble) == (False, "failed")
     assert given.error == "a process of the appliance does not read: 9 bytes wait for it"

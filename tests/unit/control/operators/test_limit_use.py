@@ -1,3 +1,4 @@
+from ipaddress import ip_network
 from pathlib import Path
 
 import pytest
@@ -7,15 +8,19 @@ from appliance.configuration.config_sources import read
 from appliance.control.operators.limit_use import OwnUses
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Kind, Registry
+from appliance.policy.host_sets import Network
+from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from tests.support.core import FakeTrail
 from tests.support.incarnations import incarnation
 
 
 def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
-    pool: Pool[str] = Pool("ports", Bounds(100, 75, 10, 0), lambda _host: QuotaClass.REGISTERED)
-    pool.charge("10.0.0.9/32", 40)
-    pool.charge("10.0.0.8/32", 2)
+    bounds = Bounds(100, 75, 10, 0)
+    ports: Pool[Network] = Pool("ports", bounds, lambda _host: QuotaClass.REGISTERED)
+    pool: Pool[Address] = Pool("bytes", bounds, lambda _host: QuotaClass.REGISTERED)
+    ports.charge(ip_network("10.0.0.9/32"), 40)
+    ports.charge(ip_network("10.0.0.8/32"), 2)
     registry = Registry()
     for number, host in enumerate(("10.0.0.9", "10.0.0.9", "10.0.0.8", "127.0.0.1")):
         registry.add(incarnation(f"/node{number}", 4000 + number, host=host))
@@ -26,7 +31,7 @@ def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
     carried = RelayTraffic(FakeTrail(), registry, 2, lambda _node, _topic: None)
     carried.memory = memory
     settings = read({"state": str(state), "audit": {"retention_bytes": 4 << 20}, "relays": 2})
-    uses = OwnUses(registry, carried, lambda: pool, pool, pool, settings)
+    uses = OwnUses(registry, carried, lambda: ports, pool, pool, settings)
     return {row.resource: row for row in uses()}
 
 

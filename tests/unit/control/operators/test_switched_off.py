@@ -1,88 +1,82 @@
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from appliance.control.operators.switched_off import SwitchedOffWatch
-from appliance.store.state_file import StateStore
-from tests.support.core import FakeTrail
-from tests.support.engines import InlineDatabase
+from appliance.policy.policy_compiler import compile_policy
+from appliance.specifications.switches import SHADOW, Switch
+from tests.support.core import Core
+
+AUDIT_ONLY = "[Options]\naudit-only = publishers, subscribers\n"
 
 
-class Scene:
-    def __init__(self, store: StateStore) -> None:
-        self.store = store
-        self.off: dict[str, Any] = {}
-        self.until: dict[str, float] = {}
-        self.audit_only: set[str] = set()
-        self.trail = FakeTrail()
-
-    @property
-    def recorded(self) -> list[str]:
-        return [f"{record.event}: {record.reason}" for record in self.trail.records]
-
-    def watch(self, forgotten_after: float | None = 3600.0) -> SwitchedOffWatch:
-        monitors: Any = SimpleNamespace(
-            switches=SimpleNamespace(switched_off=lambda: self.off),
-            returns=SimpleNamespace(until=lambda name: self.until.get(name)),  # noqa: PLW0108  of whatever is there then
-        )
-        policies: Any = SimpleNamespace(
-            current=SimpleNamespace(audit_only=lambda category: category.value in self.audit_only)
-        )
-        return SwitchedOffWatch(monitors, policies, self.store, self.trail, forgotten_after)
+def watch(
+    core: Core,
+    off: dict[str, Switch],
+    *,
+    until: Callable[[str], float | None] = lambda _name: None,
+    policy: str = "",
+    forgotten_after: float | None = 3600.0,
+) -> SwitchedOffWatch:
+    compiled = compile_policy(policy, file="p.ini")
+    return SwitchedOffWatch(
+        lambda: off, until, lambda: compiled,
+        store=core.store, trail=core.trail, forgotten_after=forgotten_after,
+    )  # fmt: skip
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Iterator[Scene]:
-    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    yield Scene(store)
-    store.close()
+def recorded(core: Core) -> list[str]:
+    return [f"{record.event}: {record.reason}" for record in core.trail.records]
 
 
 @pytest.mark.nightly
 @pytest.mark.anyio
-async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
-    scene.off = {"a": False, "b": "shadow"}
-    watch = scene.watch()
-    watch.look(3000.0)
-    assert [row.forgotten for row in watch.rows()] == [False, False]
-    await scene.store.settled()
-    watch = scene.watch()
-    watch.look(700.0)
-    assert scene.recorded == [
+async def test_a_disabled_monitor_is_an_alarm_once(tmp_path: Path) -> None:
+    core, off = Core(tmp_path), dict[str, Switch](a=False, b=SHADOW)
+    looks = watch(core, off)
+    looks.look(3000.0)
+    assert [row.forgotten for row in looks.rows()] == [False, False]
+    await core.store.settled()
+    looks = watch(core, off)
+    looks.look(700.0)
+    assert recorded(core) == [
         "protection forgotten: monitor a is disabled for more than 1.0 h: rosrv monitor enable a",
         "protection forgotten: monitor b is in shadow mode for more than 1.0 h: rosrv monitor enforce b",
     ]
-    await scene.store.settled()
-    watch = scene.watch()
-    watch.look(9000.0)
-    assert len(scene.recorded) == 2
-    assert [row.forgotten for row in watch.rows()] == [True, True]
-    scene.off = {}
-    watch.look(60.0)
-    scene.off = {"a": False}
-    watch.look(60.0)
-    assert [row.forgotten for row in watch.rows()] == [False]
+    await core.store.settled()
+    looks = watch(core, off)
+    looks.look(9000.0)
+    assert len(recorded(core)) == 2
+    assert [row.forgotten for row in looks.rows()] == [True, True]
+    off.clear()
+    looks.look(60.0)
+    off["a"] = False
+    looks.look(60.0)
+    assert [row.forgotten for row in looks.rows()] == [False]
+    core.store.close()
 
 
-def test_a_timed_change_is_not_forgotten(scene: Scene) -> None:
-    scene.off, scene.until = {"a": False}, {"a": 1e12}
-    watch = scene.watch()
-    watch.look(9000.0)
-    assert scene.recorded == []
-    scene.until = {"a": 1.0}
-    watch.look(9000.0)
-    assert len(scene.recorded) == 1
+def test_a_timed_change_is_not_forgotten(tmp_path: Path) -> None:
+    core, off, until = Core(tmp_path), dict[str, Switch](a=False), {"a": 1e12}
+    looks = watch(core, off, until=until.get)
+    looks.look(9000.0)
+    assert recorded(core) == []
+    until["a"] = 1.0
+    looks.look(9000.0)
+    assert len(recorded(core)) == 1
+    core.store.close()
 
 
-def test_an_audit_only_section_is_forgotten_like_a_monitor(scene: Scene) -> None:
-    scene.audit_only = {"publish", "subscribe"}
-    watch = scene.watch(None)
-    watch.look(1e9)
-    (row,) = [row for row in watch.rows() if row.name == "Publishers"] or watch.rows()[:1]
-    assert (row.about, row.forgotten, scene.recorded) == ("policy", False, [])
-    watch = scene.watch(3600.0)
-    watch.look(3600.0)
-    assert scene.recorded
+def test_an_audit_only_section_is_forgotten_like_a_monitor(tmp_path: Path) -> None:
+    core = Core(tmp_path)
+    looks = watch(core, {}, policy=AUDIT_ONLY, forgotten_after=None)
+    looks.look(1e9)
+    assert [(row.about, row.name, row.forgotten) for row in looks.rows()] == [
+        ("policy", "Publishers", False),
+        ("policy", "Subscribers", False),
+    ]
+    assert recorded(core) == []
+    watch(core, {}, policy=AUDIT_ONLY).look(3600.0)
+    assert len(recorded(core)) == 2
+    core.store.close()
