@@ -29,6 +29,11 @@ _EVENTS: dict[Switch, str] = {
 WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in shadow mode"}
 
 
+def off_in(now: InForce) -> dict[str, str]:
+    """Return the monitors that are disabled or in shadow mode, each with its state in words."""
+    return {name: WORDS[to] for name, to in now.states.items() if to is not True}
+
+
 class ChangeRecords:
     """The records of changes; times are seconds since the epoch."""
 
@@ -43,11 +48,10 @@ class ChangeRecords:
         who: str,
         *,
         began: Sequence[str],
-        off: Mapping[str, str],
         changed: tuple[list[str], list[str], list[str]],
         warnings: Sequence[str],
     ) -> None:
-        """Record a revision. `changed` are its added, changed and removed files, `off` the monitors not in force."""
+        """Record a revision. `changed` are its added, changed and removed files."""
         checked, (added, other, removed) = new.checked, changed
         self._trail.happened(
             "specifications loaded",
@@ -61,7 +65,7 @@ class ChangeRecords:
             diff=changed_lines(before.named(), new.sources.named()),
             compiled_sha256=fingerprint(checked.compiled),
             monitors=list(checked.monitors),
-            off=dict(off),
+            off=off_in(new),
             added=added,
             changed=other,
             removed=removed,

@@ -115,8 +115,16 @@ class Rollout:
         await self._make(now, self.allocation.of_file)
 
     def adopt(self, now: InForce) -> None:
-        """Let later statements be of this value, which differs only by what the relays got in messages of its own."""
+        """Let later statements be of this value; the relays have it, or get the difference in messages of its own."""
         self._now = now
+        self._forget()
+
+    async def take_back(self, earlier: InForce) -> None:
+        """Return all relays to the specifications that they had before `take`, and which they do not refuse."""
+        plan = self.allocation.plan(earlier.checked, self.relays.live_resources())
+        await self._make(earlier, _of(plan))
+        self._settle(earlier, plan)
+        await self.all_taken()
 
     async def leave(self, seconds: float) -> list[bytes]:
         """Make all relays drop all messages. Raises `ConnectionError`, `TimeoutError`."""
@@ -257,7 +265,6 @@ class Rollout:
         self._now = coming
         self.relays.withdraw(plan.moves)
         self.allocation.adopt(plan)
-        self._forget()
         for relay in range(self.allocation.relays):
             statement = self._statement(coming, relay, self.allocation.of_file, plan.moved_files)
             if relay in plan.losing:

@@ -21,6 +21,17 @@ _LONGEST = (
 )  # characters of all files and definitions: the compiler has a minute, and takes 14 s for each MiB
 
 
+class MonitorsChangedError(Exception):
+    """The monitors changed after a change was prepared; `tag` is the present one."""
+
+    def __init__(self, expected: str, tag: str) -> None:
+        super().__init__(
+            f"the monitors were loaded, switched or resumed in the meantime (they are at {tag}, not at {expected}):"
+            " list them first"
+        )
+        self.tag = tag
+
+
 class SpecificationsRefusedError(Exception):
     """Specifications are refused; `findings` has every reason, as `file:line:column: error: text`."""
 

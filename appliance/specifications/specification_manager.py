@@ -1,6 +1,7 @@
 """The specifications in force: load, switch, roll back, and answer operators.
 
-Here are the orders of operators. `specifications_in_force.py` brings what they ask for into force.
+Here are the orders of operators, and the messages of relays. `specifications_in_force.py` brings what operators order
+into force.
 
 1. The appliance never writes to the folder of specifications. Changes are revisions in the store; revisions and
    switches survive a restart.
@@ -12,33 +13,59 @@ Here are the orders of operators. `specifications_in_force.py` brings what they 
 """
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
+from pathlib import Path
+from typing import Literal
 
 import msgspec
 
 from appliance.base.actors import DISK, UNCONFIRMED
-from appliance.base.withdrawal import take_effect
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.specifications import in_force
-from appliance.specifications.givens import parsed, split
-from appliance.specifications.in_force import Wanted, unknown_monitors
-from appliance.specifications.judgement import Consent, broken, in_shadow
-from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
-from appliance.specifications.specification_revisions import NOTHING, kept_in, sources_of
-from appliance.specifications.specifications_in_force import ChangeOrder, SpecificationsInForce
-from appliance.specifications.switches import SHADOW, Switch
+from appliance.specifications.allocation import Allocation
+from appliance.specifications.change_records import off_in
+from appliance.specifications.givens import Givens, parsed, split
+from appliance.specifications.in_force import InForce, Wanted, unknown_monitors
+from appliance.specifications.judgement import Checks, Consent, Judge, broken, in_shadow
+from appliance.specifications.live_topics import Published
+from appliance.specifications.monitor_values import MonitorValues
+from appliance.specifications.records import MonitorRecords
+from appliance.specifications.rollout import Parts, Relays, Rollout
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    MonitorsChangedError,
+    Sources,
+    SpecificationFolder,
+    SpecificationsRefusedError,
+)
+from appliance.specifications.specification_revisions import (
+    NOTHING,
+    Check,
+    CheckBeside,
+    kept_in,
+    sources_of,
+)
+from appliance.specifications.specifications_in_force import (
+    ChangeOrder,
+    SourceCheck,
+    SpecificationsInForce,
+)
+from appliance.specifications.switches import SHADOW, Switch, Switches
 from appliance.specifications.timed_switches import LONGEST
+from appliance.store.ends import EndTable
 from appliance.store.revisions import reloaded_by
+from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 
 _NO_FOLDER = (
     "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
     " --monitors DIR (monitors: DIR in appliance.yaml), or load files: rosrv monitor load FILE"
 )
-_NO_FILES: tuple[list[str], list[str], list[str]] = ([], [], [])
+_STOPS = "monitor stops"
 _ALL = Consent(force=True, hold=True)
 """The consent of a rollback, which must never fail."""
 
@@ -51,31 +78,135 @@ class DryRunUnderWayError(Exception):
     """A client may have only one dry run at a time."""
 
 
-class MonitorsChangedError(Exception):
-    """The monitors changed after a change was prepared; `tag` is the present one."""
+class SpecificationManager:
+    """The orders of operators about specifications, and what the relays report about monitors.
 
-    def __init__(self, expected: str, tag: str) -> None:
-        super().__init__(
-            f"the monitors were loaded, switched or resumed in the meantime (they are at {tag}, not at {expected}):"
-            " list them first"
-        )
-        self.tag = tag
-
-
-class SpecificationManager(SpecificationsInForce):
-    """The orders of operators about specifications.
-
-    They are carried out one at a time; they raise `SpecificationsRefusedError` and `UnknownMonitorError`.
+    Orders are carried out one at a time. They raise `SpecificationsRefusedError`, `UnknownMonitorError`, and
+    `StoreError`, which has changed nothing.
     """
 
-    outdated = MonitorsChangedError
+    def __init__(
+        self,
+        folder: Path | None,
+        enable: str,
+        store: StateStore,
+        ends: EndTable,
+        trail: AuditTrail,
+        *,
+        on_fault: Literal["drop", "pass"],
+        slices: int,
+        allocation: Allocation,
+        relays: Relays,
+        published: Callable[[], None],
+        told: Collection[Callable[[messages.MonitorEvent], None]],
+        site_keys: Sequence[str],
+        check: CheckBeside,
+        check_at_start: Check,
+        try_out: CheckBeside,
+        parts: Parts,
+        live: Callable[[], Published],
+    ) -> None:
+        """`check` is for an order, `check_at_start` for a start, and `try_out` for a dry run.
 
-    @cached_property
-    def _attempting(self) -> set[str]:
-        """The clients with a dry run under way."""
-        return set()
+        `live()` returns the topics published now; `published()` is called when monitors may publish other topics. With
+        `site_keys`, everything in force is signed.
+        """
+        self._folder = SpecificationFolder(folder)
+        self.site_keys = site_keys
+        self.rollout = Rollout(allocation, trail, on_fault, relays, slices=slices, parts=parts)
+        self.judge = Judge(
+            Checks(check, check_at_start, try_out),
+            site_keys,
+            live,
+            held=lambda: self.rollout.held,
+            moved=self.rollout.moved_files,
+        )
+        self._present = SpecificationsInForce(
+            self._folder,
+            enable,
+            store,
+            ends,
+            trail,
+            rollout=self.rollout,
+            judge=self.judge,
+            site_keys=site_keys,
+            go_back=self._go_back,
+            come_back=self._come_back,
+        )
+        self.returns = self._present.returns
+        self._change_records = self._present.change_records
+        self.records = MonitorRecords(
+            trail,
+            lambda topic, data: self.checked.fields(topic, data),  # noqa: PLW0108 - of whatever is in force then
+            [*told],
+            lambda stops: store.save_setting(_STOPS, stops),
+        )
+        self.values = MonitorValues(self.rollout.tell, lambda: self.revision, trail)
+        self._store = store
+        self._published = published
+        self._ticking: asyncio.TimerHandle | None = None
+        self._attempting: set[str] = set()  # the clients with a dry run under way
+
+    async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
+        """As `SpecificationsInForce.start`."""
+        self.records.start(self._store.settings().get(_STOPS, "[]"))
+        await self._present.start(restarted=restarted, taken_over=taken_over)
 
     # --- queries ---
+
+    @property
+    def now(self) -> InForce:
+        return self._present.now
+
+    @property
+    def in_force(self) -> MonitorRevisionRow:
+        return self._present.in_force
+
+    @property
+    def confirm_by(self) -> float | None:
+        return self._present.confirm_by
+
+    @property
+    def differs_from_folder(self) -> bool:
+        return self._present.differs_from_folder
+
+    @property
+    def folder(self) -> Path | None:
+        return self._folder.path
+
+    @property
+    def revision(self) -> int:
+        return self.now.number
+
+    @property
+    def tag(self) -> str:
+        return self.now.tag
+
+    @property
+    def sources(self) -> Sources:
+        return self.now.sources
+
+    @property
+    def checked(self) -> CheckedSpecifications:
+        return self.now.checked
+
+    @property
+    def switches(self) -> Switches:
+        return self.now.switches
+
+    @property
+    def givens(self) -> Givens:
+        return self.now.givens
+
+    @property
+    def off(self) -> dict[str, str]:
+        return off_in(self.now)
+
+    def names(self) -> list[str]:
+        return list(self.checked.monitors)
+
+    def statement(self, relay: int) -> messages.SpecificationsStated:
+        return self.rollout.statement(relay)
 
     def file_of(self, name: str) -> str:
         """Return the file of `name`, which is a monitor or a file."""
@@ -86,17 +217,17 @@ class SpecificationManager(SpecificationsInForce):
         return self.checked.monitors[name]
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        rows = [self._described(row) for row in await self._kept()]
+        rows = [self._present.described(row) for row in await self._present.rows()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
-        row = await self._find(request.revision)
+        row = await self._present.find(request.revision)
         if row is None:
             raise UnknownMonitorError(
                 f"there is no revision {request.revision} of the specifications: rosrv monitor revisions lists all"
             )
         texts = msgspec.structs.asdict(sources_of(row))
-        return msgspec.convert(self._described(row) | texts, answers.RevisionTexts)
+        return msgspec.convert(self._present.described(row) | texts, answers.RevisionTexts)
 
     async def shown(self, request: admin.MonitorValuesWanted, who: str) -> answers.MonitorReadout:
         """Return the variables of a monitor. Raises `UnknownMonitorError`."""
@@ -111,15 +242,13 @@ class SpecificationManager(SpecificationsInForce):
         With `enable`, monitors are enabled even if the setting `enable` would disable them. With `confirm_within`, the
         change is rolled back after that many seconds unless confirmed.
         """
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             topics, constants = split(request.given)
             new = Sources(request.files, request.definitions, request.signatures, topics)
             sources = self.sources.with_files(new)
             asks = request.shadow or request.given or new.files.keys() & broken(self.now).keys()
             if self.in_force.who != DISK and sources == self.sources and not asks:
-                return self._replaced(
-                    self.revision, _NO_FILES, loaded=new.files
-                )  # same texts: no new revision
+                return self._present.replaced(self.revision, loaded=new.files)  # same texts: no new revision
             files = frozenset(new.files)
             shadow, enabled = files if request.shadow else (), files if enable else ()
             order = ChangeOrder(
@@ -173,7 +302,7 @@ class SpecificationManager(SpecificationsInForce):
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
         """Load the folder; files that are not in it stay in force, unless `prune` is set."""
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             if self._folder.path is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
@@ -192,10 +321,10 @@ class SpecificationManager(SpecificationsInForce):
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
         """Bring exactly these sources into force."""
-        async with self._changing(None):
+        async with self._present.changing(None):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
-                return self._replaced(self.revision, _NO_FILES)  # same texts: no new revision
+                return self._present.replaced(self.revision)  # same texts: no new revision
             order = ChangeOrder(who, note, consent=Consent(hold=True))
             return await self._change(Wanted(sources), self.judge.strictly, order)
 
@@ -208,7 +337,7 @@ class SpecificationManager(SpecificationsInForce):
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, or the files of monitors, if no other monitor is in them or uses their variables."""
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             names, owners = request.names, self.checked.monitors
             known = set(self.sources.files) | set(owners)
             unknown = [name for name in names if name not in known]
@@ -225,7 +354,7 @@ class SpecificationManager(SpecificationsInForce):
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
             keeper, within = who, request.confirm_within
-            if within is None and self._is_folder(sources):
+            if within is None and self._present.is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
             check = partial(self.judge.beside_broken, self.now, self.judge.checks.order)
             return await self._change(Wanted(sources), check, ChangeOrder(who, note, within, author=keeper))
@@ -235,8 +364,8 @@ class SpecificationManager(SpecificationsInForce):
 
         The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start.
         """
-        async with self._changing(request.expected):
-            row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
+        async with self._present.changing(request.expected):
+            row = NOTHING if request.revision == 0 else await self._present.wanted(request.revision)
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
             as_before = partial(self.judge.as_at_start, known=last.warnings)
             check = as_before if who == UNCONFIRMED else self.judge.strictly
@@ -244,21 +373,21 @@ class SpecificationManager(SpecificationsInForce):
             return await self._change(wanted, check, ChangeOrder(who, note, consent=_ALL))
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             promoted = self.returns.unconfirmed()
             waited = self.confirm_by is not None or bool(promoted)
             if waited:
-                self._end_limit()
+                self._present.end_limit()
                 self.returns.end(promoted)
                 self._change_records.confirmed(self.revision, promoted, who)
-                await self.store.settled()
+                await self._store.settled()
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
         """Switch monitors; return those that changed. A monitor is not enabled if it is in shadow mode, or shares
         variables with such a monitor.
         """
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             self._all_known(request.names)
             seconds = request.for_seconds
             if seconds is not None and (request.enabled or not 0 < seconds <= LONGEST):
@@ -273,7 +402,7 @@ class SpecificationManager(SpecificationsInForce):
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
         """Return the monitors that changed. With `confirm_within`, they return to shadow mode unless confirmed."""
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             self.judge_shadow(request)
             names = await self._switch(
                 request.names, SHADOW if request.shadow else True, who, request.confirm_within
@@ -313,13 +442,13 @@ class SpecificationManager(SpecificationsInForce):
             raise SpecificationsRefusedError([text])
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        async with self._one_change:
+        async with self._present.changing(None):
             for to in (True, SHADOW):
                 names = [name for name in self.switches.states if back.get(name) == to]
                 unconfirmed = [name for name in names if self.returns.confirm_by(name) is not None]
                 disabled = [name for name in names if name not in unconfirmed]
-                await self._switch(disabled, to, "its disabled period is over")
-                await self._switch(unconfirmed, to, UNCONFIRMED)
+                await self._switch(disabled, to, "its disabled period is over", due=True)
+                await self._switch(unconfirmed, to, UNCONFIRMED, due=True)
 
     def _switched(
         self,
@@ -331,7 +460,13 @@ class SpecificationManager(SpecificationsInForce):
         return Switched(names, self.revision, self.tag, [*began], until, confirm_by)
 
     async def _switch(
-        self, names: Sequence[str], to: Switch, who: str, seconds: float | None = None
+        self,
+        names: Sequence[str],
+        to: Switch,
+        who: str,
+        seconds: float | None = None,
+        *,
+        due: bool = False,
     ) -> list[str]:
         switches = self.switches
         changed = [
@@ -348,19 +483,17 @@ class SpecificationManager(SpecificationsInForce):
         back = {name: switches.states[name] or True for name in changed}
 
         def store() -> None:
-            # Killed between the two, control leaves a limit without its switch, never the reverse.
             if seconds is None:
-                self._store_words(new)
                 self.returns.end(changed)
             else:
                 self.returns.begin(back, seconds, to)
-                self._store_words(new)
 
         told = [(name, messages.MonitorSwitched(name, to is True)) for name in changed]
-        await self._bring(new, store, tell=None if shadow else told)
+        await self._present.bring(new, store, tell=None if shadow else told, due=due)
         for name in changed:
-            self._say_switched(name, to, who, earlier=switches.states[name])
-        await self.store.settled()
+            self._present.say_switched(name, to, who, earlier=switches.states[name])
+        if due:
+            await self._store.settled()
         await self.rollout.carried_out()
         return changed
 
@@ -369,17 +502,15 @@ class SpecificationManager(SpecificationsInForce):
 
         A relay that is not running is refused, because the next process will hold the topics again.
         """
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             self._all_known(request.names)
             rows = self.rollout.rows
             held = [
                 name for name in dict.fromkeys(request.names)
                 if name in self.rollout.held or (name in rows and rows[name].awaits)
             ]  # fmt: skip
-            take_effect()
             if held:
-                await self._count(self.now.acts + 1)
-                self.now = replace(self.now, acts=self.now.acts + 1)
+                await self._present.bring(replace(self.now, acts=self.now.acts + 1), tell=())
             away = []
             for name in held:
                 if not self.rollout.tell(name, messages.MonitorResumed(name)):
@@ -394,7 +525,7 @@ class SpecificationManager(SpecificationsInForce):
             return self._switched(held)
 
     async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
-        async with self._changing(request.expected):
+        async with self._present.changing(request.expected):
             name = request.name
             self._all_known([name])
             present = {one.name: one.value for one in self.givens.states(self.checked, name)}
@@ -403,21 +534,45 @@ class SpecificationManager(SpecificationsInForce):
             if changed:
                 coming = in_force.given(self.now, name, new)
                 values = coming.givens.in_force(coming.checked)[name]
-                await self._bring(
-                    coming,
-                    partial(self._store_words, coming),
-                    tell=[(name, messages.MonitorGiven(name, values))],
-                )
+                await self._present.bring(coming, tell=[(name, messages.MonitorGiven(name, values))])
                 self._change_records.given(
-                    name, self._given_states(name), {one: present[one] for one in changed}, who
+                    name, self._present.given_states(name), {one: present[one] for one in changed}, who
                 )
-                await self.store.settled()
                 await self.rollout.carried_out()
             given = self.givens.states(self.checked, name)
             return answers.GivenSet(name, changed, given, self.revision, self.tag)
 
+    async def _change(self, wanted: Wanted, check: SourceCheck, order: ChangeOrder) -> Replacement:
+        try:
+            return await self._present.change(wanted, check, order)
+        finally:
+            self._published()
+
     async def _go_back(self, revision: int) -> None:
         await self.roll_back(admin.MonitorRollback(revision), UNCONFIRMED)
+
+    # --- messages of relays ---
+
+    def received(self, message: messages.Message, relay: int = 0) -> None:
+        if isinstance(message, messages.MonitorsReported):
+            self.records.reported(message.events, message.lost)
+            if self._ticking is None:
+                self._tick()
+        elif isinstance(message, messages.ValuesSeen):
+            self.values.received(message)
+        else:
+            self.rollout.received(message, relay)
+
+    def relay_lost(self, relay: int) -> None:
+        self.rollout.lost(relay)
+        self.values.relay_lost()
+
+    def _tick(self) -> None:
+        self.records.tick()
+        going_on = self.records.some
+        self._ticking = asyncio.get_running_loop().call_later(1.0, self._tick) if going_on else None
+
+    # --- inside ---
 
     def _unknown(self, names: list[str]) -> str:
         return unknown_monitors(names, self.checked)

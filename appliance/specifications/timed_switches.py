@@ -73,7 +73,7 @@ class TimedSwitches:
 
     def begin(self, back: Mapping[str, Switch], seconds: float, of: Switch = False) -> None:
         """Begin limits. A monitor that already has a limit returns to the switch of that limit."""
-        self._kept |= {
+        self._kept = self._kept | {
             name: _Return(self._kept[name].back if name in self._kept else to, of)
             for name, to in back.items()
         }
@@ -90,6 +90,17 @@ class TimedSwitches:
 
     def keep(self, states: Mapping[str, Switch]) -> None:
         self.end([name for name, one in self._kept.items() if states.get(name) != one.of])
+
+    def undo(self) -> Callable[[], None]:
+        """Return a function that sets the limits as they are now."""
+        kept, restore_ends = self._kept, self._ends.undo(TIMED)
+
+        def restore() -> None:
+            self._kept = kept
+            restore_ends()
+            self._save()
+
+        return restore
 
     def _save(self) -> None:
         self._store.save_setting(_SETTING, msgspec.json.encode(self._kept).decode())

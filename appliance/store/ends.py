@@ -126,6 +126,17 @@ class EndTable:
             if left > _CUT_SHORT and self._left(end) <= 0:
                 self._cut_short(kind.name, name, left / _SECOND)
 
+    def undo(self, kind: EndKind) -> Callable[[], None]:
+        """Return a function that sets the ends of a kind as they are now."""
+        kept = dict(self._ends.get(kind.name, {}))
+
+        def restore() -> None:
+            self.forget(kind, *(name for name in self.names(kind) if name not in kept))
+            for name, end in kept.items():
+                self._put(kind.name, name, end)
+
+        return restore
+
     # --- reading ends ---
 
     def passed(self, kind: EndKind, name: str) -> bool:

@@ -91,7 +91,7 @@ class Revisions(ABC, Generic[R]):
 
     # --- start ---
 
-    def _find_last(self, *, restarted: bool) -> bool:
+    def find_last(self, *, restarted: bool) -> bool:
         """Return whether the last stored revision takes precedence over the files on disk.
 
         It does after a crash of control (`restarted`), or if an operator made it.
@@ -101,19 +101,19 @@ class Revisions(ABC, Generic[R]):
 
     # --- reading ---
 
-    async def _kept(self) -> list[R]:
+    async def rows(self) -> list[R]:
         return await asyncio.to_thread(self._rows)
 
-    def _described(self, row: R) -> dict[str, Any]:
+    def described(self, row: R) -> dict[str, Any]:
         return row._asdict() | {"in_force": row.revision == self.revision}
 
-    async def _find(self, revision: int) -> R | None:
-        return next((row for row in await self._kept() if row.revision == revision), None)
+    async def find(self, revision: int) -> R | None:
+        return next((row for row in await self.rows() if row.revision == revision), None)
 
-    async def _wanted(self, revision: int | None) -> R:
+    async def wanted(self, revision: int | None) -> R:
         """Return a stored revision; None is the revision before the present one. Raises `refusal` and `outdated`."""
         before = self.revision
-        known = {row.revision: row for row in await self._kept()}
+        known = {row.revision: row for row in await self.rows()}
         if self.revision != before:
             raise self.outdated(before, self.revision)
         previous = max((number for number in known if number < before), default=0)
@@ -127,7 +127,7 @@ class Revisions(ABC, Generic[R]):
     # --- changing ---
 
     @contextlib.asynccontextmanager
-    async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
+    async def changing(self, expected: int | str | None) -> AsyncIterator[None]:
         """Make no other change during the block. Raises `outdated` unless `expected` is None or the present tag."""
         async with self._one_change:
             require_awaited()
@@ -136,21 +136,28 @@ class Revisions(ABC, Generic[R]):
             yield
 
     def _put_in_force(self, row: R, within: float | None = None) -> None:
+        self.store_revision(row, within)
+        self.in_force = row
+
+    def store_revision(self, row: R, within: float | None = None) -> None:
+        """Store a revision, with the time limit to confirm it, in seconds, or without one."""
         if within is not None:  # set the limit first, because control may die during the change
             back_to = next(iter(self.ends.names(self.unconfirmed)), str(self.revision))
             with self.store.database.together():
-                self._end_limit()
+                self.end_limit()
                 self.ends.set(self.unconfirmed, back_to, within)
         self._save(row)
-        self.in_force = row
         if within is None:
-            self._end_limit()
+            self.end_limit()
 
-    def _end_limit(self) -> None:
+    def end_limit(self) -> None:
+        self._cancel_return()
+        self.ends.forget(self.unconfirmed, *self.ends.names(self.unconfirmed))
+
+    def _cancel_return(self) -> None:
         if self.going_back is not None and self.going_back is not asyncio.current_task():
             self.going_back.cancel()
         self.going_back = None
-        self.ends.forget(self.unconfirmed, *self.ends.names(self.unconfirmed))
 
     def _due(self, revisions: list[str]) -> None:
         if self.going_back is None or self.going_back.done():

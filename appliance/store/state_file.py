@@ -300,6 +300,9 @@ class StateStore:
     def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
         self.database.put("monitor_revision", *row)
 
+    def forget_monitor_revision(self, revision: int) -> None:
+        self.database.delete("monitor_revision", revision=revision)
+
     def monitor_revisions(self, limit: int = -1) -> list[MonitorRevisionRow]:
         rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT ?", (limit,))
         return [MonitorRevisionRow(*row) for row in rows]

@@ -245,6 +245,18 @@ class Database:
 
     async def settled(self) -> None:
         """Wait until the changes queued so far are on the disk. Raises `StoreError` if they cannot be written."""
+        if problem := await self.unwritten():
+            raise StoreError(
+                f"{problem}; free space: until then a restart undoes recent changes"
+                if problem == self._failing
+                else f"{problem}; a power failure may undo recent changes: check the disk"
+            )
+
+    async def unwritten(self) -> str:
+        """Wait until the changes queued so far are on the disk; return why they are not, or an empty text.
+
+        Raises `StoreError` after `close`.
+        """
         loop = asyncio.get_running_loop()
         done: asyncio.Future[str] = loop.create_future()
 
@@ -262,9 +274,8 @@ class Database:
         self._driver.hurry()
         while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
             if self._failing:
-                raise StoreError(f"{self._failing}; free space: until then a restart undoes recent changes")
-        if problem := done.result():
-            raise StoreError(f"{problem}; a power failure may undo recent changes: check the disk")
+                return self._failing
+        return done.result()
 
     def close(self, seconds: float | None = None) -> None:
         """Write the queue within `seconds` (None: no limit). Changes made after this call begins raise

@@ -129,11 +129,11 @@ class Policies(Revisions[RevisionRow]):
         operator's revision that was in force at its stop comes first, and then the file. If the file is refused, the
         last revision stays in force, with an alarm.
         """
-        kept_first = self._find_last(restarted=restarted)
+        kept_first = self.find_last(restarted=restarted)
         kept = kept_policy(self.in_force) if self.revision else None
         policy, signature, refused = policy_at_start(kept, self.file, self.known, kept_first=kept_first)
         if kept is None or (kept.text, kept.signature) != (policy.text, signature):
-            self._end_limit()
+            self.end_limit()
             self._keep(policy, signature, who=DISK, note="read at start")
             return
         self._enforce(policy)
@@ -143,8 +143,8 @@ class Policies(Revisions[RevisionRow]):
             self._note_refused("")
 
     @contextlib.asynccontextmanager
-    async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        async with super()._changing(expected):
+    async def changing(self, expected: int | str | None) -> AsyncIterator[None]:
+        async with super().changing(expected):
             yield
             await self.store.settled()
             await self._carried_out()
@@ -155,7 +155,7 @@ class Policies(Revisions[RevisionRow]):
         The revision is recorded as loaded from disk; its note names who ordered it.
         """
         within, note = request.confirm_within, reloaded_by(who)
-        async with self._changing(request.expected):
+        async with self.changing(request.expected):
             try:
                 policy, signature = await self._prepared(lambda: read_policy(self.file), str(self.file), who)
             except PolicyRefusedError as error:
@@ -176,7 +176,7 @@ class Policies(Revisions[RevisionRow]):
 
     async def load_with(self, request: admin.PolicyLoad, who: str, cases: PolicyCases | None) -> Loaded:
         given, within = (request.text, request.signature), request.confirm_within
-        async with self._changing(request.expected):
+        async with self.changing(request.expected):
             now = self.in_force
             if now.who != DISK and (now.text, now.signature) == given:
                 return self._loaded(self.revision, 0)
@@ -196,7 +196,7 @@ class Policies(Revisions[RevisionRow]):
         return self._enforce(self.current)
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
-        async with self._changing(request.expected):
+        async with self.changing(request.expected):
             return await self.rollback(request.revision, who=who)
 
     async def rollback(self, revision: int | None, *, who: str) -> Loaded:
@@ -204,20 +204,20 @@ class Policies(Revisions[RevisionRow]):
 
         Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
-        row = await self._wanted(revision)
+        row = await self.wanted(revision)
         policy = judged(row.text, row.signature, row.file, self.known)
         return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
-        async with self._changing(request.expected):
+        async with self.changing(request.expected):
             waited = self.confirm_by is not None
             if waited:
-                self._end_limit()
+                self.end_limit()
                 self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
             return answers.PolicyConfirmed(waited, self.revision)
 
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
-        rows = [self._described(row) for row in await self._kept()]
+        rows = [self.described(row) for row in await self.rows()]
         return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
@@ -226,7 +226,7 @@ class Policies(Revisions[RevisionRow]):
 
     async def one_revision(self, request: admin.PolicyRevisionWanted) -> answers.RevisionText:
         row = await self._kept_revision(request.revision)
-        return msgspec.convert(self._described(row), answers.RevisionText)
+        return msgspec.convert(self.described(row), answers.RevisionText)
 
     async def compiled(self, number: int) -> Policy | None:
         try:
@@ -236,14 +236,14 @@ class Policies(Revisions[RevisionRow]):
             return None
 
     async def _kept_revision(self, number: int) -> RevisionRow:
-        row = self.in_force if number == self.revision else await self._find(number)
+        row = self.in_force if number == self.revision else await self.find(number)
         if row is None:
             raise UnknownThingError(f"there is no revision {number}: rosrv policy revisions lists all")
         return row
 
     def _text(self, row: RevisionRow, known: PolicyContext) -> answers.PolicyKnown:
         return answers.PolicyKnown(
-            **self._described(row),
+            **self.described(row),
             policy_file=str(self.file),
             differs_from_file=self.differs_from_file,
             warnings=[str(warning) for warning in self.current.warnings],

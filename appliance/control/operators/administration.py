@@ -24,10 +24,9 @@ from appliance.hosts.host_table import (
     UnknownHostError,
 )
 from appliance.master.endpoints.topic_taps_control import TooManyTapsError
-from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.specification_files import MonitorsChangedError, SpecificationsRefusedError
 from appliance.specifications.specification_manager import (
     DryRunUnderWayError,
-    MonitorsChangedError,
     UnknownMonitorError,
 )
 from appliance.store.writer_thread import StoreError

@@ -41,8 +41,12 @@ from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
-from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
-from appliance.specifications.specification_manager import MonitorsChangedError, SpecificationManager
+from appliance.specifications.specification_files import (
+    MonitorsChangedError,
+    Sources,
+    SpecificationsRefusedError,
+)
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail

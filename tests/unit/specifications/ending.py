@@ -1,6 +1,6 @@
 from collections.abc import Mapping
 
-from appliance.specifications.specification_manager import SpecificationManager
+from appliance.specifications.specifications_in_force import SpecificationsInForce
 from appliance.specifications.switches import Switch
 from appliance.specifications.timed_switches import TIMED, TimedSwitches
 from appliance.store.ends import EndTable
@@ -20,5 +20,5 @@ def disabled_monitor(store: StateStore, ends: EndTable) -> Ending:
 
 ENDINGS: Endings = {
     TIMED: disabled_monitor,
-    SpecificationManager.unconfirmed: unconfirmed(SpecificationManager.unconfirmed),
+    SpecificationsInForce.unconfirmed: unconfirmed(SpecificationsInForce.unconfirmed),
 }

@@ -36,11 +36,11 @@ from appliance.specifications.live_topics import LiveType, Published
 from appliance.specifications.rollout import Parts
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
+    MonitorsChangedError,
     Sources,
     SpecificationsRefusedError,
 )
 from appliance.specifications.specification_manager import (
-    MonitorsChangedError,
     SpecificationManager,
     UnknownMonitorError,
 )

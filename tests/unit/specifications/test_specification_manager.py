@@ -12,12 +12,12 @@ from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import admin, messages
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
+    MonitorsChangedError,
     Sources,
     SpecificationsRefusedError,
 )
 from appliance.specifications.specification_manager import (
     DryRunUnderWayError,
-    MonitorsChangedError,
 )
 from appliance.specifications.specification_revisions import text_of
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
@@ -80,16 +80,16 @@ async def test_a_kill_between_two_writes_disables_no_monitor_forever(
         await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
         desk.kill()
         with monkeypatch.context() as context:
-            context.setattr(desk.store, "save_setting", first(writes, desk.store.save_setting))
+            context.setattr(desk.store.database, "_keep", first(writes, desk.store.database._keep))
             await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
         monitors = await desk.monitors(restarted=True)
         assert monitors.switches.enabled("a") or monitors.returns.until("a") is not None, writes
         desk.kill()
 
 
-def first(count: int, write: Callable[[str, str], None]) -> Callable[[str, str], None]:
+def first(count: int, write: Callable[[Any], None]) -> Callable[[Any], None]:
     left = iter(range(count))
-    return lambda name, value: write(name, value) if next(left, None) is not None else None
+    return lambda changes: write(changes) if next(left, None) is not None else None
 
 
 @pytest.mark.nightly

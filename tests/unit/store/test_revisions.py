@@ -32,10 +32,10 @@ class Keeper(Revisions[MonitorRevisionRow]):
         self._put_in_force(to, within)
 
     def started(self, *, restarted: bool) -> bool:
-        return self._find_last(restarted=restarted)
+        return self.find_last(restarted=restarted)
 
     async def wanted(self, revision: int | None) -> MonitorRevisionRow:
-        return await self._wanted(revision)
+        return await self.wanted(revision)
 
     def limit(self) -> dict[str, float | None]:
         return {name: self.ends.left(self.unconfirmed, name) for name in self.ends.names(self.unconfirmed)}

@@ -24,7 +24,7 @@ from appliance.channel.rest_operation import Operation
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.errors import SenselessError, TokenRefusedError, UnknownThingError
 from appliance.hosts.host_table import HostForbiddenError
-from appliance.specifications.specification_manager import MonitorsChangedError
+from appliance.specifications.specification_files import MonitorsChangedError
 from appliance.store.writer_thread import StoreError
 from tests.support.rest_world import ROLES, RestWorld, idle_application
 from tests.support.rows import require_rows
