@@ -5,15 +5,16 @@ from pathlib import Path
 
 import pytest
 from rosrv_fleet import retention
+from rosrv_fleet.collector import Collector
 from rosrv_fleet.config import RetentionConfig
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.retention import Pruner
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
 from appliance.base.clock import using, utc_now, wall
+from tests.support.collectors import collector_in, upload
 from tests.support.enrolled_robots import enrolled_robots
 from tests.support.virtual_clock import VirtualClock, let_time_pass, set_wall
-from tests.unit.fleet.test_segment_store import Robot
 
 _DAY = 86_400
 _DAMAGED = "0" * 32, "1" * 32
@@ -49,25 +50,23 @@ def test_damaged_logs_do_not_stop_the_retention(
     assert len(dropped) == 1
 
 
-class _Collector:
-    """A collector that keeps segments for 30 days, as after its start."""
+def _started(folder: Path) -> Collector:
+    """Return a collector that keeps segments for 30 days, as after its start."""
+    if not (folder / "robots").exists():
+        enrolled_robots(folder, "arm7")
+    return collector_in(folder, retention=RetentionConfig(index_days=30, segment_days=30))
 
-    def __init__(self, folder: Path) -> None:
-        self.robot = Robot(folder)
-        robots = enrolled_robots(folder) if (folder / "robots").exists() else enrolled_robots(folder, "arm7")
-        database = IndexDatabase("", connections=1, statement_seconds=1.0)
-        retention = RetentionConfig(index_days=30, segment_days=30)
-        self._pruner = Pruner(self.robot.store, robots, database, retention)
 
-    def push(self, number: int) -> None:
-        self.robot.store.indexed(self.robot.push(number))
+def _push(collector: Collector, number: int) -> None:
+    collector.store.indexed(upload(collector.store, number))
 
-    def kept(self) -> list[int]:
-        """Return the numbers of the segments after a turn of the retention."""
-        self._pruner.step()
-        assert self._pruner.trouble is None
-        (log,) = self.robot.store.logs("arm7")
-        return [place.number for place in self.robot.store.segments("arm7", log)]
+
+def _kept(collector: Collector) -> list[int]:
+    """Return the numbers of the segments after a turn of the retention."""
+    collector.pruner.step()
+    assert collector.pruner.trouble is None
+    (log,) = collector.store.logs("arm7")
+    return [place.number for place in collector.store.segments("arm7", log)]
 
 
 @pytest.fixture
@@ -85,61 +84,61 @@ def oldest_days(monkeypatch: pytest.MonkeyPatch) -> list[date]:
 @pytest.mark.parametrize("years", [3, -3], ids=["ahead", "behind"])
 def test_a_wrong_clock_removes_nothing(years: int, tmp_path: Path, oldest_days: list[date]) -> None:
     """Segments that arrive in that time are removed neither earlier nor later than those after them."""
-    collector, before = _Collector(tmp_path), utc_now().date()
-    collector.push(1)
+    collector, before = _started(tmp_path), utc_now().date()
+    _push(collector, 1)
     let_time_pass(_DAY)
-    collector.push(2)
-    assert collector.kept() == [1, 2]
+    _push(collector, 2)
+    assert _kept(collector) == [1, 2]
     set_wall(wall() + years * 365 * _DAY)
-    collector = _Collector(tmp_path)
-    collector.push(3)
-    collector.push(4)
-    assert collector.kept() == [1, 2, 3, 4]
+    collector = _started(tmp_path)
+    _push(collector, 3)
+    _push(collector, 4)
+    assert _kept(collector) == [1, 2, 3, 4]
     let_time_pass(_DAY / 2)
     set_wall(wall() - years * 365 * _DAY)
-    collector.push(5)
-    collector.push(6)
-    assert collector.kept() == [1, 2, 3, 4, 5, 6]
+    _push(collector, 5)
+    _push(collector, 6)
+    assert _kept(collector) == [1, 2, 3, 4, 5, 6]
     assert {(before - day).days for day in oldest_days} <= {28, 29, 30}
     let_time_pass(28 * _DAY)
-    assert collector.kept() == [1, 2, 3, 4, 5, 6]
+    assert _kept(collector) == [1, 2, 3, 4, 5, 6]
     let_time_pass(_DAY)
-    assert collector.kept() == [2, 3, 4, 5, 6]
+    assert _kept(collector) == [2, 3, 4, 5, 6]
     let_time_pass(2 * _DAY)
-    assert collector.kept() == [6]
+    assert _kept(collector) == [6]
 
 
 def test_segments_that_arrive_after_a_long_time_off_stay_as_long_as_others(
     tmp_path: Path, oldest_days: list[date]
 ) -> None:
     """The time off counts after a day of running, but only for older segments."""
-    collector = _Collector(tmp_path)
-    collector.push(1)
-    collector.push(2)
-    assert collector.kept() == [1, 2]
+    collector = _started(tmp_path)
+    _push(collector, 1)
+    _push(collector, 2)
+    assert _kept(collector) == [1, 2]
     let_time_pass(60 * _DAY)
     clock = VirtualClock(wall=wall())  # of the machine after its boot
     with using(clock):
-        collector = _Collector(tmp_path)
-        collector.push(3)
-        collector.push(4)
-        assert collector.kept() == [1, 2, 3, 4]
+        collector = _started(tmp_path)
+        _push(collector, 3)
+        _push(collector, 4)
+        assert _kept(collector) == [1, 2, 3, 4]
         clock.advance(1.1 * _DAY)
-        assert collector.kept() == [3, 4]
+        assert _kept(collector) == [3, 4]
         clock.advance(28 * _DAY)
-        assert collector.kept() == [3, 4]
+        assert _kept(collector) == [3, 4]
         clock.advance(2 * _DAY)
-        assert collector.kept() == [4]
+        assert _kept(collector) == [4]
     assert len(oldest_days) == 5
 
 
 def test_a_wrong_clock_at_the_first_start_of_this_version_removes_nothing(
     tmp_path: Path, oldest_days: list[date]
 ) -> None:
-    collector = _Collector(tmp_path)
-    collector.push(1)
-    collector.push(2)
+    collector = _started(tmp_path)
+    _push(collector, 1)
+    _push(collector, 2)
     (tmp_path / "age").unlink()
     set_wall(wall() + 3 * 365 * _DAY)
-    assert _Collector(tmp_path).kept() == [1, 2]
+    assert _kept(_started(tmp_path)) == [1, 2]
     assert len(oldest_days) == 1

@@ -1,10 +1,10 @@
 import asyncio
 import errno
+import itertools
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import psycopg
 import pytest
@@ -23,28 +23,22 @@ from rosrv_fleet.rollouts.store import RolloutStore
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
+from tests.support.collectors import InlineWorkers
 from tests.support.enrolled_robots import enrolled_robots
 
 _DEFECT = "a defect of rosrv-fleet, please report it: RuntimeError: unforeseen"
 
 
-class _Defect:
-    def __init__(self, second: Callable[[], object]) -> None:
-        self._second = second
-        self.calls = 0
+def _defect(second: Callable[[], object] = bool) -> Callable[..., NoReturn]:
+    """Return a function that fails at each call; at its second call, it calls `second` first."""
+    calls = itertools.count(1)
 
-    def __call__(self, *_arguments: object, **_named: object) -> NoReturn:
-        self.calls += 1
-        if self.calls == 2:
-            self._second()
+    def defect(*_arguments: object, **_named: object) -> NoReturn:
+        if next(calls) == 2:
+            second()
         raise RuntimeError("unforeseen")
 
-
-class _WithoutMemory(Workers):
-    def submit(self, *_work: Any, **_named: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_exception(MemoryError())
-        return future
+    return defect
 
 
 def test_the_indexer_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,7 +55,7 @@ def test_the_indexer_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         work.stop()
 
     monkeypatch.setattr(indexer, "_PAUSE_SECONDS", 0.0)
-    monkeypatch.setattr(psycopg, "connect", _Defect(stop))
+    monkeypatch.setattr(psycopg, "connect", _defect(stop))
     work.run("pending")
     assert troubles == [_DEFECT]
 
@@ -74,7 +68,7 @@ def test_a_segment_that_causes_a_defect_is_set_aside(tmp_path: Path) -> None:
     work = Indexer(
         store,
         enrolled_robots(tmp_path, "arm1"),
-        _WithoutMemory(1),
+        InlineWorkers(error=MemoryError()),
         FleetConfig(certificate=tmp_path, key=tmp_path),
     )
     assert [work.step(lane) for lane in LANES] == [True, False]
@@ -88,11 +82,10 @@ def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     work = Pruner(
         SegmentStore(tmp_path, 0), enrolled_robots(tmp_path, "arm1"), database, RetentionConfig(index_days=1)
     )
-    drop = _Defect(work.stop)
     monkeypatch.setattr(retention, "_AGAIN_SECONDS", 0.0)
-    monkeypatch.setattr(retention, "drop_partitions", drop)
+    monkeypatch.setattr(retention, "drop_partitions", _defect(work.stop))
     work.run()
-    assert (drop.calls, work.trouble) == (2, f"retention: {_DEFECT}")
+    assert work.trouble == f"retention: {_DEFECT}"
 
 
 @pytest.mark.nightly
@@ -103,7 +96,7 @@ def test_rollouts_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
     async def run() -> None:
         loop, again = asyncio.get_running_loop(), asyncio.Event()
-        defect = _Defect(lambda: loop.call_soon_threadsafe(again.set))
+        defect = _defect(lambda: loop.call_soon_threadsafe(again.set))
 
         def members() -> Mapping[str, RobotGroup]:
             return defect()
@@ -124,7 +117,7 @@ def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
         configure_log()
         secret = "".join(chr(code) for code in range(ord("a"), ord("m")))
         with pytest.raises(RuntimeError) as caught:
-            _Defect(lambda: None)(secret)
+            _defect()(secret)
         failure_of(caught.value)
     finally:
         structlog.configure(**earlier)

@@ -1,8 +1,5 @@
 import errno
-from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, NoReturn
 
 import pytest
 from rosrv_fleet.config import FleetConfig
@@ -11,26 +8,14 @@ from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
+from tests.support.collectors import InlineWorkers
 from tests.support.enrolled_robots import enrolled_robots
 
 _PLACE = SegmentPlace("arm1", "0" * 32, 1, "a" * 64)
 
 
-class _NoProcesses(Workers):
-    def submit(self, *_work: Any, **_named: Any) -> NoReturn:
-        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
-
-
-class _Damage(Workers):
-    def __init__(self, before: Callable[[], object]) -> None:
-        super().__init__(1)
-        self._before = before
-
-    def submit(self, *_work: Any, **_named: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self._before()
-        future.set_exception(EOFError("the file ends too early"))
-        return future
+def _no_processes() -> None:
+    raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
 
 
 @pytest.fixture
@@ -43,7 +28,7 @@ def store(tmp_path: Path) -> SegmentStore:
 
 def _indexer(store: SegmentStore, data: Path, workers: Workers | None = None) -> Indexer:
     config = FleetConfig(certificate=data, key=data)
-    return Indexer(store, Robots(data / "robots"), workers or _NoProcesses(1), config)
+    return Indexer(store, Robots(data / "robots"), workers or InlineWorkers(before=_no_processes), config)
 
 
 def test_segments_wait_while_no_worker_can_be_started(store: SegmentStore, tmp_path: Path) -> None:
@@ -75,7 +60,10 @@ def test_a_segment_that_was_replaced_is_indexed_again(store: SegmentStore, tmp_p
     file.write_bytes(b"damaged")
     whole = tmp_path / "whole"
     whole.write_bytes(b"whole")
-    indexer = _indexer(store, tmp_path, _Damage(lambda: whole.exists() and whole.rename(file)))
+    workers = InlineWorkers(
+        before=lambda: whole.exists() and whole.rename(file), error=EOFError("the file ends too early")
+    )
+    indexer = _indexer(store, tmp_path, workers)
     assert indexer.step("pending")
     assert store.marked("pending", "arm1", 9) == [_PLACE]
     assert store.marked("damaged", "arm1", 9) == []

@@ -10,22 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet import robots as robots_module
 from rosrv_fleet.cli import app, token_app
-from rosrv_fleet.collector import Collector
 from rosrv_fleet.enrolment import EnrolmentError, RobotGroup, require_own_signature
-from rosrv_fleet.health import FleetHealth, health_of
+from rosrv_fleet.health import health_of
+from rosrv_fleet.indexer import Indexer
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
-from rosrv_fleet.presence import RobotPresence
 from rosrv_fleet.robot_commands import robot_app
 from rosrv_fleet.robots import Robots
-from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner
 
@@ -34,6 +30,7 @@ from appliance.base.atomic_files import write_whole
 from appliance.base.clock import now, using
 from appliance.signing.own_certificate import make_own_certificate
 from tests.support.certificates import make_certificates, own_certificate_until
+from tests.support.collectors import collector_in
 from tests.support.enrolled_robots import enrolled_robots
 from tests.support.sources import ROOT
 from tests.support.unreadable_folders import make_unreadable
@@ -384,11 +381,14 @@ def test_a_certificate_without_a_time_is_refused(until: bytes, tmp_path: Path) -
     require_own_signature(own_certificate_until(b"\x18\x0f99991231235959Z"))
 
 
-def test_a_stored_certificate_without_a_time_hides_no_robot(tmp_path: Path) -> None:
+def test_a_stored_certificate_without_a_time_hides_no_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Indexer, "trouble", None)  # no database runs
     before = enrolled_robots(tmp_path, "arm1", "arm2").all()
     bad = msgspec.structs.replace(before["arm1"], certificate=own_certificate_until(_NO_TIMES[0]).decode())
     write_whole(tmp_path / "robots" / "arm1.json", msgspec.json.encode(bad), 0o600)
-    found = _health(tmp_path)
+    found = health_of(collector_in(tmp_path))
     assert [robot.name for robot in found.robots] == ["arm2"]
     assert found.trouble is not None
     assert "arm1.json" in found.trouble
@@ -403,15 +403,6 @@ def test_whatever_certificate_is_accepted_can_be_shown(tmp_path: Path) -> None:
         with suppress(EnrolmentError):
             robots.join("arm1", key, ssl.DER_cert_to_PEM_cert(changed).encode(), "")
             accepted += 1
-    (robot,) = _health(tmp_path).robots
+    (robot,) = health_of(collector_in(tmp_path)).robots
     assert robot.name == "arm1"
     assert 0 < accepted < len(whole)
-
-
-def _health(data: Path) -> FleetHealth:
-    up = SimpleNamespace(trouble=None)
-    parts = SimpleNamespace(
-        store=SegmentStore(data, 0), robots=Robots(data / "robots"), presence=RobotPresence(data / "heard"),
-        indexer=up, pruner=up, config=SimpleNamespace(silent_seconds=60.0),
-    )  # fmt: skip
-    return health_of(cast(Collector, parts))

@@ -10,7 +10,6 @@ import random
 import sqlite3
 import ssl
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -36,7 +35,6 @@ from rosrv_fleet.indexer import LANES
 from rosrv_fleet.push_routes import push_router
 from rosrv_fleet.receipt_key import make_receipt_key
 from rosrv_fleet.robots import Robots
-from rosrv_fleet.workers import Workers
 
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.retention import Retention
@@ -49,22 +47,13 @@ from appliance.signing.own_certificate import make_own_certificate
 from tests.support.alert_rules import Alert, FleetAlerts
 from tests.support.audit import decision, settle
 from tests.support.autojump import run
+from tests.support.collectors import InlineWorkers
 from tests.support.engines import ByHand
 from tests.support.virtual_clock import ShiftedClock, VirtualClock
 from tests.unit.audit.conftest import Notary
 
 _BUSY_SECONDS = 600.0  # after a record; later turns of a log without retention would do nothing
 _DEADLINE = 60.0  # of an exchange without an answer
-
-
-class _InlineWorkers(Workers):
-    def submit(self, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(work(*arguments, **named))
-        except Exception as error:  # noqa: BLE001  the caller gets it, as from a worker
-            future.set_exception(error)
-        return future
 
 
 class _Cable(CollectorConnection):
@@ -279,7 +268,7 @@ class FleetNight:
         )  # fmt: skip
         self.collector: RunningCollector | None = None
         for module, name, double in (
-            (collector_module, "Workers", _InlineWorkers), (segment_check, "processor_time", nullcontext),
+            (collector_module, "Workers", InlineWorkers), (segment_check, "processor_time", nullcontext),
             (psycopg, "connect", self._connect), (indexer, "migrate", lambda _connection: []),
             (indexer, "_index_one", self._index), (retention, "drop_partitions", self._drop),
         ):  # fmt: skip
