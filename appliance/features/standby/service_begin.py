@@ -1,14 +1,17 @@
 """Begin the service in control: answer operators, and on one of two appliances report that it serves."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
 import structlog
 
+from appliance.audit.log.log import AuditLog
 from appliance.base import clock
+from appliance.channel.messages import StateOwner
 from appliance.channel.status_summary import no_relay
+from appliance.configuration.settings import Settings
 from appliance.control.core import ControlPart
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.start_gate import StartingControl
@@ -20,38 +23,48 @@ from appliance.features.standby.orders import ActiveAppliance, SingleAppliance, 
 from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.takeover_record import TakeoverRecorder
+from appliance.specifications.switches import Switches
 
 _REPAIR_SECONDS = 8.0
 
 
 class ServiceReport:
-    """The service reports of one control process."""
+    """The service reports of one control process, whose monitors in force have a state if `keeps_state`."""
 
-    def __init__(self, control: StartingControl) -> None:
-        self._control = control
+    def __init__(
+        self,
+        settings: Settings,
+        audit: AuditLog,
+        keeps_state: Callable[[], bool],
+        *,
+        relays: Callable[[], str],
+        probe: Callable[[], str],
+    ) -> None:
+        self._settings, self._audit, self._keeps_state = settings, audit, keeps_state
+        self._relays, self._probe = relays, probe
         self._sound = clock.now()  # when nothing was to be repaired
 
     def now(self) -> lease_link.ControlServes:
-        control = self._control
-        failed, monitors, settings = control.audit.failed, control.monitors, control.settings
+        failed, settings = self._audit.failed, self._settings
         # With less, hosts wait before the log fails: records still fit into SQLite's write-ahead file.
         obstacle = lacking_room(settings.state / "control")
         if failed is not None and settings.audit.on_audit_failure == "deny":
             obstacle = f"nothing is granted, because the audit log cannot be written: {failed}"
-        keeps_state = any(
-            owner.held and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()
-        )
-        return lease_link.ControlServes(obstacle or self._lasting(), keeps_state)
+        return lease_link.ControlServes(obstacle or self._lasting(), self._keeps_state())
 
     def _lasting(self) -> str:
-        probe = self._control.probe()
-        broken = no_relay(self._control.relays())
+        probe, broken = self._probe(), no_relay(self._relays())
         if probe not in ("", "passed"):
             broken = f"the ROS master is not hidden: {probe}"
         now = clock.now()
         if broken is None:
             self._sound = now
         return broken if broken is not None and now - self._sound > _REPAIR_SECONDS else ""
+
+
+def holds_if_lost(states: Mapping[str, StateOwner], switches: Switches) -> bool:
+    """Return whether a monitor in force would hold topics without its state."""
+    return any(owner.held and switches.enabled(name) for name, owner in states.items())
 
 
 _SEAL_SECONDS = 0.5  # the robot waits
@@ -88,7 +101,15 @@ async def begin(control: StartingControl) -> ControlPart:
 
     async def report_service() -> None:
         await control.ready.wait()
-        await pair.lease.report_service(ServiceReport(control).now)
+        monitors = control.monitors
+        report = ServiceReport(
+            control.settings,
+            control.audit,
+            lambda: holds_if_lost(monitors.checked.states, monitors.switches),
+            relays=control.relays,
+            probe=control.probe,
+        )
+        await pair.lease.report_service(report.now)
 
     active = ActiveAppliance(replication, rehearsing, leaving, partial(keep_state, store, rollout))
     orders = StandbyOrders(active, control.trail)

@@ -1,84 +1,76 @@
+import os
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from appliance.base import clock
+from appliance.channel.messages import StateOwner
+from appliance.configuration.settings import Audit, Settings
 from appliance.features.standby.lease_link import ControlServes
-from appliance.features.standby.service_begin import ServiceReport
+from appliance.features.standby.service_begin import ServiceReport, holds_if_lost
+from appliance.specifications.switches import Switches
+from tests.support.core import FakeTrail, MemoryLog
 from tests.support.virtual_clock import VirtualClock
 
 
-class Control:
-    def __init__(self, state: Path) -> None:
-        (state / "control").mkdir()
-        self.state = state
-        self.audit = SimpleNamespace(failed=None)
-        self.policy = SimpleNamespace(on_audit_failure="deny")
-        self.surroundings = SimpleNamespace(probe="passed")
-        self.relay = SimpleNamespace(presence="connected")
-        self.switches = SimpleNamespace(enabled=lambda name: name == "gun")
-        self.checked = SimpleNamespace(states={"gun": SimpleNamespace(held=False)})
-
-    def report(self) -> ServiceReport:
-        control: Any = SimpleNamespace(
-            audit=self.audit,
-            settings=SimpleNamespace(audit=self.policy, state=self.state),
-            monitors=SimpleNamespace(switches=self.switches, checked=self.checked),
-            relays=lambda: self.relay.presence,
-            probe=lambda: self.surroundings.probe,
-        )
-        return ServiceReport(control)
-
-
 @pytest.fixture
-def control(tmp_path: Path) -> Control:
-    return Control(tmp_path)
+def settings(tmp_path: Path) -> Settings:
+    (tmp_path / "control").mkdir()
+    return Settings(state=tmp_path)
 
 
-def test_a_full_disk_is_an_obstacle(control: Control, monkeypatch: pytest.MonkeyPatch) -> None:
+def report_of(
+    settings: Settings,
+    log: MemoryLog | None = None,
+    *,
+    keeps_state: bool = False,
+    relays: Callable[[], str] = lambda: "connected",
+    probe: Callable[[], str] = lambda: "passed",
+) -> ServiceReport:
+    return ServiceReport(settings, log or FakeTrail().log, lambda: keeps_state, relays=relays, probe=probe)
+
+
+def test_a_full_disk_is_an_obstacle(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hosts are already waiting, and a standby with such a disk could not take over."""
-    report = control.report()
-    monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=1023, f_frsize=4096))
-    assert "4190208 bytes are free" in report.now().obstacle
-    monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=1024, f_frsize=4096))
-    assert report.now().obstacle == ""
+    for free, obstacle in ((1023, "4190208 bytes are free"), (1024, "")):
+        disk = os.statvfs_result((4096, 4096, 0, 0, free, 0, 0, 0, 0, 255))
+        monkeypatch.setattr("os.statvfs", lambda _folder, disk=disk: disk)
+        found = report_of(settings).now().obstacle
+        assert (obstacle in found, bool(found)) == (True, bool(obstacle))
 
 
-def test_a_log_that_fails_is_an_obstacle_only_if_nothing_is_granted_then(control: Control) -> None:
+def test_a_log_that_fails_is_an_obstacle_only_if_nothing_is_granted_then(settings: Settings) -> None:
     """With `audit.on_audit_failure: allow`, control continues without records."""
-    report = control.report()
-    assert report.now() == ControlServes("", keeps_state=False)
-    control.audit.failed = "audit.db: the disk is full"
-    assert "cannot be written: audit.db: the disk is full" in report.now().obstacle
-    control.policy.on_audit_failure = "allow"
-    assert report.now().obstacle == ""
+    log = FakeTrail().log
+    assert report_of(settings, log).now() == ControlServes("", keeps_state=False)
+    log.failure = "audit.db: the disk is full"
+    assert "cannot be written: audit.db: the disk is full" in report_of(settings, log).now().obstacle
+    allowing = Settings(state=settings.state, audit=Audit(on_audit_failure="allow"))
+    assert report_of(allowing, log).now().obstacle == ""
 
 
-@pytest.mark.parametrize("broken", [("relay", "presence", "away"), ("surroundings", "probe", "it answers")])
-def test_damage_that_is_repaired_in_time_is_not_reported(
-    broken: tuple[str, str, str], control: Control
-) -> None:
-    part, field, value = broken
+@pytest.mark.parametrize("broken", [{"relays": "away"}, {"probe": "it answers"}], ids=str)
+def test_damage_that_is_repaired_in_time_is_not_reported(broken: dict[str, str], settings: Settings) -> None:
+    present = sound = {"relays": "connected", "probe": "passed"}
     machine = VirtualClock()
     with clock.using(machine):
-        report = control.report()
-        before = getattr(getattr(control, part), field)
-        for seconds, state, found in (
-            (7, value, False),
-            (7, before, False),
-            (7, value, False),
-            (9, value, True),
+        report = report_of(settings, relays=lambda: present["relays"], probe=lambda: present["probe"])
+        for seconds, state, is_reported in (
+            (7, broken, False),
+            (7, {}, False),
+            (7, broken, False),
+            (9, broken, True),
         ):
-            setattr(getattr(control, part), field, state)
+            present = sound | state
             machine.advance(seconds)
-            assert bool(report.now().obstacle) is found
+            assert bool(report.now().obstacle) is is_reported
 
 
-def test_only_monitors_in_force_keep_state(control: Control) -> None:
+def test_only_monitors_in_force_keep_state(settings: Settings) -> None:
     """A monitor that is disabled or in shadow mode holds nothing after a takeover."""
-    control.checked.states = {"gun": SimpleNamespace(held=True), "arm": SimpleNamespace(held=False)}
-    assert control.report().now().keeps_state
-    control.checked.states = {"gun": SimpleNamespace(held=False), "arm": SimpleNamespace(held=True)}
-    assert not control.report().now().keeps_state
+    holds, stateless = StateOwner("1", frozenset({"/cmd_vel"}), ""), StateOwner("2", frozenset(), "")
+    switches = Switches(states={"gun": True, "arm": False, "leg": "shadow"})
+    assert holds_if_lost({"gun": holds, "arm": stateless}, switches)
+    assert not holds_if_lost({"gun": stateless, "arm": holds, "leg": holds}, switches)
+    assert report_of(settings, keeps_state=True).now().keeps_state
