@@ -1,9 +1,7 @@
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
 
 from appliance.features.fleet.bundle_gate import disabled_among
+from appliance.specifications.specification_files import CheckedSpecifications
 from appliance.specifications.switches import Switches
 
 
@@ -17,5 +15,5 @@ from appliance.specifications.switches import Switches
     ],
 )
 def test_the_record_of_a_bundle_names_the_monitors_that_do_nothing(enable: str, end: str) -> None:
-    checked: Any = SimpleNamespace(monitors={"fence": "fence.rv", "zone": "zone.rv"}, sharing=[])
+    checked = CheckedSpecifications(monitors={"fence": "fence.rv", "zone": "zone.rv"})
     assert disabled_among(Switches(enable).of(checked).states) == end
