@@ -23,7 +23,6 @@ from appliance.features.standby.orders import ActiveAppliance, SingleAppliance, 
 from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.takeover_record import TakeoverRecorder
-from appliance.specifications.switches import Switches
 
 _REPAIR_SECONDS = 8.0
 
@@ -62,9 +61,9 @@ class ServiceReport:
         return broken if broken is not None and now - self._sound > _REPAIR_SECONDS else ""
 
 
-def holds_if_lost(states: Mapping[str, StateOwner], switches: Switches) -> bool:
+def holds_if_lost(states: Mapping[str, StateOwner], enabled: Callable[[str], bool]) -> bool:
     """Return whether a monitor in force would hold topics without its state."""
-    return any(owner.held and switches.enabled(name) for name, owner in states.items())
+    return any(owner.held and enabled(name) for name, owner in states.items())
 
 
 _SEAL_SECONDS = 0.5  # the robot waits
@@ -105,7 +104,7 @@ async def begin(control: StartingControl) -> ControlPart:
         report = ServiceReport(
             control.settings,
             control.audit,
-            lambda: holds_if_lost(monitors.checked.states, monitors.switches),
+            lambda: holds_if_lost(monitors.checked.states, monitors.switches.enabled),
             relays=control.relays,
             probe=control.probe,
         )
