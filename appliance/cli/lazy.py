@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import typer
-from typer.core import TyperCommand, TyperGroup, TyperOption
+from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
@@ -165,6 +165,8 @@ def loaded(verb: Verb, name: str) -> "Command":
     for option in _without_type_of_flags(command.get_params(context)):
         if isinstance(option, TyperOption) and option.metavar is None:
             option.metavar = _metavar(option, option.display_type(context) or "")
+        elif isinstance(option, TyperArgument) and option.metavar is None and option.name:
+            option.metavar = option.name.upper()
     return command
 
 

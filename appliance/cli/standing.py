@@ -76,8 +76,8 @@ def longest_wait(end: str) -> object:
         "--within",
         parser=_seconds,
         metavar="DURATION",
-        show_default="2m",
-        help=f"The longest wait {end}, 1s to 1h",
+        show_default=False,
+        help=f"The longest wait {end}, 1s to 1h (default: 2m)",
     )
 
 

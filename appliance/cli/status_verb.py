@@ -58,7 +58,7 @@ def status(
 
     On a standby, show both appliances, as `rosrv standby status` does.
 
-    Exit status: 0 in service, 1 needs attention, 2 not running; with --watch that of the last status.
+    Exit status: 0 in service, 1 needs attention, 2 not running; with --watch, the last status's.
 
     Example: rosrv status --watch --every 5s
     """

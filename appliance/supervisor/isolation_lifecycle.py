@@ -215,7 +215,10 @@ class ContainerIsolation(NoIsolation):
                     interfaces.delete_local_route(self._namespace, self._own_network)
                 self.firewall.remove()
             except NetworkError as error:
-                log.error("firewall rules may remain", error=str(error))
+                log.error(
+                    "firewall rules may remain: start the appliance again, or see `nft list ruleset`",
+                    error=str(error),
+                )
 
     def _end_tunnels(self, own: str) -> None:
         try:

@@ -140,7 +140,9 @@ def _entry_of(target: bytes) -> tuple[str, str]:
         parts = urlsplit(target.decode("ascii"))
         ticket = parse_qs(parts.query).get("ticket", [""])[0]
     except ValueError:
-        raise ProblemError(400, "bad-input", "the URL is not valid") from None
+        raise ProblemError(
+            400, "bad-input", "the URL is not valid: take it from `rosrv door ticket`"
+        ) from None
     name = parts.path.removeprefix(PREFIX.decode())
     if not ticket or max(len(ticket), len(name)) > _LONGEST:
         raise ProblemError(

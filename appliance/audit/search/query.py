@@ -170,9 +170,9 @@ def _match(column: str, value: str) -> Condition:
 def checked_pattern(name: str, value: str) -> str:
     """Return the pattern. Raises `FilterError` unless it is short, simple and valid Unicode."""
     if len(value) > _LONGEST_PATTERN:
-        raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters")
+        raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters; give a shorter pattern")
     if value.count("*") > _MOST_STARS:
-        raise FilterError(f"{name}: more than {_MOST_STARS} times '*'")
+        raise FilterError(f"{name}: more than {_MOST_STARS} times '*'; give a shorter pattern")
     try:
         value.encode()
     except UnicodeEncodeError as error:

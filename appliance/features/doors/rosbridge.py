@@ -202,7 +202,7 @@ class Rosbridge:
         subscription.type = _one_type(topic, "subscribed", subscription.type, kind)
         if operation.id not in subscription.clients and len(subscription.clients) >= self._limits.ids:
             raise OperationError(
-                f"{topic} has {len(subscription.clients)} subscriptions; at most {self._limits.ids}"
+                f"{topic} has {len(subscription.clients)} subscriptions, the limit for a client: unsubscribe one first"
             )
         self._spellings.setdefault(topic, set()).add(operation.topic)
         seconds, length = (operation.throttle_rate or 0) / 1000, operation.queue_length or 0

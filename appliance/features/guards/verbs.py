@@ -142,7 +142,7 @@ def new(
         typer.Option("--type", metavar="NAME=TYPE", help="Type of a topic that no node has yet (repeatable)"),
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--name", help="Name of the guard (default: that of the preset)")
+        str | None, typer.Option("--name", help="Name of the guard (default: the preset's)")
     ] = None,
     shadow: Annotated[
         bool, typer.Option("--shadow", help="Only record what the guard would have done")
@@ -205,8 +205,8 @@ def set_values(
         str | None,
         typer.Option(
             "--since",
-            help="With --dry-run: from this time: 1h (ago), 14:03, a date, or RFC 3339",
-            show_default="1h",
+            help="With --dry-run: from this time: 1h (ago; the default), 14:03, a date, or RFC 3339",
+            show_default=False,
         ),
     ] = None,
     when_standing: WhenStanding = False,

@@ -65,7 +65,8 @@ _Ports = Annotated[str, typer.Option(help="The host's local port range, where RO
 _Within = Annotated[
     str | None,
     typer.Option(
-        help="With --token: the longest wait until the host enrols: 30m, 1h or 7d", show_default="1h"
+        help="With --token: the longest wait until the host enrols: 30m, 1h or 7d (default: 1h)",
+        show_default=False,
     ),
 ]
 

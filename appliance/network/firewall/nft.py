@@ -110,7 +110,9 @@ class NftBackend:
         except TimeoutError as error:
             raise FirewallError(str(error)) from None
         except OSError as error:
-            raise FirewallError(f"nft cannot be run: {error.strerror}") from error
+            raise FirewallError(
+                f"nft cannot be run: {error.strerror}; check `nft list tables` as root"
+            ) from error
         if status != 0:
             reason = _first_lines(err or out)
             raise FirewallError(f"nft rejected the rules in {self._namespace.name}: {reason}")

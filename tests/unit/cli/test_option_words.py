@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import typer
-from typer.core import TyperOption
+from typer.core import TyperArgument, TyperOption
 
 from appliance.cli.main import app
 from rosmop.tool.renamed_options import FORMER_OPTIONS
@@ -87,6 +87,12 @@ def test_an_option_has_one_metavar_in_all_verbs() -> None:
     for one in OPTIONS:
         found[one.name].add(one.metavar)
     assert {name: kinds for name, kinds in found.items() if len(kinds) > 1} == MEANINGS
+
+
+def test_an_argument_is_in_capitals() -> None:
+    arguments = [one for _, command in commands() for one in command.params if isinstance(one, TyperArgument)]
+    assert len(arguments) > 60
+    assert [one.name for one in arguments if not one.metavar or one.metavar != one.metavar.upper()] == []
 
 
 def test_help_of_options_is_a_phrase_without_a_full_stop() -> None:
