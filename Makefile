@@ -14,7 +14,7 @@ DETERMINISTIC := -m "not nightly and not real" tests/unit tests/world rosmop/tes
 # Files with tests that are marked `real`.
 REAL = $(shell grep --recursive --files-with-matches --include='test_*.py' 'mark\.real' tests/unit tests/integration tests/system)
 
-.PHONY: help setup demo check static unit test units real smoke nightly steady mutants prove wheel constraints package image site fleet release bench clean
+.PHONY: help setup demo check static unit test units real smoke nightly steady pages mutants prove wheel constraints package image site fleet release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -58,6 +58,9 @@ nightly: setup ## every test, with all its examples: attacks, crashes, takeovers
 
 steady: setup ## run one test N times beside busy loops: make steady TEST=tests/integration/test_nodes.py N=50
 	$(BIN)/python -m tests.steady $(TEST) $(N)
+
+pages: setup ## write the generated pages: settings, commands, events, metrics, quotas, evidence about guards
+	$(BIN)/python -m distribution.generated_pages
 
 mutants: setup ## change the kernel, or the modules of a MODULE, in N small wrong ways (SEED=1), and list what no test of the gate finds
 	$(BIN)/python -m tests.mutants --number $(or $(N),200) --seed $(or $(SEED),1) $(if $(MODULE),--module $(MODULE))

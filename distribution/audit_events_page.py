@@ -1,11 +1,10 @@
-"""Print docs/reference/generated/audit-events.md, from the registry and from the calls that record events.
+"""Generate docs/reference/generated/audit-events.md, from the registry and from the calls that record events.
 
 These calls define the fields of `detail`, and the severities that the registry lacks. `ELSEWHERE` lists the fields of
 events whose calls do not show them, such as the log's own records and the actions of monitors.
 """
 
 import ast
-import sys
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -213,7 +212,3 @@ def markdown() -> str:
         for name, meaning in EVENTS.items()
     ]
     return _HEAD + "\n".join(rows) + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(markdown())

@@ -1,7 +1,6 @@
-"""Print the generated part of the page about audit records: `python -m distribution.audit_record_page`."""
+"""Generate the end of docs/reference/audit-log.md: the fields and the JSON schema of audit records."""
 
 import json
-import sys
 from typing import Any
 
 from appliance.audit.log.schema import FIELDS, json_schema
@@ -46,7 +45,3 @@ def markdown() -> str:
         "",
     ]
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(markdown())

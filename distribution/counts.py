@@ -93,15 +93,16 @@ def length(node: Function | ast.ClassDef) -> int:
     return (node.end_lineno or node.lineno) - first + 1
 
 
-def over_their_limits(counts: Iterable[Count]) -> dict[str, int]:
-    """Return the counts that exceed their limits, and those that count nothing although their goal is more."""
+def over_their_limits(program: str, counts: Iterable[Count]) -> list[str]:
+    """Return a line for each count that exceeds its limit, or counts nothing although its goal is more."""
     with no_collector():
         numbers = {count: count.number for count in counts}
-    return {
-        count.name: number
+    return [
+        f"{count.name}: {number}, and the limit is {count.limit}: {count.what}. Have fewer:"
+        f" python -m {program} {count.name} lists them"
         for count, number in numbers.items()
         if number > count.limit or (count.goal and not number)
-    }
+    ]
 
 
 def main(program: str, counts: Sequence[Count], arguments: Sequence[str]) -> int:

@@ -1,9 +1,7 @@
-"""List every metric; `python -m appliance.features.metrics.metric_table` makes the table of docs/reference/metrics.md.
+"""List every metric.
 
 Labels have few values; `control.operators.measurements` limits the number of topics and services.
 """
-
-import sys
 
 from appliance.base.metric import counter, gauge, histogram
 from appliance.channel.messages import DELAY_BOUNDS
@@ -97,16 +95,3 @@ METRICS = (
     counter("rosrv_rest_calls_total", "REST calls since the api started", "method", "status"),
     *(metric for state in STATES for metric in state.metrics),
 )
-
-
-def markdown() -> str:
-    lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
-    lines += [
-        f"| `{row.name}` | {row.kind} | {', '.join(f'`{label}`' for label in row.labels) or '-'} | {row.help} |"
-        for row in METRICS
-    ]
-    return "\n".join([*lines, ""])
-
-
-if __name__ == "__main__":
-    sys.stdout.write(markdown())

@@ -14,14 +14,10 @@ from appliance.quotas.table import (
     QuotaRow,
 )
 from appliance.relay.monitors.time_budget import TimeBudget
-from distribution.quotas_page import all_rows, allowed, page
+from distribution.quotas_page import all_rows, allowed
 
 ROOT = Path(__file__).parents[3]
 WITHOUT_NUMBER = {RVMASTER_FAREWELLS.thing, LIMITED_TOPIC.thing}
-
-
-def test_the_page_is_up_to_date() -> None:
-    assert (ROOT / "docs/reference/generated/quotas.md").read_text() == page()
 
 
 def test_every_row_is_on_the_page() -> None:

@@ -1,18 +1,9 @@
-from pathlib import Path
-
 from appliance.audit.log.events import EVENTS
 from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.log.schema import json_schema
 from appliance.audit.proof.chain_proofs import ChainProof
-from distribution.audit_record_page import CHAIN, markdown
-
-_PAGE = Path(__file__).parents[4] / "docs" / "reference" / "audit-log.md"
-
-
-def test_the_page_matches_the_code() -> None:
-    generated = _PAGE.read_text().split("<!-- generated: python -m distribution.audit_record_page -->\n")[1]
-    assert generated == markdown()
+from distribution.audit_record_page import CHAIN
 
 
 def test_every_field_is_documented() -> None:
