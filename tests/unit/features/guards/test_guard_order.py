@@ -2,7 +2,6 @@ import math
 import re
 from collections.abc import Callable
 from itertools import product
-from pathlib import Path
 
 import pytest
 
@@ -188,13 +187,6 @@ def test_each_row_of_the_table_has_its_test_and_the_phases_keep_it() -> None:
         places = {one.name: place for place, one in enumerate(compiled.specifications)}
         for first, then in (pair for row in PRECEDENCES for pair in product(row.first, row.then)):
             assert places[first] < places[then]
-
-
-def test_the_page_has_the_table() -> None:
-    page = (Path(__file__).parents[4] / "docs" / "reference" / "guards.md").read_text()
-    for first, then, otherwise in PRECEDENCES:
-        names = [", ".join(f"`{name}`" for name in part) for part in (first, then)]
-        assert f"| {names[0]} | {names[1]} | {otherwise} |" in page
 
 
 def placed(name: str, preset: str, command: str = "/cmd_vel", *, phased: bool = True) -> Placed:
