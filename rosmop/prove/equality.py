@@ -39,10 +39,12 @@ from rosmop.prove.concrete_runs import (
     EventState,
 )
 from rosmop.prove.decoding import functions_of
-from rosmop.prove.form_terms import FormResult, FormTerms, wrapped
+from rosmop.prove.event_terms import FormResult
+from rosmop.prove.form_terms import FormTerms
 from rosmop.prove.loops import BUDGET_SLOT, assumed, loop_conditions
 from rosmop.prove.model_states import state_of
 from rosmop.prove.module_terms import LoopGuess, ModuleExecution, ModuleResult, Pointer, ReadableBytes
+from rosmop.prove.number_terms import wrapped
 from rosmop.prove.questions import Effort, MayDifferError, Questions, first_difference
 from rosmop.prove.random_states import STATES, RandomStates
 from rosmop.prove.terms import (
