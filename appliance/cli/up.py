@@ -43,50 +43,57 @@ def _isolations(incomplete: str) -> list[tuple[str, str]]:
 
 
 # Not `readable`, which click checks with the rights of root alone: see `base/owner_access.py`.
+_ConfigFile = Annotated[
+    Path | None, typer.Option(readable=False, help="Configuration file (default: ./appliance.yaml)")
+]
+_PolicyFile = Annotated[
+    Path | None,
+    typer.Option(readable=False, help="Access policy file; `rosrv policy reload` reads it again"),
+]
+_MonitorFolder = Annotated[
+    Path | None,
+    typer.Option(
+        readable=False, help="Folder of specifications (.rv); `rosrv monitor reload` reads it again"
+    ),
+]
+_Enable = Annotated[
+    str | None,
+    typer.Option(help="Monitors to enable at start: all, none, NAME,…, or shadow (all in shadow mode)"),
+]
+_StateDirectory = Annotated[
+    Path | None, typer.Option(help="State directory: everything that survives a restart")
+]
+_Listen = Annotated[str | None, typer.Option(help="Where RVMaster listens, for ROS_MASTER_URI; port 0: any")]
+_RosmasterPort = Annotated[int | None, typer.Option(help="Port of the ROS master; 0: any")]
+_Isolation = Annotated[str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)]
+_Relayed = Annotated[
+    str | None,
+    typer.Option(help="all, or monitored: only topics that [Monitor] or a specification names"),
+]
+_Mediation = Annotated[
+    str | None, typer.Option(help="full, or monitored: nodes get real URIs (with --relay monitored)")
+]
+_Api = Annotated[
+    str | None, typer.Option(metavar="HOST:PORT", help="Where REST listens; port 0: any; or off")
+]
+_ApiTls = Annotated[str | None, typer.Option(help="true, or false: clear text, on a loopback address only")]
+_AsJson = Annotated[bool, typer.Option("--json", help="Print a JSON object when nodes may connect")]
+
+
 def up(  # noqa: PLR0917  typer gives every flag by its name
-    config: Annotated[
-        Path | None, typer.Option(readable=False, help="Configuration file (default: ./appliance.yaml)")
-    ] = None,
-    policy: Annotated[
-        Path | None,
-        typer.Option(readable=False, help="Access policy file; `rosrv policy reload` reads it again"),
-    ] = None,
-    monitors: Annotated[
-        Path | None,
-        typer.Option(
-            readable=False, help="Folder of specifications (.rv); `rosrv monitor reload` reads it again"
-        ),
-    ] = None,
-    enable: Annotated[
-        str | None,
-        typer.Option(help="Monitors to enable at start: all, none, NAME,…, or shadow (all in shadow mode)"),
-    ] = None,
-    state: Annotated[
-        Path | None, typer.Option(help="State directory: everything that survives a restart")
-    ] = None,
-    listen: Annotated[
-        str | None, typer.Option(help="Where RVMaster listens, for ROS_MASTER_URI; port 0: any")
-    ] = None,
-    rosmaster_port: Annotated[int | None, typer.Option(help="Port of the ROS master; 0: any")] = None,
-    isolation: Annotated[
-        str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)
-    ] = None,
-    relay: Annotated[
-        str | None,
-        typer.Option(help="all, or monitored: only topics that [Monitor] or a specification names"),
-    ] = None,
-    mediation: Annotated[
-        str | None, typer.Option(help="full, or monitored: nodes get real URIs (with --relay monitored)")
-    ] = None,
-    api: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Where REST listens; port 0: any; or off")
-    ] = None,
-    api_tls: Annotated[
-        str | None, typer.Option(help="true, or false: clear text, on a loopback address only")
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a JSON object when nodes may connect")
-    ] = False,
+    config: _ConfigFile = None,
+    policy: _PolicyFile = None,
+    monitors: _MonitorFolder = None,
+    enable: _Enable = None,
+    state: _StateDirectory = None,
+    listen: _Listen = None,
+    rosmaster_port: _RosmasterPort = None,
+    isolation: _Isolation = None,
+    relay: _Relayed = None,
+    mediation: _Mediation = None,
+    api: _Api = None,
+    api_tls: _ApiTls = None,
+    as_json: _AsJson = False,
 ) -> None:
     """Start the appliance and run until SIGTERM or Ctrl-C.
 
@@ -141,39 +148,12 @@ def _write(line: str, *, as_json: bool) -> None:
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
     """Announce that nodes may connect. If the first token cannot be stored, print nothing and raise `StartError`."""
-    rest = _rest_url(settings)
-    more: list[str] = []
-    if as_json:
-        event: dict[str, object] = {
-            "event": "ready",
-            "master": said.master,
-            "api": rest,
-            "revision": said.revision,
-        }
-        if said.token is not None:
-            event["token"] = said.token
-        if said.warnings:
-            event["warnings"] = said.warnings
-        line = json.dumps(event)
-    else:
-        line = f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
-        more += said.warnings[:_MOST_WARNINGS]
-        if len(said.warnings) > _MOST_WARNINGS:
-            more.append(
-                f"and {len(said.warnings) - _MOST_WARNINGS} more warnings: rosrv policy check {settings.policy}"
-            )
-        if settings.isolation == "netns":
-            port = settings.listen_address[1]
-            more.append(
-                f"Nodes on other machines: this machine's address, ROS_MASTER_URI=http://ADDRESS:{port}"
-            )
-        if settings.monitors is not None:
-            more.append(f"Monitors: {settings.monitors} (rosrv monitor list)")
-        if rest is not None:
-            browsed = rest if settings.api_published else _rest_url(settings, "127.0.0.1")
-            more += [f"Console: {browsed}/console/", f"REST: {browsed}"]
-        if said.token is not None:
-            more.append(f"The first access token (admin) is in {_keep_token(settings.state, said.token)}")
+    line = (
+        _event(said, settings)
+        if as_json
+        else f"Nodes may connect: ROS_MASTER_URI={said.master} (state in {settings.state})"
+    )
+    more = [] if as_json else _hints(said, settings)
     try:
         _write(line, as_json=as_json)
     except OSError as error:  # closed pipe, full disk, closed terminal
@@ -183,6 +163,40 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
     with contextlib.suppress(OSError):
         for one in more:
             write_line(one, sys.stderr)
+
+
+def _event(said: ControlReady, settings: Settings) -> str:
+    event: dict[str, object] = {
+        "event": "ready",
+        "master": said.master,
+        "api": _rest_url(settings),
+        "revision": said.revision,
+    }
+    if said.token is not None:
+        event["token"] = said.token
+    if said.warnings:
+        event["warnings"] = said.warnings
+    return json.dumps(event)
+
+
+def _hints(said: ControlReady, settings: Settings) -> list[str]:
+    """Return the lines after the announcement; the first token is then in a file. Raises `StartError`."""
+    lines = [*said.warnings[:_MOST_WARNINGS]]
+    if len(said.warnings) > _MOST_WARNINGS:
+        lines.append(
+            f"and {len(said.warnings) - _MOST_WARNINGS} more warnings: rosrv policy check {settings.policy}"
+        )
+    if settings.isolation == "netns":
+        port = settings.listen_address[1]
+        lines.append(f"Nodes on other machines: this machine's address, ROS_MASTER_URI=http://ADDRESS:{port}")
+    if settings.monitors is not None:
+        lines.append(f"Monitors: {settings.monitors} (rosrv monitor list)")
+    if (rest := _rest_url(settings)) is not None:
+        browsed = rest if settings.api_published else _rest_url(settings, "127.0.0.1")
+        lines += [f"Console: {browsed}/console/", f"REST: {browsed}"]
+    if said.token is not None:
+        lines.append(f"The first access token (admin) is in {_keep_token(settings.state, said.token)}")
+    return lines
 
 
 def _rest_url(settings: Settings, own: str = "") -> str | None:

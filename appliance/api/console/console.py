@@ -60,6 +60,29 @@ class _File(NamedTuple):
 def routes(settings: Settings) -> APIRouter:
     """Return the routes, which are not part of the contract. Raises `ModuleError` if the modules cannot be joined."""
     router = APIRouter(include_in_schema=False)
+    served = _served(settings)
+
+    async def index(request: Request) -> Response:
+        return _answer(request, served[_PAGE])
+
+    async def file(request: Request, name: str) -> Response:
+        found = served.get(name)
+        if found is None:
+            raise ProblemError(404, "unknown-path", "the console has no such file")
+        return _answer(request, found)
+
+    methods = ["GET", "HEAD"]
+    router.add_api_route(_PREFIX + "{name:path}", file, methods=methods)
+    for path in ("/", "/console", "/console/"):
+        router.add_api_route(path, index, methods=methods)
+    for view in views():
+        router.add_api_route(f"/console/{view}", index, methods=methods)
+        router.add_api_route(f"/console/{view}/{{rest:path}}", index, methods=methods)
+    return router
+
+
+def _served(settings: Settings) -> dict[str, _File]:
+    """Return the files by name, with the page for these settings."""
     served = _collect((files(__package__) / name for name in _SERVED), "")
     parts = {name: feature.console for name, feature in FOLDERS.items() if isinstance(feature, Feature)}
     for name, of_feature in parts.items():
@@ -69,11 +92,18 @@ def routes(settings: Settings) -> APIRouter:
     texts = {name: served[name].body.decode() for name in served if name.endswith((".js", ".css", ".html"))}
     texts[_PARTS] = _parts(parts)
     styles = [name for name in texts if name.startswith("features/") and name.endswith(".css")]
-    addresses: dict[str, str] = {}
     joined = {
         **join_modules(texts, _SCRIPT, _PREFIX),
         _STYLE: "".join(join_styles(texts, one) for one in (_STYLE, *styles)),
     }
+    page = _stating(_with_lasting_files(texts[_PAGE], joined, served), _stated(settings))
+    served[_PAGE] = _file(page.encode(), served[_PAGE].media_type)
+    return served
+
+
+def _with_lasting_files(page: str, joined: Mapping[str, str], served: dict[str, _File]) -> str:
+    """Add the files that the page names, directly or not, under lasting addresses; return the page with those."""
+    addresses: dict[str, str] = {}
 
     def named(found: re.Match[str]) -> str:
         name = found[1]
@@ -90,40 +120,17 @@ def routes(settings: Settings) -> APIRouter:
             raise ModuleError(f"the console's script {name} loads itself late")
         return _PREFIX + addresses[name]
 
-    page = served[_PAGE] = _file(
-        _stating(
-            _ADDRESS.sub(named, texts[_PAGE]),
-            {
-                "lock-seconds": f"{settings.api_lock_seconds:g}",
-                "notice": settings.api_notice,
-                "robot": settings.name,
-                **{
-                    name: text
-                    for section in settings.sections.values.values()
-                    for name, text in section.on_page().items()
-                },
-            },
-        ).encode(),
-        served[_PAGE].media_type,
-    )
+    return _ADDRESS.sub(named, page)
 
-    async def index(request: Request) -> Response:
-        return _answer(request, page)
 
-    async def file(request: Request, name: str) -> Response:
-        found = served.get(name)
-        if found is None:
-            raise ProblemError(404, "unknown-path", "the console has no such file")
-        return _answer(request, found)
-
-    methods = ["GET", "HEAD"]
-    router.add_api_route(_PREFIX + "{name:path}", file, methods=methods)
-    for path in ("/", "/console", "/console/"):
-        router.add_api_route(path, index, methods=methods)
-    for view in views():
-        router.add_api_route(f"/console/{view}", index, methods=methods)
-        router.add_api_route(f"/console/{view}/{{rest:path}}", index, methods=methods)
-    return router
+def _stated(settings: Settings) -> dict[str, str]:
+    sections = settings.sections.values.values()
+    return {
+        "lock-seconds": f"{settings.api_lock_seconds:g}",
+        "notice": settings.api_notice,
+        "robot": settings.name,
+        **{name: text for section in sections for name, text in section.on_page().items()},
+    }
 
 
 def views() -> tuple[str, ...]:

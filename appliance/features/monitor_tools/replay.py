@@ -13,57 +13,59 @@ from appliance.cli.monitor_program import MONITOR
 from appliance.features.table import recorded_messages
 from rosmop.form.findings import SpecificationError
 from rosmop.tool.batch_session import RecordingsOptions, batch_session
-from rosmop.tool.options import BagSets, Folders, On, ReportFile, Resume, ShowProgress, Workers
+from rosmop.tool.options import Bags, BagSets, Folders, On, ReportFile, Resume, ShowProgress, Workers
 from rosmop.tool.replay_report import ReplayReport
 from rosmop.tool.run_command import run_batch, run_spans
 from rosmop.tool.specification_input import Specifications, read_for_recordings, topics_of
 from rosmop.tool.terminal import refused
 
+_MonitorOrFile = Annotated[
+    str,
+    typer.Argument(
+        metavar="MONITOR|FILE",
+        help="A monitor of the running appliance, or a file (.rv)",
+        show_default=False,
+    ),
+]
+_Since = Annotated[
+    str | None,
+    typer.Option(
+        "--since",
+        help="Without --bag: read the flight recorder from this time: 1h (ago), 14:03, a date, or RFC 3339",
+        show_default=False,
+    ),
+]
+_Until = Annotated[
+    str | None,
+    typer.Option("--until", help="Read the flight recorder up to this time", show_default=False),
+]
+_Topics = Annotated[
+    list[str] | None,
+    typer.Option("--topic", metavar="PATTERN", help="Only these topics; `*` matches anything (repeatable)"),
+]
+_Most = Annotated[
+    int,
+    typer.Option(
+        "--limit", min=0, metavar="N", help="Largest number of findings for each monitor, topic and kind"
+    ),
+]
+_Margins = Annotated[
+    bool, typer.Option("--margins", help="Also show how close each comparison of numbers came (slower)")
+]
+
 
 @speaks
 def replay_monitor(
     appliance: Appliance,
-    what: Annotated[
-        str,
-        typer.Argument(
-            metavar="MONITOR|FILE",
-            help="A monitor of the running appliance, or a file (.rv)",
-            show_default=False,
-        ),
-    ],
+    what: _MonitorOrFile,
     *,
-    bags: Annotated[
-        list[Path] | None,
-        typer.Option("--bag", metavar="FILE", help="A recording: a bag or an MCAP file (repeatable)"),
-    ] = None,
+    bags: Bags = None,
     sets: BagSets = None,
-    since: Annotated[
-        str | None,
-        typer.Option(
-            "--since",
-            help="Without --bag: read the flight recorder from this time: 1h (ago), 14:03, a date, or RFC 3339",
-            show_default=False,
-        ),
-    ] = None,
-    until: Annotated[
-        str | None,
-        typer.Option("--until", help="Read the flight recorder up to this time", show_default=False),
-    ] = None,
-    topics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--topic", metavar="PATTERN", help="Only these topics; `*` matches anything (repeatable)"
-        ),
-    ] = None,
-    most: Annotated[
-        int,
-        typer.Option(
-            "--limit", min=0, metavar="N", help="Largest number of findings for each monitor, topic and kind"
-        ),
-    ] = 10,
-    margins: Annotated[
-        bool, typer.Option("--margins", help="Also show how close each comparison of numbers came (slower)")
-    ] = False,
+    since: _Since = None,
+    until: _Until = None,
+    topics: _Topics = None,
+    most: _Most = 10,
+    margins: _Margins = False,
     msg: Folders = None,
     workers: Workers = None,
     on: On = None,
