@@ -1,4 +1,4 @@
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -7,15 +7,15 @@ from appliance.relay.connections.exchange import ServiceExchange
 from appliance.relay.connections.held_requests import AWAY, HeldRequests
 from roswire.errors import ProtocolError
 from roswire.tcpros import ServiceReply, encode_frame, encode_service_error, encode_service_reply
+from tests.unit.relay.monitors.quiet import Timers
 
 
 class Relay:
     def __init__(self, *, asks: bool = True) -> None:
         self.asks = asks
-        self.later: list[Any] = []
-        self.asked: list[Any] = []
+        self.loop, self.asked = Timers(), list[Any]()
         self.service, self.client = bytearray(), bytearray()
-        self.approvals = HeldRequests(cast(Any, self), self.asked.append)
+        self.approvals = HeldRequests(self.loop, self.asked.append)
         self.exchange = ServiceExchange(
             1000,
             persistent=True,
@@ -26,9 +26,6 @@ class Relay:
             asks=self.ask,
         )
         self.approvals.attach(True)
-
-    def after(self, _seconds: float, work: Any) -> None:
-        self.later.append(work)
 
     def question(self, host: str, body: bytes = b"") -> int:
         return self.approvals.ask(("/home", host, "/it"), "std_srvs/SetBool", body, lambda _refused: None)
@@ -82,8 +79,7 @@ def test_requests_are_refused_without_control() -> None:
     relay.approvals.attach(False)
     relay.request(b"\x02")
     assert len(relay.asked) == 1 and relay.client.count(AWAY.encode()) == 1
-    for work in relay.later:
-        work()
+    relay.loop.run_due()
     assert relay.client.count(AWAY.encode()) == 2 and not relay.service
 
 

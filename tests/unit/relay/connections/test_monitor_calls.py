@@ -1,5 +1,4 @@
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,8 +13,9 @@ from appliance.channel.messages import (
 from appliance.relay.connections.monitor_calls import MOST, MOST_OF_MONITOR, ServiceCalls
 from rosmop.run.outcomes import Published
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
+from tests.unit.relay.contexts import context_of
 from tests.unit.relay.monitors.monitored import SET_BOOL_MD5, Monitored, string
-from tests.unit.relay.monitors.quiet import QuietMonitors, Timers
+from tests.unit.relay.monitors.quiet import QuietMonitors, Reports, Timers
 from tests.unit.relay.world import LIMITS, LOOPBACK, Peer
 
 REACT = """react() { std_srvs::SetBoolRequest r;
@@ -31,13 +31,8 @@ class Calls:
     def __init__(self, *, connected: bool = True) -> None:
         self.quiet, self.loop = QuietMonitors(), Timers()
         self.quiet.load(REACT)
-        self.sent = list[Any]()
-        context: Any = SimpleNamespace(
-            loop=self.loop,
-            limits=LIMITS,
-            reporter=SimpleNamespace(send=self.sent.append),
-            interceptor=self.quiet.interceptor,
-        )
+        self.reports = Reports()
+        context = context_of(self.loop, LIMITS, reporter=self.reports, interceptor=self.quiet.interceptor)
         self.failed: list[str] = []
         observer: Any = self.quiet.interceptor.observer
         observer.call_failed = lambda *report: self.failed.append(report[-1])
@@ -49,12 +44,6 @@ class Calls:
         monitors = self.quiet.interceptor.monitors
         return monitors.monitor("react").faults if monitors is not None else 0
 
-    def run(self) -> None:
-        due, self.loop.due[:] = sorted(self.loop.due, key=lambda one: one[0]), []
-        for _, timer in due:
-            if timer.callback is not None:
-                timer.callback()
-
 
 def denied(calls: Calls) -> None:
     calls.calls.answered(MonitorCallAnswered(1, "", 0, "", "denied: 127.0.0.1 may not"))
@@ -64,9 +53,9 @@ def denied(calls: Calls) -> None:
     ("connected", "happens", "reason"),
     [
         (True, denied, "denied: 127.0.0.1 may not"),
-        (True, Calls.run, f"no response within {LIMITS.service_seconds:g} s"),
+        (True, lambda calls: calls.loop.run_due(), f"no response within {LIMITS.service_seconds:g} s"),
         (True, lambda calls: calls.calls.attach(False), "the appliance's control has ended"),
-        (False, Calls.run, "the appliance's control is not running"),
+        (False, lambda calls: calls.loop.run_due(), "the appliance's control is not running"),
     ],
 )
 def test_each_call_that_does_not_succeed_is_one_fault(
@@ -76,24 +65,24 @@ def test_each_call_that_does_not_succeed_is_one_fault(
     calls.calls.call(wanted())
     happens(calls)
     denied(calls)
-    calls.run()
+    calls.loop.run_due()
     assert calls.failed == [f"the call of /arm failed: {reason}"]
     assert calls.faults == 1
-    assert len(calls.sent) == connected
+    assert len(calls.reports.sent) == connected
 
 
 def test_the_number_of_calls_under_way_is_bounded() -> None:
     calls = Calls()
     for _ in range(MOST_OF_MONITOR + 3):
         calls.calls.call(wanted())
-    assert (len(calls.sent), calls.faults) == (MOST_OF_MONITOR, 3)
+    assert (len(calls.reports.sent), calls.faults) == (MOST_OF_MONITOR, 3)
     for number in range(MOST):
         calls.calls.call(wanted(f"other{number}"))
-    assert len(calls.sent) == MOST
-    calls.run()
+    assert len(calls.reports.sent) == MOST
+    calls.loop.run_due()
     assert calls.faults == 3 + MOST_OF_MONITOR
     calls.calls.call(wanted())
-    assert len(calls.sent) == MOST + 1
+    assert len(calls.reports.sent) == MOST + 1
 
 
 @pytest.fixture(name="world")

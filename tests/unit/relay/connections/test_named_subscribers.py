@@ -4,17 +4,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.named_subscribers import NamedSubscribers, looks_for_names
-from appliance.relay.context import RelayContext
-from appliance.relay.grant_table import GrantTable
 from appliance.relay.loop import EventLoop
-from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.report import Reporter
-from appliance.relay.transport.frames import Scratch
-from appliance.relay.transport.memory import RelayMemory
 from roswire.tcpros import HeaderParser
+from tests.unit.relay.contexts import context_of
 
 GOAL = "actionlib_tutorials/FibonacciActionGoal"
 TOPIC = "/fibonacci/goal"
@@ -35,17 +28,9 @@ def publisher() -> Iterator[socket.socket]:
         yield sock
 
 
-def _nothing(*_what: object) -> None: ...
-
-
 @pytest.fixture
 def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
-    limits = RelayLimits()
-    reporter = Reporter(limits)
-    memory = RelayMemory.of(limits, lambda _host: QuotaClass.REGISTERED)
-    interceptor = Interceptor(loop, reporter, budget=1.0, publish=_nothing, changed=_nothing)
-    context = RelayContext(loop, limits, reporter, memory, Scratch(), interceptor, GrantTable())
-    presences = NamedSubscribers(context, TOPIC, "10.0.0.9")
+    presences = NamedSubscribers(context_of(loop), TOPIC, "10.0.0.9")
     yield presences
     presences.close()
 
