@@ -44,7 +44,11 @@ def build_app(services: Services) -> FastAPI:
         },
     )
     of_features = [routes(services) for routes in members("routes", "routes")]
-    for router in (operation_routes.routes(services, of_features), health.routes(services), *of_features):
+    for router in (
+        operation_routes.routes(services, of_features),
+        health.routes(services.control, services.history),
+        *of_features,
+    ):
         app.include_router(router)
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract

@@ -41,8 +41,9 @@ import re
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, get_args
 
+import msgspec
 import pytest
 import yaml
 
@@ -147,7 +148,7 @@ class Transcript:
             self._fake.serve(Path("state"))
             self._serves = True
         if len(words) > 1 and words[-1] in get_args(Trouble):
-            self._fake.reject(" ".join(words[:-1]), cast(Trouble, words[-1]), *below)
+            self._fake.reject(" ".join(words[:-1]), msgspec.convert(words[-1], Trouble), *below)
         else:
             self._fake.answer(" ".join(words), **(yaml.safe_load("\n".join(below)) or {}))
 

@@ -4,9 +4,10 @@ from typing import Literal
 
 import msgspec
 
+from appliance.api.front.control import ControlLink
+from appliance.api.front.history import SampleHistory
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.routing import Responses, Routes
-from appliance.api.front.services import Services
 from appliance.channel.status_summary import unserved
 
 _PATIENCE_SECONDS = 1.0
@@ -18,7 +19,7 @@ class Health(msgspec.Struct, frozen=True):
     status: Literal["live", "ready"]
 
 
-def routes(services: Services) -> Routes:
+def routes(control: ControlLink, history: SampleHistory) -> Routes:
     router = Routes(tags=["status"])
 
     async def live() -> Health:
@@ -27,15 +28,15 @@ def routes(services: Services) -> Routes:
 
     async def ready() -> Health:
         """Whether nodes are served: 503 while they are not. Without a token, so the answer does not give the reason."""
-        if services.control.paused:
+        if control.paused:
             raise ProblemError(
                 503, "not-served", "nodes are not served: the appliance is paused", retry_after=1
             )
-        if not services.control.connected:
+        if not control.connected:
             raise ProblemError(503, "not-available", "RVMaster is being restarted", retry_after=1)
-        seen = services.history.seen
+        seen = history.seen
         if seen.status is None or unserved(seen.status) is not None:
-            seen = await services.history.again(_PATIENCE_SECONDS)
+            seen = await history.again(_PATIENCE_SECONDS)
         if seen.status is None or unserved(seen.status) is not None:
             raise ProblemError(
                 503, "not-served", "nodes are not served: GET /v1/status says why", retry_after=1

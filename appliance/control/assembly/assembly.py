@@ -49,7 +49,7 @@ class Parts:
 def assemble(base: Foundation) -> Parts:
     core = make_master_core(base)
     ends = make_endpoints(base, core)
-    reminders = Reminders(core.registry, ends.subscribers)
+    reminders = Reminders(core.registry, ends.subscribers.absent, ends.subscribers.renew)
     base.role.on_end_of_gap(reminders.begin)
     parameters = ParameterCalls(
         ends.rosmaster,

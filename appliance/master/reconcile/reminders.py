@@ -7,15 +7,18 @@ subscriber whose grant was withdrawn and restored without its knowledge.
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from appliance.base import clock
 from appliance.channel.messages import Message
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.registry import Registry
+from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.specifications.allocation import TOPIC, Move, Resource
+
+Absent = Callable[[Sequence[Incarnation]], Iterable[tuple[Incarnation, str, Sequence[Incarnation]]]]
+Renew = Callable[[Incarnation, str, Sequence[Incarnation]], None]
 
 _GENTLE = 1  # the reminders before a subscriber must drop the publisher and connect again
 _LASTING_SECONDS = 5.0
@@ -32,11 +35,15 @@ class _Absence:
 
 
 class Reminders:
-    """Reminds absent subscribers, first after `_LASTING_SECONDS`, then at growing intervals."""
+    """Reminds absent subscribers, first after `_LASTING_SECONDS`, then at growing intervals.
 
-    def __init__(self, registry: Registry, subscribers: Subscribers) -> None:
+    `absent` returns those of some nodes, each with the topic and its publishers. `renew` sends a list again, first
+    without these publishers.
+    """
+
+    def __init__(self, registry: Registry, absent: Absent, renew: Renew) -> None:
         self._registry = registry
-        self._subscribers = subscribers
+        self._absent, self._renew = absent, renew
         self.round: asyncio.Task[None] | None = None
         self._absences: dict[tuple[str, str], _Absence] = {}
 
@@ -47,14 +54,14 @@ class Reminders:
 
     def remind_lasting(self) -> None:
         before, self._absences, now = self._absences, {}, clock.now()
-        for subscriber, topic, publishers in list(self._subscribers.absent(self._registry.live())):
+        for subscriber, topic, publishers in list(self._absent(self._registry.live())):
             absence = before.get((subscriber.key, topic)) or _Absence(
                 now + _LASTING_SECONDS, _LASTING_SECONDS
             )
             if now >= absence.due:
                 pause = min(2 * absence.pause, _LONGEST_SECONDS)
                 absence = _Absence(now + pause, pause)
-                self._subscribers.renew(subscriber, topic, publishers)
+                self._renew(subscriber, topic, publishers)
             self._absences[subscriber.key, topic] = absence
 
     def begin(self) -> None:
@@ -68,11 +75,11 @@ class Reminders:
     async def _remind(self) -> None:
         for number, pause in enumerate(_PAUSES):
             await asyncio.sleep(pause)
-            absent = list(self._subscribers.absent(self._registry.live()))
+            absent = list(self._absent(self._registry.live()))
             if not absent:
                 return
             for subscriber, topic, publishers in absent:
-                self._subscribers.renew(subscriber, topic, publishers if number >= _GENTLE else ())
+                self._renew(subscriber, topic, publishers if number >= _GENTLE else ())
 
 
 class RelayMoves:

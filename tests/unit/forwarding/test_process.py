@@ -1,8 +1,6 @@
 import asyncio
 import socket
 import threading
-from collections.abc import Callable
-from typing import Any, cast
 
 import pytest
 
@@ -11,24 +9,22 @@ from appliance.channel.channel import Channel
 from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.forwarding.process import ForwardingProcess, ProgressReports
 from tests.support.core import FakeTrail
+from tests.support.memory_channel import HeldChannel
 
 pytestmark = pytest.mark.anyio
 
 
 class Control:
+    """A control on a link to the forwarder."""
+
     def __init__(self) -> None:
-        self.trail = FakeTrail()
+        self.trail, self.channel = FakeTrail(), HeldChannel()
         self.forwarded = ForwarderLink("udp://127.0.0.1:514", "all", self.trail)
-        self.hears: Callable[[object, tuple[int, ...]], None] = lambda _message, _descriptors: None
+        self.forwarded.link.attach(self.channel)
 
     @property
     def gaps(self) -> list[int]:
         return [row["count"] for row in self.trail.rows if row["event"] == "forwarding gap"]
-
-    def attach(self, _loop: object, received: Any, *_ends: object) -> None:
-        self.hears = received
-
-    def close(self) -> None: ...
 
 
 def missed(count: int) -> messages.ForwardingReported:
@@ -44,7 +40,7 @@ def controls() -> list[Control]:
 def reports(controls: list[Control]) -> ProgressReports:
     def send(message: messages.ForwardingReported) -> bool:
         if controls:
-            controls[-1].hears(message, ())
+            controls[-1].channel.say(message)
         return bool(controls)
 
     return ProgressReports(send)
@@ -54,7 +50,6 @@ def begin(
     controls: list[Control], reports: ProgressReports, progress: messages.ForwardingReported
 ) -> Control:
     control = Control()
-    control.forwarded.link.attach(cast(Channel, control))
     controls.append(control)
     reports.anew(progress)
     return control

@@ -1,15 +1,15 @@
 import asyncio
 import contextlib
 import tracemalloc
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
 from appliance.master.endpoints.delivery import ANSWER, NodeApiClient
+from appliance.master.graph.registry import Registry
 from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError, XmlRpcClient
 from roswire.uris import NodeUri
 from roswire.xmlrpc import build_response
+from tests.support.incarnations import incarnation
 
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
@@ -92,8 +92,8 @@ def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
 
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
-        node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
-        client = NodeApiClient(cast(Any, None), timeout=20).client(cast(Any, node))
+        node = incarnation("/node", port, host="127.0.0.1")
+        client = NodeApiClient(Registry(), timeout=20).client(node)
         with pytest.raises(CallFailedError, match=f"the answer is larger than {ANSWER.body} bytes"):
             await client.call("getPid", "/me")
         server.close()
@@ -118,8 +118,8 @@ async def test_a_deep_answer_of_a_node_is_refused() -> None:
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
-    client = NodeApiClient(cast(Any, None), timeout=20).client(cast(Any, node))
+    node = incarnation("/node", port, host="127.0.0.1")
+    client = NodeApiClient(Registry(), timeout=20).client(node)
     with pytest.raises(CallFailedError, match="nonsense"):
         await client.call("getPid", "/me")
     server.close()

@@ -2,7 +2,6 @@ import ast
 import os
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -127,7 +126,7 @@ def test_their_number_and_size_are_bounded(folder: Path, monkeypatch: pytest.Mon
 
 def test_a_full_disk_keeps_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = CompiledStore(folder, "x")
-    full = SimpleNamespace(f_bavail=100, f_frsize=4096)
+    full = os.statvfs_result((4096, 4096, 1000, 100, 100, 1000, 100, 100, 0, 255))
     monkeypatch.setattr(os, "statvfs", lambda _path: full)
     store.keep(QUESTION, ANSWER)
     assert list(folder.iterdir()) == []

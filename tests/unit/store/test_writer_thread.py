@@ -12,14 +12,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NoReturn
 
 import msgspec
 import pytest
 
 from appliance.base import clock
-from appliance.store import changes as ahead_module
 from appliance.store import writer_thread
 from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import (
@@ -638,13 +636,13 @@ class _Gate:
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def write(self, descriptor: int, data: bytes) -> int:
+    def write(self, descriptor: int, data: bytes, write: Callable[[int, bytes], int] = os.write) -> int:
         self.writing.set()
         assert self.closing.wait(30)
-        return os.write(descriptor, data)
+        return write(descriptor, data)
 
-    def close(self, descriptor: int) -> None:
-        os.close(descriptor)
+    def close(self, descriptor: int, close: Callable[[int], None] = os.close) -> None:
+        close(descriptor)
         self.other = os.open("another", os.O_RDWR | os.O_CREAT)  # the lowest number that is free
         self.closing.set()
 
@@ -653,16 +651,16 @@ class _Gate:
 def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gate = _Gate()
     monkeypatch.chdir(tmp_path)
-    flags = {name: getattr(os, name) for name in ("O_RDWR", "O_CREAT", "O_APPEND", "O_CLOEXEC")}
-    calls = SimpleNamespace(open=os.open, write=gate.write, close=gate.close, **flags)
-    monkeypatch.setattr(ahead_module, "os", calls)
-    monkeypatch.setattr(ahead_module, "threading", SimpleNamespace(Lock=lambda: gate))
     ahead = WriteAhead(tmp_path / "state.ahead")
+    monkeypatch.setattr(ahead, "_lock", gate)
+    monkeypatch.setattr(os, "write", gate.write)
+    monkeypatch.setattr(os, "close", gate.close)
     writing = threading.Thread(target=ahead.append, args=([encoded(1, "a")],))
     writing.start()
     assert gate.writing.wait(30)
     ahead.close()
     writing.join(30)
+    monkeypatch.undo()
     os.close(gate.other)
     assert (tmp_path / "another").read_bytes() == b""
     assert (tmp_path / "state.ahead").stat().st_size > 0

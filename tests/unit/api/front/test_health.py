@@ -1,19 +1,18 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import pytest
 
-from appliance.api.front.control import ControlAwayError
+from appliance.api.front.control import ControlAwayError, ControlLink
 from appliance.api.front.health import Health, routes
 from appliance.api.front.history import SampleHistory
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.services import Services
 from appliance.channel.answers.measures import Measures
 from tests.support.answers import example
+from tests.support.memory_channel import HeldChannel
 
 pytestmark = pytest.mark.anyio
 SERVING: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
@@ -26,11 +25,12 @@ class Probed:
         self._statuses = list(statuses)
         self.looks = 0
         self.history = SampleHistory(self._measures)
-        self.control = SimpleNamespace(connected=True, paused="")
-        services = SimpleNamespace(control=self.control, history=self.history)
+        self.control = ControlLink(lambda _tokens: None, lambda: None)
+        self.control.attach(HeldChannel())
+        self.control.known = True
         (self._ready,) = [
             one.endpoint  # type: ignore[attr-defined]  # it is a route with one
-            for one in routes(cast(Services, services)).routes
+            for one in routes(self.control, self.history).routes
             if one.path == "/readyz"  # type: ignore[attr-defined]  # and a path
         ]
 

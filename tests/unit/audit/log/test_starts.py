@@ -1,12 +1,11 @@
 """A robot that is started again and again beside a guest that floods: what the audit log charges to each of them."""
 
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from appliance.audit.log import disk_space
 from appliance.audit.log.budget import THE_ROBOT, Budget, DiskGroup, DiskParts, weight
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_writer import ChainWriter
@@ -65,8 +64,8 @@ class Robot:
 
 @pytest.fixture
 def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
-    disk = SimpleNamespace(f_bavail=FREE, f_frsize=1)
-    monkeypatch.setattr(disk_space, "os", SimpleNamespace(statvfs=lambda _folder: disk))
+    disk = os.statvfs_result((1, 1, 2 * FREE, FREE, FREE, 1000, 1000, 1000, 0, 255))
+    monkeypatch.setattr(os, "statvfs", lambda _folder: disk)
     one = Robot(tmp_path)
     let_pass(one.log, 1)
 

@@ -50,7 +50,7 @@ class Timers(EventLoop):
 
 
 class Reports(Reporter):
-    """What the relay reports to control."""
+    """The reports of a relay to control, in `sent`."""
 
     def __init__(self) -> None:
         super().__init__(RelayLimits())
