@@ -78,13 +78,14 @@ class Stage:
 # start many processes themselves.
 STAGES = (
     Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical"),
-    Stage(
-        "worlds", ("tests/world",), "logical", spread=True
-    ),  # a file of them computes for more than an hour
+    Stage(  # files that each compute for a quarter of an hour or more
+        "worlds", ("tests/world", "tests/integration/test_entrance_mutants.py"), "logical", spread=True
+    ),
     Stage("nodes", ("tests/integration",), "auto"),
     Stage(
         "machine",
         (
+            "tests/integration/examples/test_ros2.py",
             "tests/system/vm",
             "tests/system/console/test_sign_on.py",
             "tests/system/test_examples.py",

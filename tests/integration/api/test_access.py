@@ -77,7 +77,7 @@ def test_a_flood_of_one_host_is_rate_limited(tmp_path: Path) -> None:
 
 def test_the_first_token_is_shown_once(running: Appliance) -> None:
     token = running.ready["token"]
-    assert list(running.ready) == ["event", "master", "api", "revision", "token"]
+    assert list(running.ready) == ["event", "master", "api", "revision", "token", "warnings"]
     assert running.stop() == 0
     running.start()
     assert "token" not in running.ready

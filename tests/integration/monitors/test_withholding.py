@@ -18,10 +18,11 @@ def test_a_topic_is_withheld_from_one_host(common_lab: Lab, common_robot: Host, 
     ):
 
         def switch(*, on: bool) -> None:
-            ros.run("rostopic", "pub", "-1", "/privacy", "std_msgs/Bool", f"data: {str(on).lower()}")
+            data = f"data: {str(on).lower()}"
+            ros.run("rostopic", "pub", "-1", "/privacy", "std_msgs/Bool", data, "__name:=privacy_switch")
 
         topics = "--by", "/privacy", "--type", "command=std_msgs/String", "--type", "by=std_msgs/Bool"
-        appliance.rosrv("guard", "new", "withhold", "/chatter", *topics, "hosts=10.77.0.11")
+        appliance.rosrv("guard", "new", "withhold", "/chatter", *topics, "hosts=10.77.0.11", "silent=0")
         near, away = ros.listener("roscpp", "/chatter"), far.listener("rospy", "/chatter", name="tablet")
         ros.talker("roscpp", "/chatter")
         near.wait_for_count(20, event="received", timeout=60)

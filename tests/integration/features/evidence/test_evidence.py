@@ -74,7 +74,7 @@ def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
     assert record["detail"]["who"] == "operator"
     assert appliance.rosrv("evidence", "verify", str(bundle), state=False).stdout.endswith("sealed it\n")
     again = appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle), check=False)
-    assert (again.returncode, again.stderr) == (2, f"rosrv: {bundle}: File exists\n")
+    assert (again.returncode, again.stderr) == (2, f"rosrv: {bundle}: File exists; name a new file\n")
 
 
 def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import socket
 import socketserver
 import ssl
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import pytest
 from appliance.signing.request_signing import keys_of, reading_key
 from tests.support.appliance import Appliance
 from tests.support.certificates import Certificates, make_certificates
+from tests.support.waiting import eventually
 
 # The provider, in a thread of the test, uses functions that its library will remove.
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -190,6 +192,8 @@ class TestProxy:
         assert refused.status_code == 503
         assert "certificate verify failed" in refused.json()["detail"]
         (tmp_path / "ca.pem").write_bytes(certificates.ca.read_bytes())
+        asked_again = time.monotonic() + 5  # a failure of the provider is the answer for five seconds
+        eventually(lambda: time.monotonic() > asked_again, "five seconds")
         assert opened().sign_on("alice").raise_for_status().json()["role"] == "operator"
         assert {*proxy.connected} == {f"CONNECT {NAME}:{provider}"}
 
