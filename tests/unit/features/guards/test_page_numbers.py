@@ -9,6 +9,13 @@ from rosmop.types.roles import types_of_roles
 DOCS = Path(__file__).parents[4] / "docs"
 DEFAULTS = [
     ("driving.md", "been silent for `silent` ({} s)", "deadman", "silent"),
+    (
+        "guards.md",
+        "from the present rate: silent; defaults, which you should check: resume={}",
+        "deadman",
+        "resume",
+    ),
+    ("guards.md", "defaults, which you should check: margin={}, …", "fence", "margin"),
     ("guards.md", "(default {} m/s and", "mode", "vMax"),
     ("guards.md", "m/s and {} rad/s)", "mode", "wMax"),
     ("reference/guards.md", "within `together` ({} s)", "estop", "together"),
