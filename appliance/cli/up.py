@@ -135,7 +135,7 @@ def _announce_waiting(pairing: Pairing | None, *, as_json: bool) -> None:
     if pairing is None:
         return
     with contextlib.suppress(OSError):
-        _write(json.dumps(pairing.event) if as_json else pairing.text, as_json=as_json)
+        _write(json.dumps(pairing.waiting_event) if as_json else pairing.waiting_text, as_json=as_json)
 
 
 def _write(line: str, *, as_json: bool) -> None:

@@ -44,7 +44,8 @@ class Pairing:
     """One of two appliances, before it starts.
 
     `robot` is an address of the robot. Only `other` may send to `port`. `files` have names, users and contents.
-    `fixed_authority` is why the authority of hosts cannot be replaced.
+    `fixed_authority` is why the authority of hosts cannot be replaced. `rosrv up` prints one of the `waiting` fields
+    while control waits for its role, and `ready` is the status for systemd then.
     """
 
     robot: str
@@ -54,6 +55,6 @@ class Pairing:
     nice: int
     gate: Callable[[RoleChanges], ServiceGate]
     fixed_authority: str
-    event: Mapping[str, str]
-    text: str
+    waiting_event: Mapping[str, str]
+    waiting_text: str
     ready: str

@@ -31,11 +31,11 @@ from appliance.ipsec.strongswan import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
 from appliance.supervisor.lapse_answers import answer_for_control
+from appliance.supervisor.listener_store import ListenerRejectedError, ListenerStore
 from appliance.supervisor.machine_work import MachineWork, NoMachineWork, Terms
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.priority import PrioritizedProcess, keep_priorities
@@ -132,7 +132,7 @@ class Supervisor:
             for role in roles
             for index in range((role.most or relays) if role.indexed else 1)
         ]
-        self.kept = InheritedListeners()
+        self.kept = ListenerStore()
         self.kept.keep(ADMIN, admin.detach())
         self._listeners = dict(listeners or {})
         self._memories = memories

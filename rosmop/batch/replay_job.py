@@ -69,7 +69,7 @@ class ReplayJob(msgspec.Struct, frozen=True, tag=True):
     strict: bool
 
 
-class Effect(msgspec.Struct, frozen=True):
+class EffectCount(msgspec.Struct, frozen=True):
     """How often a monitor had an effect of a kind on a topic or timer; times are in nanoseconds."""
 
     monitor: str
@@ -116,7 +116,7 @@ class Replayed(msgspec.Struct, frozen=True, tag=True):
     passed: int
     changed: int
     dropped: int
-    effects: list[Effect]
+    effects: list[EffectCount]
     occurrences: list[Occurrence]
     margins: list[ClosestMargin]
     notes: list[str]
@@ -142,7 +142,7 @@ def replayed(job: ReplayJob, path: Path) -> Replayed:
 class _Summary:
     def __init__(self, job: ReplayJob) -> None:
         self._job = job
-        self._effects: dict[tuple[str, str, str], Effect] = {}
+        self._effects: dict[tuple[str, str, str], EffectCount] = {}
         self._occurrences: list[Occurrence] = []
         self._closest: dict[tuple[str, int, int, int, bool], ClosestMargin] = {}
 
@@ -165,7 +165,7 @@ class _Summary:
         key = found.monitor, step.topic or timer or "", found.kind
         known = self._effects.get(key)
         count, first = (1, time) if known is None else (known.count + 1, known.first)
-        self._effects[key] = Effect(found.monitor, found.kind, key[1], count, first, time)
+        self._effects[key] = EffectCount(found.monitor, found.kind, key[1], count, first, time)
         if count <= self._job.most:
             text = found.text[:_LONGEST].encode("utf-8", "backslashreplace").decode("utf-8")
             place = (time, step.topic, step.index, timer)

@@ -403,7 +403,7 @@ def of_slice(
     for bound in trail:
         if not bound.passed and compiled.suppresses:
             continue
-        if all(map(_same, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
+        if all(map(_same_value, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
             happened.append(EventOccurrence(bound.event, bound.time, bound.sender))
             own[happened[-1]] = bound.everywhere
     if not happened:
@@ -417,7 +417,7 @@ def of_slice(
     return why if why is not None and all(own[event] for event in why.events) else None
 
 
-def _same(one: object, other: object) -> bool:
+def _same_value(one: object, other: object) -> bool:
     return bool(one == other or (one != one and other != other))  # noqa: PLR0124  NaN
 
 

@@ -40,7 +40,7 @@ FOLLOWER = Model(
 )
 
 
-class Bounded(Protocol):
+class ModelBounds(Protocol):
     @property
     def model(self) -> Model: ...
 
@@ -130,7 +130,7 @@ class Found:
 
 
 def search(
-    folder: Path, bounds: Bounded, mutant: str = "", traced: Path | None = None, *, large: bool = False
+    folder: Path, bounds: ModelBounds, mutant: str = "", traced: Path | None = None, *, large: bool = False
 ) -> Found:
     """Search all states, with `folder` for the files. `traced` is a copy of the model with a trace.
 
@@ -166,7 +166,7 @@ def search(
 Step = tuple[str, int, int]
 
 
-def accepts(folder: Path, bounds: Bounded, trace: Sequence[Step]) -> bool:
+def accepts(folder: Path, bounds: ModelBounds, trace: Sequence[Step]) -> bool:
     steps = [
         f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
         for place, (what, one, other) in enumerate(trace)

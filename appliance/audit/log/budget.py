@@ -78,7 +78,7 @@ class DiskParts:
         if (group := self._group_of(host)) is not None:
             self._owed[group] = max(0, self._owed.get(group, 0) + change)
 
-    def pay(self, paid: int) -> None:
+    def lower_all(self, paid: int) -> None:
         self._owed = {group: owed - paid for group, owed in self._owed.items() if owed > paid}
 
     def resize(self, free: int) -> None:
@@ -228,7 +228,7 @@ class Budget:
             self._within.clear()
             for host, _owed in list(self.owed.holders()):
                 self._lower(host, paid)
-            self.parts.pay(paid)
+            self.parts.lower_all(paid)
 
     def _forgive(self) -> None:
         bounds, before = self._plenty if self._left is None else self._scarce, self.owed.bounds

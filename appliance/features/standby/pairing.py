@@ -44,8 +44,8 @@ def pairing_in(state: Path) -> Pairing | None:
         nice=LEASE_NICE,
         gate=LeaseWatch,
         fixed_authority=_FIXED_AUTHORITY,
-        event={"event": "standby", "name": name, "other": other},
-        text=f"This appliance ({name}) is ready to be active, or to take over from {other}"
+        waiting_event={"event": "standby", "name": name, "other": other},
+        waiting_text=f"This appliance ({name}) is ready to be active, or to take over from {other}"
         f" ({membership.other_address}): rosrv standby status",
         ready="ready to take over: rosrv standby status",
     )

@@ -15,8 +15,8 @@ class ListenerRejectedError(ValueError):
     """A socket is not kept."""
 
 
-class InheritedListeners:
-    """The kept sockets; this object owns their descriptors."""
+class ListenerStore:
+    """The kept sockets. It owns their descriptors."""
 
     def __init__(self, *, limit: int = 10_000) -> None:
         self._limit = limit

@@ -4,14 +4,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
+from appliance.supervisor.listener_store import ListenerRejectedError, ListenerStore
 
 pytestmark = pytest.mark.usefixtures("sockets")
 
 
 @pytest.fixture
-def kept() -> Iterator[InheritedListeners]:
-    sockets = InheritedListeners(limit=2)
+def kept() -> Iterator[ListenerStore]:
+    sockets = ListenerStore(limit=2)
     yield sockets
     sockets.close()
 
@@ -28,7 +28,7 @@ def _is_open(descriptor: int) -> bool:
     return True
 
 
-def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) -> None:
+def test_a_kept_socket_is_there_until_it_is_dropped(kept: ListenerStore) -> None:
     descriptor = _listening()
     kept.keep("outer:a1", descriptor)
     assert list(kept) == [("outer:a1", descriptor)]
@@ -37,7 +37,7 @@ def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) ->
     assert not _is_open(descriptor)
 
 
-def test_a_name_stands_for_one_socket(kept: InheritedListeners) -> None:
+def test_a_name_stands_for_one_socket(kept: ListenerStore) -> None:
     first, second, other = _listening(), _listening(), _listening()
     kept.keep("other", other)
     kept.keep("rvmaster", first)
@@ -46,7 +46,7 @@ def test_a_name_stands_for_one_socket(kept: InheritedListeners) -> None:
     assert not _is_open(first)
 
 
-def test_there_is_a_bound(kept: InheritedListeners) -> None:
+def test_there_is_a_bound(kept: ListenerStore) -> None:
     kept.keep("one", _listening())
     kept.keep("two", _listening())
     third = _listening()
@@ -57,14 +57,14 @@ def test_there_is_a_bound(kept: InheritedListeners) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a\n", "-a", "x" * 201, "\u00e4", "a\0"])
-def test_only_plain_names_are_accepted(kept: InheritedListeners, name: str) -> None:
+def test_only_plain_names_are_accepted(kept: ListenerStore, name: str) -> None:
     descriptor = _listening()
     with pytest.raises(ListenerRejectedError, match="not a valid name"):
         kept.keep(name, descriptor)
     assert not _is_open(descriptor)
 
 
-def test_only_listening_sockets_are_kept(kept: InheritedListeners) -> None:
+def test_only_listening_sockets_are_kept(kept: ListenerStore) -> None:
     read_end, write_end = os.pipe()
     os.close(write_end)
     with pytest.raises(ListenerRejectedError, match="not a socket"):
