@@ -11,13 +11,15 @@ messages.
 
 import asyncio
 from collections.abc import Callable, Iterable
+from typing import Protocol
 
 import msgspec
 
 from appliance.base import clock
+from appliance.channel.messages import StateLeft
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.replication import Pair
-from appliance.specifications.rollout import InheritedState, Rollout
+from appliance.specifications.rollout import InheritedState
 from appliance.store.state_file import StateStore
 
 _ACTIVE = "active appliance"
@@ -43,6 +45,18 @@ class _Copies(msgspec.Struct, frozen=True):
     epoch: int
     at: int
     """The time of the states (ns), or 0 if the relays passed no message since."""
+
+
+class StateHolders(Protocol):
+    """The relays, whose monitors have the state, as `Rollout` reaches them."""
+
+    def has_state(self) -> bool: ...
+
+    async def leave(self, seconds: float) -> list[bytes]: ...
+
+    async def copies(self, seconds: float, *, full: bool) -> list[StateLeft]: ...
+
+    def pass_again(self) -> None: ...
 
 
 def _save_copies(store: StateStore, epoch: int, contents: Iterable[tuple[int, bytes]], at: int) -> None:
@@ -78,29 +92,31 @@ def inherited_state(pair: Pair, store: StateStore) -> tuple[InheritedState, Call
     return InheritedState(lost, left, copies.at) if fresh else InheritedState(lost), taken
 
 
-async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
+async def leave_state(pair: Pair, store: StateStore, relays: StateHolders) -> None:
     """Store the state of all monitors after their last message, before the lease is given up."""
     try:
-        contents = await rollout.leave(_LEAVE_SECONDS)
+        contents = await relays.leave(_LEAVE_SECONDS)
     except (TimeoutError, ConnectionError) as error:
         raise HandOverError("a relay does not answer; try again") from error
     _save_copies(store, pair.epoch, enumerate(contents), 0)
 
 
-def keep_state(store: StateStore, rollout: Rollout) -> None:
+def keep_state(store: StateStore, relays: StateHolders) -> None:
     """Void the states that relays left for a switchover, and let messages pass again."""
     store.save_setting(_COPIES, "")
-    rollout.pass_again()
+    relays.pass_again()
 
 
 class StateCopies:
     """Copies the states of monitors for an unplanned takeover."""
 
-    def __init__(self, pair: Pair, store: StateStore, rollout: Rollout, followed: Callable[[], bool]) -> None:
+    def __init__(
+        self, pair: Pair, store: StateStore, relays: StateHolders, followed: Callable[[], bool]
+    ) -> None:
         # `followed()` returns whether the standby gets changes now.
         self._epoch = pair.epoch
         self._store = store
-        self._rollout = rollout
+        self._relays = relays
         self._followed = followed
         self._complete = False  # whether the stored copies are those of all relays
         self._noted = 0.0
@@ -112,12 +128,12 @@ class StateCopies:
 
     async def rehearse(self) -> None:
         """Copy all states, which are as much as `leave_state` will store. Raises `HandOverError`."""
-        if not self._rollout.has_state():
+        if not self._relays.has_state():
             return
         copied = False
         try:
             async with asyncio.timeout(_LEAVE_SECONDS), self._copying:
-                copies = await self._rollout.copies(_LEAVE_SECONDS, full=True)
+                copies = await self._relays.copies(_LEAVE_SECONDS, full=True)
                 copied = all(copy.at for copy in copies)
                 if copied:  # otherwise a state cannot be copied while messages pass
                     contents = enumerate(copy.content or b"" for copy in copies)
@@ -134,15 +150,15 @@ class StateCopies:
             return await self._copy_changed()
 
     async def _copy_changed(self) -> float:
-        if not self._rollout.has_state() or not self._followed():
+        if not self._relays.has_state() or not self._followed():
             self._void()
             return _COPY_SECONDS
         try:
-            copies = await self._rollout.copies(_RELAY_SECONDS, full=not self._complete)
+            copies = await self._relays.copies(_RELAY_SECONDS, full=not self._complete)
         except (TimeoutError, ConnectionError):
             self._void()
             return _COPY_SECONDS
-        if not self._rollout.has_state():  # an operator has ordered a switchover since
+        if not self._relays.has_state():  # an operator has ordered a switchover since
             return _COPY_SECONDS
         if not all(copy.at for copy in copies):
             self._void()
@@ -158,7 +174,7 @@ class StateCopies:
     def _void(self) -> None:
         if self._complete:
             self._complete = False
-            if self._rollout.has_state():
+            if self._relays.has_state():
                 self._store.save_setting(_COPIES, "")
 
 

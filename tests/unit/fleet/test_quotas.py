@@ -1,68 +1,52 @@
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rosrv_fleet.config import Limits
 from rosrv_fleet.quotas import OverQuotaError, RobotQuotas
 
-from appliance.base.clock import using
-from tests.support.virtual_clock import VirtualClock
+from appliance.base.clock import wall
+from tests.support.virtual_clock import let_time_pass, set_wall
 
 _DAY = 86_400.0
 
 
-class _Clock:
-    def __init__(self) -> None:
-        self.now = 1e9
-
-    def __call__(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def clock() -> _Clock:
-    return _Clock()
-
-
-def quotas(folder: Path, clock: _Clock) -> RobotQuotas:
+def quotas(folder: Path) -> RobotQuotas:
     limits = Limits(robot_bytes_per_day=1_000_000, robot_unpacked_bytes_per_day=4_000_000)
-    return RobotQuotas(folder, limits, clock)
+    return RobotQuotas(folder, limits)
 
 
 @pytest.mark.parametrize("used", [(1_000_000, 0), (0, 4_000_000)])
-def test_used_bytes_survive_a_restart_and_return_evenly(
-    used: tuple[int, int], clock: _Clock, tmp_path: Path
-) -> None:
-    found = quotas(tmp_path, clock)
+def test_used_bytes_survive_a_restart_and_return_evenly(used: tuple[int, int], tmp_path: Path) -> None:
+    found = quotas(tmp_path)
     found.check("arm1")
     found.charge("arm1", 2 * used[0], 2 * used[1])
-    clock.now += _DAY / 2
-    for again in (found, quotas(tmp_path, clock)):
+    let_time_pass(_DAY / 2)
+    for again in (found, quotas(tmp_path)):
         with pytest.raises(OverQuotaError) as error:
             again.check("arm1")
         assert error.value.seconds == pytest.approx(_DAY / 2)
         again.check("arm2")
-    clock.now += _DAY / 2 + 1
+    let_time_pass(_DAY / 2 + 1)
     found.check("arm1")
 
 
-def test_used_bytes_return_evenly_after_a_corrected_clock(clock: _Clock, tmp_path: Path) -> None:
-    clock.now += 365 * _DAY
-    quotas(tmp_path, clock).charge("arm1", 2_000_000, 0)
-    clock.now -= 365 * _DAY
-    found = quotas(tmp_path, clock)
+def test_used_bytes_return_evenly_after_a_corrected_clock(tmp_path: Path) -> None:
+    set_wall(wall() + 365 * _DAY)
+    quotas(tmp_path).charge("arm1", 2_000_000, 0)
+    set_wall(wall() - 365 * _DAY)
+    found = quotas(tmp_path)
     for _ in range(2):
         with pytest.raises(OverQuotaError) as error:
             found.check("arm1")
         assert error.value.seconds > 0
-        clock.now += _DAY / 2 + 1
+        let_time_pass(_DAY / 2 + 1)
     found.check("arm1")
 
 
-def test_a_robot_that_was_off_sends_its_backlog_faster(clock: _Clock, tmp_path: Path) -> None:
-    found = quotas(tmp_path, clock)
+def test_a_robot_that_was_off_sends_its_backlog_faster(tmp_path: Path) -> None:
+    found = quotas(tmp_path)
     found.charge("arm1", 65_536, 65_536)
-    clock.now += 30 * _DAY
+    let_time_pass(30 * _DAY)
     for _ in range(8):
         found.check("arm1")
         found.charge("arm1", 1_000_000, 0)
@@ -73,9 +57,9 @@ def test_a_robot_that_was_off_sends_its_backlog_faster(clock: _Clock, tmp_path: 
         found.check("arm2")
 
 
-def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
+def test_a_tiny_segment_has_its_price(tmp_path: Path) -> None:
     """Otherwise a robot could store countless files with few bytes."""
-    found = quotas(tmp_path, clock)
+    found = quotas(tmp_path)
     for _ in range(1_000_000 // 65_536 + 1):
         found.check("arm1")
         found.charge("arm1", 1, 1)
@@ -83,22 +67,13 @@ def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
         found.check("arm1")
 
 
-@pytest.fixture
-def machine() -> Iterator[VirtualClock]:
-    machine = VirtualClock()
-    with using(machine):
-        yield machine
-
-
-def test_a_robot_pauses_after_a_refusal_by_its_processor_time(
-    clock: _Clock, tmp_path: Path, machine: VirtualClock
-) -> None:
-    found = quotas(tmp_path, clock)
+def test_a_robot_pauses_after_a_refusal_by_its_processor_time(tmp_path: Path) -> None:
+    found = quotas(tmp_path)
 
     def pause() -> float:
         with pytest.raises(OverQuotaError, match="has to pause") as error:
             found.check("arm1")
-        machine.advance(error.value.seconds + 1e-6)  # rounded
+        let_time_pass(error.value.seconds + 1e-6)  # rounded
         found.check("arm1")
         return error.value.seconds
 
@@ -108,9 +83,9 @@ def test_a_robot_pauses_after_a_refusal_by_its_processor_time(
     found.check("arm2")
 
 
-def test_a_damaged_file_begins_again(clock: _Clock, tmp_path: Path) -> None:
+def test_a_damaged_file_begins_again(tmp_path: Path) -> None:
     (tmp_path / "arm1.json").write_bytes(b"")
-    found = quotas(tmp_path, clock)
+    found = quotas(tmp_path)
     found.check("arm1")
     found.charge("arm1", 2_000_000, 0)
     with pytest.raises(OverQuotaError):

@@ -1,8 +1,8 @@
 import asyncio
+import datetime
 from collections.abc import Callable, Collection, Coroutine
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import msgspec
 import pytest
@@ -12,6 +12,7 @@ from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.machine import Baseline, BundleRollout, HealthGates, OperatorAct, RobotSeen
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
+from tuf.api.metadata import Root
 
 from appliance.formats.bundle_api import RobotReport
 from appliance.formats.terms import BundlePath, Ring, Terms
@@ -104,6 +105,10 @@ def _service(
 ) -> BundleService:
     members = dict.fromkeys(robots, _GROUP)
     return BundleService(folder / "absent", folder / "key", store, lambda: members, lambda: now[0])
+
+
+def _published(bundles: dict[str, Terms]) -> PublishedBundles:
+    return PublishedBundles(Root(), 1, bundles, datetime.datetime.max)  # noqa: DTZ901  never compared
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, calls: _Calls, work: Coroutine[Any, Any, T]) -> T:
@@ -208,7 +213,7 @@ def test_a_rollout_with_an_unknown_robot_does_not_start(
 ) -> None:
     service, path = _service(store, tmp_path, [1010.0]), "site-a/arms/3.tar"
     terms = Terms(0, [Ring("canary", ["r-0", "r-zero"]), Ring("rest", [], 100)])
-    service.publisher.publication = cast(PublishedBundles, SimpleNamespace(bundles={path: terms}))
+    service.publisher.publication = _published({path: terms})
     with pytest.raises(RolloutRefusedError, match="r-zero, not enrolled in site-a/arms"):
         _run(monkeypatch, _Calls(), service.start(BundlePath.parse(path), HealthGates(), "olga"))
     assert store.stored.rollout == _ROLLOUT
@@ -226,7 +231,7 @@ def test_the_next_rollout_moves_no_robot_of_a_later_ring_back(
     service = _service(store, tmp_path, [1010.0], ("r-0", "r-9"))
     terms = Terms(0, [Ring("canary", ["r-0"]), Ring("rest", [], 100)])
     paths = {f"site-a/arms/{version}.tar": terms for version in f"{signed}45"}
-    service.publisher.publication = cast(PublishedBundles, SimpleNamespace(bundles=paths))
+    service.publisher.publication = _published(paths)
     store.seen["r-9"] = StoredReport(_GROUP, RobotSeen(1000.0, _PATH))
     store.change(state=end)
 

@@ -1,5 +1,4 @@
 import ctypes
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,7 +22,7 @@ def test_the_kernels_flag_decides(
         given.contents.status = status
         return answer
 
-    monkeypatch.setattr(clock_sync, "_libc", SimpleNamespace(adjtimex=adjtimex))
+    monkeypatch.setattr("appliance.supervisor.clock_sync._libc.adjtimex", adjtimex)
     assert clock_is_synchronised() is expected
     assert asked == [0]
 

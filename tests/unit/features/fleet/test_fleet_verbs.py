@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from appliance.features.fleet import verbs
-from appliance.features.fleet.connection import reason_in
+from appliance.features.fleet.connection import CollectorConnection, reason_in
 from appliance.formats.fleet_membership import JoinRequest
 
 _CERTIFICATE = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
@@ -28,21 +28,15 @@ def test_a_join_needs_no_checkpoint(
     invitation = tmp_path / "arm7.json"
     invitation.write_text(json.dumps(_INVITATION))
 
-    class Collector:
-        def __init__(self, *_: Any) -> None:
-            pass
-
-        def post(self, _path: str, body: bytes) -> None:
-            posted.append(msgspec.json.decode(body, type=JoinRequest))
-
-        def close(self) -> None: ...
+    def post(_collector: CollectorConnection, _path: str, body: bytes) -> None:
+        posted.append(msgspec.json.decode(body, type=JoinRequest))
 
     def prepared(folder: Path, _invitation: Any) -> str:
         folder.mkdir()
         (folder / "invitation").touch()
         return _CERTIFICATE
 
-    monkeypatch.setattr(verbs, "CollectorConnection", Collector)
+    monkeypatch.setattr(CollectorConnection, "post", post)
     monkeypatch.setattr(verbs, "prepare_membership", prepared)
     verbs.join(invitation, state)
     assert [request.key for request in posted] == [sent]

@@ -1,9 +1,8 @@
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import cast
 
 import msgspec
 import pytest
+from tuf.api.metadata import TargetFile
 
 from appliance.features.fleet.bundle_link import BundleOffered, BundleStated, RefusedBundle
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
@@ -11,12 +10,14 @@ from appliance.features.fleet.poller import Poller
 from appliance.features.fleet.verified_bundles import (
     BundleRejectedError,
     BundleTooEarlyError,
+    SelectedBundle,
     VerifiedBundle,
     VerifiedBundles,
 )
 from appliance.formats.bundle_api import RobotReport
 from appliance.formats.bundle_archive import BundleContents
 from appliance.formats.terms import BundlePath
+from tests.support.idle import idle
 
 PATH = BundlePath("site-a", "arms", 7)
 TIME = 1_700_000_000.0
@@ -31,14 +32,12 @@ class Site:
         self.stated = BundleStated()
         self.offered: list[tuple[str, str]] = []
         self.reported: list[RobotReport] = []
-        bundles = SimpleNamespace(
-            refresh=lambda: None,
-            selected=lambda: SimpleNamespace(path=PATH, sha256=self.selected),
-            get=self._get,
-        )
+        bundles, connection = idle(VerifiedBundles), idle(CollectorConnection)
+        vars(bundles).update(selected=self._select, get=self._get)
+        vars(connection).update(put=self._put)
         self.poller = Poller(
-            cast(VerifiedBundles, bundles),
-            cast(CollectorConnection, SimpleNamespace(put=self._put)),
+            bundles,
+            connection,
             (PATH.site, PATH.group),
             60.0,
             lambda: self.stated,
@@ -46,7 +45,10 @@ class Site:
             lambda: TIME,
         )
 
-    def _get(self, selected: SimpleNamespace) -> VerifiedBundle:
+    def _select(self) -> SelectedBundle:
+        return SelectedBundle(PATH, TargetFile(1, {"sha256": self.selected}, str(PATH)))
+
+    def _get(self, selected: SelectedBundle) -> VerifiedBundle:
         error = next(self.errors, None)
         if error is not None:
             raise error

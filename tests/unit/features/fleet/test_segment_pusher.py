@@ -140,19 +140,16 @@ def test_a_receipt_for_another_segment_is_refused(
 def test_a_kill_between_receipt_and_position(
     collector: Collector, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class KilledError(BaseException):
-        pass
-
     receipts = tmp_path / "state" / "receipts.ndjson"
 
     def killed(*given: Any) -> None:
         if receipts.exists():
-            raise KilledError
+            raise SystemExit
         write_whole(*given)
 
     with monkeypatch.context() as patch:
         patch.setattr(segment_pusher, "write_whole", killed)
-        with pytest.raises(KilledError):
+        with pytest.raises(SystemExit):
             make().step()
     receipts.write_bytes(receipts.read_bytes()[:-40])  # and the disk kept a part of the line
     pusher = make()

@@ -1,6 +1,5 @@
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from rosrv_fleet.enrolment import EnrolmentError
@@ -11,6 +10,7 @@ from appliance.features.fleet import verbs
 from appliance.features.fleet.connection import CollectorError, robot_context
 from appliance.formats.fleet_membership import Invitation
 from appliance.signing.own_certificate import make_own_certificate
+from appliance.supervisor.users import Account
 from tests.support.enrolled_robots import JoiningAppliance
 from tests.support.virtual_clock import VirtualClock
 
@@ -33,7 +33,7 @@ def test_a_join_with_a_wrong_clock_is_refused(years: float, tmp_path: Path) -> N
 
 
 def test_a_join_after_the_clock_was_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verbs, "account_of", lambda _user: SimpleNamespace(uid=os.getuid(), gid=os.getgid()))
+    monkeypatch.setattr(verbs, "account_of", lambda user: Account(user, os.getuid(), os.getgid()))
     invitation = Invitation(
         robot="arm7", collector="https://192.0.2.9:8444", authority="", receipt_key="", expires=1.0,
         token=f"rosrv-join_{'A' * 43}",

@@ -1,7 +1,6 @@
 import asyncio
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
 
 import pytest
 
@@ -17,7 +16,6 @@ from appliance.features.standby.inheritance import (
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.tunnels import StandbyTunnels
-from appliance.specifications.rollout import Rollout
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.features.standby.standby_site import memberships
@@ -56,14 +54,14 @@ class Pairs:
         return state.lost, state.left
 
     def hand_over(self, content: bytes) -> None:
-        asyncio.run(leave_state(self.present, self.store, cast(Rollout, Relays(content))))
+        asyncio.run(leave_state(self.present, self.store, Relays(content)))
 
     @property
     def present(self) -> Pair:
         return self.members["a"]._replace(epoch=self.epoch)
 
     def copies(self, *contents: bytes | None, followed: bool = True) -> StateCopies:
-        made = StateCopies(self.present, self.store, cast(Rollout, Relays(*contents)), lambda: followed)
+        made = StateCopies(self.present, self.store, Relays(*contents), lambda: followed)
         asyncio.run(made.copy_once())
         return made
 
@@ -133,7 +131,7 @@ def test_a_state_that_was_left_is_void_if_its_appliance_went_on(pairs: Pairs) ->
 def test_a_failed_switchover_makes_the_state_void(pairs: Pairs) -> None:
     pairs.active("a")
     pairs.hand_over(b"left by a")
-    keep_state(pairs.store, cast(Rollout, Relays()))
+    keep_state(pairs.store, Relays())
     assert pairs.active("b")[1] == ()
 
 
@@ -150,7 +148,7 @@ def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
 def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> None:
     pairs.active("a")
     relays, followed = Relays(b"of relay 0", b"of relay 1"), [True]
-    copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: followed[0])
+    copies = StateCopies(pairs.present, pairs.store, relays, lambda: followed[0])
     asyncio.run(copies.copy_once())
     pairs.copy_age = {"old": 6.0, "none": None}.get(why, 1.0)
     relays.contents = (b"of relay 0", None)  # the second has not changed
@@ -167,7 +165,7 @@ def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> No
 def test_a_rehearsal_stores_as_much_as_the_switchover_while_messages_pass(pairs: Pairs) -> None:
     pairs.active("a")
     relays = Relays(b"of relay 0", b"of relay 1")
-    copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: True)
+    copies = StateCopies(pairs.present, pairs.store, relays, lambda: True)
     asyncio.run(copies.copy_once())
     relays.contents = (b"later", b"of relay 1")
     asyncio.run(copies.rehearse())
@@ -179,7 +177,7 @@ def test_a_rehearsal_that_fails_refuses_the_switchover_and_is_followed_by_a_whol
     """A relay that did answer sends its last changes only once, so a copy of later changes would lack them."""
     pairs.active("a")
     relays = Relays(b"of relay 0", b"of relay 1")
-    copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: True)
+    copies = StateCopies(pairs.present, pairs.store, relays, lambda: True)
     asyncio.run(copies.copy_once())
     relays.hangs = True
     with pytest.raises(HandOverError, match="a relay does not answer"):
