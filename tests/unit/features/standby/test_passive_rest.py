@@ -20,27 +20,17 @@ from appliance.channel.messages.api import (
 )
 from appliance.control.operators.token_orders import TOKENS
 from appliance.features.standby import passive_rest
-from appliance.features.standby.answers import StandbyState
-from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.orders import StandbyAdministration
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
-from tests.support.answers import example
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
+from tests.unit.features.standby.parts import Member
 
 pytestmark = pytest.mark.anyio
-
-
-class Standby:
-    def state(self) -> StandbyState:
-        return example(StandbyState, role="standby", other={"name": "a", "address": "10.0.0.1"})
-
-    async def hand_over(self) -> None:
-        raise HandOverError("not now")
 
 
 def made(name: str) -> tuple[TokenRow, str]:
@@ -58,7 +48,7 @@ def save(folder: Path, *rows: TokenRow) -> None:
 
 def rest_of(folder: Path) -> PassiveRest:
     tokens = ReplicatedTokens(folder / "state.db")
-    return PassiveRest(StandbyAdministration(Standby(), orders=False), tokens)
+    return PassiveRest(StandbyAdministration(Member("standby"), orders=False), tokens)
 
 
 def attached(rest: PassiveRest) -> tuple[Channel, asyncio.Queue[Any]]:
@@ -86,7 +76,7 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
         api.send(RequestMade(7, admin.StatusWanted(), token))
         answer = await heard.get()
     assert isinstance(answer, RequestAnswered)
-    assert admin.decode(answer.answer, admin.StatusWanted()).active == "10.0.0.1"
+    assert admin.decode(answer.answer, admin.StatusWanted()).active == "10.0.0.2"
     api.close()
 
 

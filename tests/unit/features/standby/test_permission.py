@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 from collections import deque
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +14,6 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import LeaseClient
-from appliance.features.standby.membership import Membership
 from appliance.features.standby.process import LeaseProcess
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_frames import Stored
@@ -28,14 +26,10 @@ from appliance.features.standby.witness.settings import AppliancePeer
 from tests.support.examples import examples
 from tests.support.memory_channel import memory_link
 from tests.support.virtual_clock import VirtualClock
+from tests.unit.features.standby.parts import MEMBERSHIP, CountedDatabase
 
 ADDRESSES = {"a": "10.0.0.2", "b": "10.0.0.3"}
 KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
-MEMBERSHIP = Membership(
-    name="a", other="b", address=ADDRESSES["a"], other_address=ADDRESSES["b"], fixed="10.0.0.100",
-    witness="10.0.0.1", witness_port=7411, witness_key=KEYS["a"].hex(), peer_key="cc" * 32, certificate="", key="",
-    other_certificate="",
-)  # fmt: skip
 STEPS = (
     "change", "ship", "acknowledge", "connect", "disconnect", "time", "witness", "answer", "lose", "report",
     "to lease", "to control", "restart", "settle", "settle", "away", "back", "back",
@@ -48,30 +42,12 @@ STORIES = {
 }
 
 
-class Feed:
-    size = 0
-
-    def release(self, _number: int) -> None: ...
-
-
 class Datagrams:
     def __init__(self, sent: deque[bytes]) -> None:
         self._sent = sent
 
     def sendto(self, datagram: bytes, _to: tuple[str, int]) -> None:
         self._sent.append(datagram)
-
-
-class Store:
-    history = "history"
-
-    def __init__(self) -> None:
-        self.number = 0
-
-    def follow(self, _notice: object, _room: int) -> Feed:
-        return Feed()
-
-    async def settled(self) -> None: ...
 
 
 class Pair:
@@ -90,9 +66,8 @@ class Pair:
         away: Any = Datagrams(deque())
         asking: Any = Datagrams(self.requests)
         self.lease = LeaseProcess(MEMBERSHIP, lifeline, folder / "epoch", peers=away, asking=asking)
-        parts: Any = self.lease
-        parts.child = SimpleNamespace(tell=self.to_control.append)
-        self.database = Store()
+        patch.setattr(self.lease.child, "tell", self.to_control.append)
+        self.database = CountedDatabase()
         self.standby = 0  # the last change on the standby's disk
         self.acknowledgements = deque[int]()
         self.answered = 0
@@ -110,8 +85,9 @@ class Pair:
         self.client = LeaseClient()
         client: Any = self.client
         client.send = self.to_lease.append
-        store: Any = self.database
-        self.control = Replication(MEMBERSHIP, self.client, store, 2, taken_over=taken_over, folder=Path())
+        self.control = Replication(
+            MEMBERSHIP, self.client, self.database, 2, taken_over=taken_over, folder=Path()
+        )
         self.lease.control_linked()
         self.control.begin()
 
@@ -126,10 +102,9 @@ class Pair:
         sender: Any = self.control.sender
         match name:
             case "change":
-                self.database.number += 1
-                self.waiting.add(asyncio.ensure_future(self._answer(self.database.number)))
+                self.waiting.add(asyncio.ensure_future(self._answer(self.database.change())))
             case "connect":
-                sender.link = sender.link or SimpleNamespace(cancel=lambda: None)
+                sender.link = sender.link or asyncio.Future[None]()
             case "disconnect":
                 sender.link = None
                 self.acknowledgements.clear()

@@ -3,7 +3,6 @@
 import asyncio
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -12,27 +11,15 @@ import pytest
 from appliance.base import clock
 from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
-from appliance.features.standby.membership import Membership
 from appliance.features.standby.orders import ActiveAppliance
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_sender import ReplicationLag
+from tests.unit.features.standby.parts import MEMBERSHIP, CountedDatabase
 
 pytestmark = pytest.mark.anyio
 
-MEMBERSHIP = Membership(
-    name="a", other="b", address="10.0.0.2", other_address="10.0.0.3", fixed="10.0.0.100", witness="10.0.0.1",
-    witness_port=7411, witness_key="aa" * 32, peer_key="cc" * 32, certificate="", key="", other_certificate="",
-)  # fmt: skip
 REFUSED_SECONDS = 2.0
 PAUSE_SECONDS = 2.0
-
-
-class Database:
-    history = "history"
-    number = 7
-
-    def follow(self, _notice: object, _room: int) -> SimpleNamespace:
-        return SimpleNamespace(size=0)
 
 
 class Active:
@@ -44,11 +31,11 @@ class Active:
         self.delay, self.connected, self.obstacle = 0.1, True, ""
         self.written = 0.0
         self.lease = LeaseClient()
-        client, database = self.lease, Database()
+        client, database = self.lease, CountedDatabase(7)
         parts: Any = client
         parts.send = self._ordered
         parts = self.replication = Replication(
-            MEMBERSHIP, client, database, 4, taken_over=False, folder=Path()  # type: ignore[arg-type]  # a stand-in with the methods that the replication calls
+            MEMBERSHIP, client, database, 4, taken_over=False, folder=Path()
         )  # fmt: skip
         parts.sender.lag = self._lag
         self.database = database
