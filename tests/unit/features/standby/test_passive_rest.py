@@ -30,7 +30,7 @@ from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.unit.features.standby.parts import Member
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("local_sockets")]
 
 
 def made(name: str) -> tuple[TokenRow, str]:
@@ -62,7 +62,6 @@ def attached(rest: PassiveRest) -> tuple[Channel, asyncio.Queue[Any]]:
     return api, heard
 
 
-@pytest.mark.nightly
 async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
     """Until then, its empty list would sign users out."""
     row, token = made("alice")
@@ -80,7 +79,6 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
     api.close()
 
 
-@pytest.mark.nightly
 async def test_a_door_is_refused_at_once_and_no_request_is_lost_in_a_takeover(tmp_path: Path) -> None:
     row, token = made("alice")
     save(tmp_path, row)
@@ -101,12 +99,8 @@ async def test_a_door_is_refused_at_once_and_no_request_is_lost_in_a_takeover(tm
     api.close()
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("count", [0, 1])
-async def test_no_tokens_are_stated_before_they_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
-    monkeypatch.setattr("appliance.features.standby.passive_rest._READ_SECONDS", 0.01)
+async def test_no_tokens_are_stated_before_they_are_read(tmp_path: Path, count: int) -> None:
     rest = rest_of(tmp_path)
     api, heard = attached(rest)
     async with asyncio.timeout(20):
