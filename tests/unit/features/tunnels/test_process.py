@@ -34,7 +34,7 @@ _LIMIT_SECONDS = 30
 
 @asynccontextmanager
 async def running(
-    directory: Path, told: Callable[[Any], object], esp: Esp = "kernel"
+    directory: Path, told: Callable[[Any], None], esp: Esp = "kernel"
 ) -> AsyncIterator[tuple[process.TunnelProcess, asyncio.Task[None]]]:
     """Run the process until the end of the block. `told` gets each message to control, and to the supervisor."""
     (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
