@@ -34,7 +34,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
 from appliance.control.operators.request_method import RequestMethod
-from appliance.control.operators.sessions import Sessions
+from appliance.control.operators.sessions import Session, Sessions
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.policy.judgement import PolicyContext
@@ -267,6 +267,12 @@ class Bearers:
     usable: Callable[[], list[TokenKept]]
     changed: Callable[[], None]
     sessions: Provided[Sessions]
+
+    def people(self) -> list[Session]:
+        """Return the sessions of people."""
+        sessions = self.sessions()
+        found = [] if sessions is None else [sessions.of(row.id) for row in sessions.rows()]
+        return [session for session in found if session is not None]
 
     def provide(self, sessions: Sessions) -> None:
         self.sessions.provide(sessions)

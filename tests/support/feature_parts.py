@@ -42,6 +42,9 @@ from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.policy.policy import CurrentPolicy
+from appliance.policy.policy_compiler import compile_policy
+from appliance.specifications.in_force import InForce
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -49,14 +52,20 @@ from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.idle import idle
 
+EMPTY = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n"
+
 
 def idle_core(state: Path) -> Core:
-    """Return a core whose parts do nothing, with an empty store."""
+    """Return a core with an empty store, policy and set of specifications, whose other parts do nothing."""
     settings = read({"state": str(state)})
     store = StateStore(state, failed=print, kind=InlineDatabase)
     ends = ends_of(store, state)
     policies, trail, relay = idle(Policies), idle(AuditTrail), idle(RelayControl)
     policies.in_force = RevisionRow(0, "", "", 0.0, "", "")
+    policies.policy = CurrentPolicy()
+    policies.policy.set(compile_policy(EMPTY, file="policy"))
+    specifications = idle(SpecificationManager)
+    specifications.now = InForce()
     trail.audit, relay.taps = idle(AuditLog), idle(TapRequests)
     relay.ranks = RankStates(lambda _order: False)
     return Core(
@@ -67,7 +76,7 @@ def idle_core(state: Path) -> Core:
         ends=ends,
         links=Links(idle(ControlLifeline), lambda _sequence: None),
         policy=PolicyFacts(policies, PolicyServices(), str),
-        specifications=idle(SpecificationManager),
+        specifications=specifications,
         hosts=SiteHosts(
             BlockTable(store, ends),
             make_host_table(settings, store),

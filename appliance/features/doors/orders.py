@@ -47,7 +47,7 @@ class DoorOrders:
         self._visits = visits
         self._processes = processes
         self._viewers = ViewerTopics(core.relay, core.settings.publish_as)
-        self._own = OwnDoors(table, core.bearers.sessions)
+        self._own = OwnDoors(table, core.bearers.people)
         self._one = asyncio.Lock()
         # By ticket: the door to which connections were passed, also by an earlier control.
         self._used = {row.id: row.door for row in tickets.valid()}

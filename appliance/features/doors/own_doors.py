@@ -4,10 +4,10 @@ An administrator chooses these names. A name that the provider gives a person op
 choose it at some providers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from appliance.control.operators.sessions import Sessions
+from appliance.control.operators.sessions import Session
 from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.door_table import DoorTable, is_door_name
 
@@ -21,11 +21,11 @@ class CallerDoor(NamedTuple):
 
 
 class OwnDoors:
-    """The doors of all callers; `sessions()` returns the sessions of people."""
+    """The doors of all callers; `people()` returns the sessions of people."""
 
-    def __init__(self, table: DoorTable, sessions: Callable[[], Sessions | None]) -> None:
+    def __init__(self, table: DoorTable, people: Callable[[], Iterable[Session]]) -> None:
         self._table = table
-        self._sessions = sessions
+        self._people = people
 
     def of(self, who: str) -> CallerDoor:
         groups = self._groups(who)
@@ -43,9 +43,5 @@ class OwnDoors:
         return CallerDoor("", None, text)
 
     def _groups(self, who: str) -> list[str] | None:
-        sessions = self._sessions()
-        found = (
-            [] if sessions is None else [sessions.of(row.id) for row in sessions.rows() if row.name == who]
-        )
-        people = [one for one in found if one is not None]
+        people = [person for person in self._people() if person.name == who]
         return [group for person in people for group in person.groups] if people else None

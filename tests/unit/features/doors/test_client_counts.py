@@ -1,14 +1,17 @@
-from types import SimpleNamespace
-from typing import Any
+from websockets.server import ServerProtocol
 
 from appliance.base import clock
 from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.door_link import MOST_SHOWN
+from appliance.features.doors.session import DoorSession
+from tests.support.idle import idle
 from tests.support.virtual_clock import VirtualClock
 
 
 def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
-    session: Any = SimpleNamespace(received=0, sent=0, refusals=0, protocol_name="rosbridge")
+    session = idle(DoorSession)
+    session._socket = ServerProtocol()
+    session.received = session.sent = session.refusals = 0
     machine = VirtualClock()
     clients = []
     with clock.using(machine):

@@ -1,13 +1,20 @@
-from types import SimpleNamespace
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from appliance.features.doors.door_rows import DoorRow
+from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.orders import DoorOrders
-from appliance.policy.model import Address
-from tests.support.core import FakeTrail
+from appliance.policy.model import address_of
+from tests.unit.features.doors.door_site import DoorSite
 
-ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> DoorSite:
+    site = DoorSite(tmp_path, monkeypatch)
+    monkeypatch.setattr(site.processes, "pass_on", lambda *_given: True)
+    return site
 
 
 @pytest.mark.parametrize(
@@ -20,29 +27,15 @@ ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
     ],
 )
 def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
-    peer: str, ticket: str, status: int, decision: str | None
+    site: DoorSite, peer: str, ticket: str, status: int, decision: str | None
 ) -> None:
     """A refusal is a denial of the peer, so those of unknown hosts are folded."""
-    trail = FakeTrail()
-
-    def blocked(host: Address) -> object | None:
-        mapped = getattr(host, "ipv4_mapped", None) or host
-        return object() if str(mapped) == "10.0.0.7" else None
-
-    orders = DoorOrders.__new__(DoorOrders)
-    row = SimpleNamespace(id="1")
-    orders.__dict__ |= {
-        "_core": SimpleNamespace(
-            policy=SimpleNamespace(current=lambda: SimpleNamespace(blocked=blocked)),
-            trail=trail,
-        ),
-        "_table": SimpleNamespace(live=lambda: [ALICE]),
-        "_visits": SimpleNamespace(find=lambda _door, _text: None),
-        "_tickets": SimpleNamespace(find=lambda _door, text: row if text == "valid" else None),
-        "_processes": SimpleNamespace(pass_on=lambda *_given: True),
-        "_used": {},
-    }
-    assert orders.enter("alice", ticket, peer, 3)[0] == status
-    assert [(one["host"], one["decision"]) for one in trail.rows] == (
+    blocks = {address_of("10.0.0.7"): "by an operator"}
+    site.policies.policy.set(replace(site.policies.current, blocks=blocks))
+    tickets, visits = DoorTickets(site.core.store, site.core.ends), DoorVisits(site.core.ends, dict)
+    orders = DoorOrders(site.core, site.table, tickets=tickets, visits=visits, processes=site.processes)
+    secret = tickets.make("alice", 60.0, "ann")[1] if ticket == "valid" else "wrong"
+    assert orders.enter("alice", secret, peer, 3)[0] == status
+    assert [(one["host"], one["decision"]) for one in site.trail.rows] == (
         [] if decision is None else [(peer, decision)]
     )

@@ -1,21 +1,24 @@
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
 from appliance.base import clock
-from appliance.features.doors.door_rows import DoorRow
+from appliance.control.operators.sessions import Session
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.own_doors import OwnDoors
+from appliance.features.doors.settings import Doors
+from appliance.store.state_file import StateStore
 from tests.support.ends import ends_in
+from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
 
-def people(**groups: tuple[str, ...]) -> Any:
-    rows = [SimpleNamespace(id=name, name=f"sso:{name}") for name in groups]
-    return SimpleNamespace(rows=lambda: rows, of=lambda one: SimpleNamespace(groups=groups[one]))
+def person(name: str, *groups: str) -> Session:
+    return Session(name, f"sso:{name}", f"subject of {name}", "", "operator", groups, 0.0)
+
+
+PEOPLE = [person("bob", "Floor 1", "hall", "floor"), person("alice", "hall"), person("agent-1")]
 
 
 @pytest.mark.parametrize(
@@ -31,14 +34,12 @@ def people(**groups: tuple[str, ...]) -> Any:
     ],
 )
 def test_a_token_has_the_door_of_its_name_and_a_person_that_of_a_group(
-    who: str, door: str, reason: str
+    tmp_path: Path, who: str, door: str, reason: str
 ) -> None:
-    rows = [
-        DoorRow(name, "198.19.240.2", 1.0, None, 0, None, "") for name in ("alice", "agent-1", "bob", "floor")
-    ]
-    sessions = people(bob=("Floor 1", "hall", "floor"), alice=("hall",), **{"agent-1": ()})
-    table = cast(DoorTable, SimpleNamespace(live=lambda: rows))
-    found = OwnDoors(table, lambda: sessions).of(who)
+    table = DoorTable(StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase), Doors())
+    for name in ("alice", "agent-1", "bob", "floor"):
+        table.save(table.planned(name, None, ""))
+    found = OwnDoors(table, lambda: PEOPLE).of(who)
     assert found.name == door
     assert reason in found.reason
     assert (found.row is None) is bool(reason)
