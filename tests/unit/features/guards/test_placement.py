@@ -1,11 +1,11 @@
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
+from appliance.channel.answers.graph_answers import Graph, Node, Topic
 from appliance.features.guards.placement import GuardedDriver, Placement
 from appliance.features.guards.view import GUARDS_VIEW, BypassedGuard, GuardsState
+from tests.support.answers import example
 from tests.unit.features.guards.test_suggestions import ROBOTS, graph_of
 
 pytestmark = pytest.mark.anyio
@@ -30,17 +30,15 @@ def placed(
     robot: str, host: str, *topics_of_guards: str, commands: Callable[[], Sequence[str]] | None = None
 ) -> tuple[Placement, Connections]:
     topics = [
-        SimpleNamespace(
-            name=one.name, type=one.type, subscribers=list(one.subscribers),
-            publishers=[SimpleNamespace(node=node, messages_per_second=1.0) for node in one.publishers],
+        example(
+            Topic, name=topic.name, type=topic.type, subscribers=list(topic.subscribers),
+            publishers=[{"node": node, "messages_per_second": 1.0} for node in topic.publishers],
         )
-        for one in graph_of(robot)
+        for topic in graph_of(robot)
     ]  # fmt: skip
-    names = {node for one in graph_of(robot) for node in (*one.publishers, *one.subscribers)}
-    graph: Any = SimpleNamespace(
-        topics=topics,
-        nodes=[SimpleNamespace(name=name, host=host if "mux" not in name else "10.0.0.77") for name in names],
-    )
+    names = {node for topic in graph_of(robot) for node in (*topic.publishers, *topic.subscribers)}
+    nodes = [example(Node, name=name, host=host if "mux" not in name else "10.0.0.77") for name in names]
+    graph = Graph(nodes, topics, [])
     connections = Connections()
     place = Placement(
         commands or (lambda: topics_of_guards), lambda: graph, connections, connections.reported.append

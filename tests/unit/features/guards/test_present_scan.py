@@ -14,6 +14,7 @@ from appliance.features.guards.presets import PRESETS
 from rosmop.tests.acting import message
 from rosmop.tool.last_messages import last_messages
 from tests.support.bags import make_bag
+from tests.support.memory_call import call_of
 
 RAYS = 120
 MS = 10**6
@@ -74,19 +75,6 @@ def test_the_shown_values_are_less_safe_by_the_preset(preset: str) -> None:
     assert PRESETS[preset].topics["by"] == (SCAN,)
 
 
-class Robot:
-    as_json = False
-
-    def __init__(self, preset: str = "separation") -> None:
-        topics = {"command": "/cmd_vel", "by": "/scan"}
-        self.proposal = Suggestion(
-            preset, preset, "Limits.", topics, {"silent": "0.5"}, {}, "rosrv guard new"
-        )
-
-    def ask_or_exit(self, _request: Any) -> Suggestions:
-        return Suggestions([self.proposal])
-
-
 Recorder = Callable[[], Any] | None
 
 
@@ -101,9 +89,14 @@ def recorder(bag: Path | None) -> Recorder:
     return lambda: spans
 
 
-def said(monkeypatch: pytest.MonkeyPatch, found: Recorder, robot: Robot) -> None:
+def suggest(
+    monkeypatch: pytest.MonkeyPatch, found: Recorder, preset: str = "separation", *, as_json: bool = False
+) -> None:
     monkeypatch.setattr(suggest_verb, "recorded_messages", found)
-    suggest_verb.suggest.function(robot, with_scan=True)
+    topics = {"command": "/cmd_vel", "by": "/scan"}
+    proposal = Suggestion(preset, preset, "Limits.", topics, {"silent": "0.5"}, {}, "rosrv guard new")
+    call = call_of(lambda _request: Suggestions([proposal]), as_json=as_json)
+    suggest_verb.suggest.function(call, with_scan=True)
 
 
 def test_suggest_says_what_the_last_recorded_scan_permits(
@@ -114,7 +107,7 @@ def test_suggest_says_what_the_last_recorded_scan_permits(
     bag = make_bag(tmp_path / "a.bag", [*messages, ("/rear", SCAN, 9.0, b"")])
     found = last_messages([("a", bag, (0, 2 * 10**9))], {"/scan": SCAN, "/rear": SCAN}, 3)
     assert len(found["/scan"]) == 3 and found["/scan"][-1][0] <= 2 * 10**9 and not found["/rear"]
-    said(monkeypatch, recorder(bag), Robot())
+    suggest(monkeypatch, recorder(bag))
     permits, free = formula(1.0, 1.6), formula(1.0, 0)
     line = capsys.readouterr().out.splitlines()[-1]
     assert line.startswith("separation: the present scan of /scan permits ") and line.endswith(
@@ -140,20 +133,18 @@ def test_an_unknown_velocity_is_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     topic, data = ("/scan", content) if content is not None else ("/other", scan(1.0))
-    said(monkeypatch, recorder(make_bag(tmp_path / "a.bag", [(topic, SCAN, 1.0, data)])), Robot())
+    suggest(monkeypatch, recorder(make_bag(tmp_path / "a.bag", [(topic, SCAN, 1.0, data)])))
     assert f"separation: what it would permit is not known: {why}" in capsys.readouterr().out
 
 
 def test_without_a_recording_no_velocity_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said(monkeypatch, lambda: None, Robot())
+    suggest(monkeypatch, lambda: None)
     assert "is not known: this appliance has no flight recorder" in capsys.readouterr().out
-    said(monkeypatch, recorder(None), Robot())
+    suggest(monkeypatch, recorder(None))
     assert "is not known: the flight recorder has no scan" in capsys.readouterr().out
-    robot = Robot()
-    robot.as_json = True
-    said(monkeypatch, recorder(None), robot)
+    suggest(monkeypatch, recorder(None), as_json=True)
     assert '"unknown":' in capsys.readouterr().out.splitlines()[-1]
-    said(monkeypatch, recorder(None), Robot("deadman"))
+    suggest(monkeypatch, recorder(None), "deadman")
     assert capsys.readouterr().out.endswith("no proposed guard limits a velocity by a scan (separation)\n")

@@ -4,15 +4,23 @@ import json
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 import typer
 
+from appliance.base.option_group import GroupedCommand, GroupedVerb
 from appliance.channel import admin
-from appliance.channel.answers.monitor_answers import GivenSet, GivenState, Replacement, Switched
-from appliance.cli.output import say_json
+from appliance.channel.admin import AdminAnswer
+from appliance.channel.answers.monitor_answers import (
+    GivenSet,
+    GivenState,
+    Monitors,
+    MonitorState,
+    Replacement,
+    Switched,
+)
 from appliance.features.guards import suggest_verb, verbs
 from appliance.features.guards.guard_answers import (
     GuardList,
@@ -45,13 +53,23 @@ from appliance.features.guards.requests import (
 )
 from appliance.features.guards.upgrades import same
 from rosmop.types.roles import ANY_TYPE
+from tests.support.answers import example
+from tests.support.memory_call import call_of
 from tests.unit.features.guards.test_released import made
+
+LOADED = [
+    GuardRow(name, "fence", "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3, version=1, origin=origin,
+             below=["silent=0 is below the standard"] * (name == "old"), digest=f"digest of {name}",
+             last_stop=LastStop(5, until, 2, "at the edge", "10.0.0.7", "/teleop", "18e9") if until != 0 else None)
+    for name, origin, until in (("fence", "current", None), ("old", "older", 7), ("mine", "changed", 0))
+]  # fmt: skip
 
 
 class Robot:
+    """An appliance with guards: its answers, and the orders that it got. `loaded` are the rows of its guards."""
+
     as_json = False
     place: str | None = None
-    said = True
     off = False
 
     def __init__(self, folder: Path | None, *guards: Guard, shadow: bool = False) -> None:
@@ -59,13 +77,15 @@ class Robot:
         self.refused = ["it would hold /c"]
         self.files = {f"{one.name}.rv": text_of(one) for one in guards}
         self.folder = None if folder is None else str(folder)
+        self.loaded = LOADED
+        margin = {"name": "margin", "value": 0.2, "default": 0.2, "kind": "double"}
         self.rows = [
-            SimpleNamespace(name=one.name, file=f"{one.name}.rv", shadow=shadow, enabled=not shadow, held=False,
-                            topics=["/cmd_vel"], given=[SimpleNamespace(name="margin", value=0.2, kind="double")])
+            example(MonitorState, name=one.name, file=f"{one.name}.rv", shadow=shadow, enabled=not shadow,
+                    topics=["/cmd_vel"], given=[margin])
             for one in guards
         ]  # fmt: skip
 
-    def ask_or_exit(self, request: Any) -> Any:
+    def answer(self, request: Any) -> Any:
         match request:
             case GuardSuggestionsWanted():
                 return Suggestions(
@@ -75,24 +95,15 @@ class Robot:
                     ["/estop_enabled: its name does not say whether true stops"],
                 )  # fmt: skip
             case GuardsWanted():
-                rows = [
-                    GuardRow(name, "fence", "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3, version=1,
-                             origin=origin, below=["silent=0 is below the standard"] * (name == "old"),
-                             digest=f"digest of {name}",
-                             last_stop=LastStop(5, until, 2, "at the edge", "10.0.0.7", "/teleop", "18e9")
-                             if until != 0 else None)
-                    for name, origin, until in (
-                        ("fence", "current", None), ("old", "older", 7), ("mine", "changed", 0)
-                    )
-                ]  # fmt: skip
-                return SimpleNamespace(guards=rows, warnings=["fence acts before rate"])
+                return GuardList(2, "2", [], self.loaded, ["fence acts before rate"])
             case GuardTry():
                 assert request.upgrade or request.values == {"margin": "0.5"}
                 assert not request.enforce
                 return GuardPlan(2, "2", "fence", "", "", False, False, {"margin": ["0.2", "0.5"]},
                                  {"command": "/c"}, 3, [], self.refused, self.off)  # fmt: skip
             case admin.MonitorsWanted():
-                return SimpleNamespace(monitors=self.rows, files=self.files, folder=self.folder)
+                loaded = example(Monitors, files=self.files, folder=self.folder)
+                return msgspec.structs.replace(loaded, monitors=self.rows)
         self.orders.append(request)
         if isinstance(request, GuardNew):
             preset = PRESETS[request.preset]
@@ -100,13 +111,6 @@ class Robot:
                 Guard(request.name, preset, request.topics, request.types, request.values)
             )
         return _changed(request)
-
-    def answer_or_exit(self, request: Any) -> Any:
-        answer = self.ask_or_exit(request)
-        if self.as_json:
-            say_json(answer)
-            raise typer.Exit
-        return answer
 
 
 def _changed(order: Any) -> Any:
@@ -123,7 +127,8 @@ FENCE = Guard("fence", PRESETS["fence"], types={"command": "geometry_msgs/Twist"
 
 
 def run(verb: Any, robot: Robot, *arguments: Any, **options: Any) -> Any:
-    verb.function(robot, *arguments, **options)
+    call = call_of(robot.answer, as_json=robot.as_json, place=robot.place)
+    verb.function(call, *arguments, **options)
     return robot.orders[0] if robot.orders else None
 
 
@@ -192,7 +197,7 @@ def test_a_plan_holds_without_the_flight_recorder(
     def replay(*_given: Any, **_options: Any) -> None:
         raise typer.Exit(status)
 
-    monkeypatch.setattr(verbs, "verb_function", lambda *_verb: SimpleNamespace(function=replay))
+    monkeypatch.setattr(verbs, "verb_function", lambda *_verb: GroupedVerb(replay, GroupedCommand))
     robot = Robot(tmp_path, FENCE)
     robot.refused = []
     with pytest.raises(typer.Exit) if status == 2 else contextlib.nullcontext():
@@ -344,44 +349,33 @@ def test_a_guard_that_cannot_be_upgraded_does_not_keep_the_others_from_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = Robot(tmp_path, Guard("old", PRESETS["fence"], types=FENCE.types))
-    ask, asked = robot.ask_or_exit, []
+    robot.loaded = [
+        GuardRow(name, "fence", "", "free", {}, {}, [], {}, 0, origin="older") for name in ("bad", "old")
+    ]
+    answer, asked = robot.answer, list[str]()
 
-    def answer(request: Any) -> Any:
+    def without_bad(request: Any) -> Any:
         match request:
-            case GuardsWanted():
-                rows = [
-                    GuardRow(name, "fence", "", "free", {}, {}, [], {}, 0, origin="older")
-                    for name in ("bad", "old")
-                ]
-                return GuardList(2, "2", [], rows)
             case GuardUpgrade("bad"):
-                raise typer.Exit(1)
+                return AdminAnswer(False, error="it is damaged", trouble="refused")
             case GuardUpgrade(name):
                 asked.append(name)
-        return ask(request)
+        return answer(request)
 
-    monkeypatch.setattr(robot, "ask_or_exit", answer)
+    monkeypatch.setattr(robot, "answer", without_bad)
     with pytest.raises(typer.Exit):
         run(verbs.upgrade, robot)
     assert asked == ["old"]
 
 
-class Removing(Robot):
-    """An appliance with one guard, as it shows it."""
-
-    def __init__(self, folder: Path, guard: Guard) -> None:
-        super().__init__(folder, guard)
-        text = text_of(guard)
-        constants = [_stated(one, guard.values[one.name]) for one in guard.preset.parameters if not one.loads]
-        self.row = GuardRow(
-            guard.name, guard.preset.name, "", "shadow", dict(guard.topics), types_in(text), constants,
-            loaded_values(text), 0, version=guard.preset.version, origin="current", below=[], digest="",
-        )  # fmt: skip
-
-    def ask_or_exit(self, request: Any) -> Any:
-        if isinstance(request, GuardsWanted):
-            return SimpleNamespace(guards=[self.row], warnings=[])
-        return super().ask_or_exit(request)
+def shown(guard: Guard) -> GuardRow:
+    """Return the guard as an appliance shows it."""
+    text = text_of(guard)
+    constants = [_stated(one, guard.values[one.name]) for one in guard.preset.parameters if not one.loads]
+    return GuardRow(
+        guard.name, guard.preset.name, "", "shadow", dict(guard.topics), types_in(text), constants,
+        loaded_values(text), 0, version=guard.preset.version, origin="current", below=[], digest="",
+    )  # fmt: skip
 
 
 def _stated(parameter: Parameter, text: str) -> GivenState:
@@ -400,7 +394,8 @@ def test_the_undo_of_a_removal_makes_the_same_guard(
     guard = made(preset, kinds)
     if "frozen" in guard.values:  # of any other type only the silence is judged
         guard = replace(guard, values={**guard.values, "frozen": "0"})
-    robot = Removing(tmp_path, guard)
+    robot = Robot(tmp_path, guard)
+    robot.loaded = [shown(guard)]
     run(verbs.remove, robot, guard.name)
     [undo] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("undo: ")]
     words = iter(shlex.split(undo)[4:])
