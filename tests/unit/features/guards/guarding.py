@@ -1,8 +1,9 @@
 import math
 import random
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Self
 
+from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender, Outcome
 from rosmop.tests.acting import fields, message
 from tests.support.features.guards.running_guard import Value, named, on_its_module, part_with
@@ -29,12 +30,31 @@ def same(one: Iterable[float], other: Iterable[float]) -> bool:
 
 
 class Guarded:
-    def __init__(self, preset: str, types: dict[str, str] | None = None, **values: Value) -> None:
-        part, given = part_with(preset, types or {}, values)
-        self.monitors = on_its_module(part)
-        self.monitors.give({"guard": given})
+    """A base behind a guard, and behind the monitors of the texts `before` it; `got` is what arrives there."""
+
+    def __init__(
+        self,
+        preset: str,
+        types: dict[str, str] | None = None,
+        *,
+        before: Sequence[str] = (),
+        **values: Value,
+    ) -> None:
+        part, given = part_with(preset, types or {}, values, before=before)
+        monitors = on_its_module(part)
+        monitors.give({"guard": given})
+        self._begin(monitors, named(preset).given_topics)
+
+    @classmethod
+    def by(cls, monitors: MonitorSet, topics: dict[str, str]) -> Self:
+        """Return a base behind these monitors; `topics` are those of the guard."""
+        guarded = cls.__new__(cls)
+        guarded._begin(monitors, topics)
+        return guarded
+
+    def _begin(self, monitors: MonitorSet, topics: dict[str, str]) -> None:
+        self.monitors, self.topics = monitors, topics
         self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
-        self.topics = named(preset).given_topics
         self.got: list[tuple[int, Any]] = []
         self.monitors.start(BEGIN - 100 * MS)
         self.advance(0)

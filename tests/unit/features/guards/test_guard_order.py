@@ -12,35 +12,27 @@ from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import fields, message
 from tests.support.features.guards.running_guard import DEFINITIONS
-from tests.unit.features.guards.guarding import BEGIN, MS, NODES, Guarded, twist
+from tests.unit.features.guards.guarding import Guarded, twist
 from tests.unit.features.guards.test_watching_presets import button, with_id
 
 
-class Together(Guarded):
-    """Two guards of one topic, of which `last` acts first by its name; `ordered`: they have their phases."""
-
-    def __init__(self, first: str, last: str, types: dict[str, str] | None = None, *, ordered: bool,
-                 **values: dict[str, object]) -> None:  # fmt: skip
-        files = {}
-        for name, preset in (("z", first), ("a", last)):
-            wanted = {each: str(value) for each, value in values.get(preset, {}).items()}
-            topics = {"command": "/move_base/goal"} if types else {}
-            guard = Guard(name, PRESETS[preset], topics, {"command": next(iter(PRESETS[preset].topics["command"])),
-                          **(types or {})}, wanted)  # fmt: skip
-            text = text_of(guard)
-            files[f"{name}.rv"] = text if ordered else re.sub(r" in \w+ given \{", " given {", text, count=1)
-        self.monitors = MonitorSet.of(compiled_from(dict(sorted(files.items())), DEFINITIONS))
-        self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
-        self.topics = PRESETS[last].given_topics | PRESETS[first].given_topics
-        if types:
-            self.topics = self.topics | {"command": "/move_base/goal"}
-        self.got = []
-        self.monitors.start(BEGIN - 100 * MS)
-        self.advance(0)
+def together(
+    first: str, last: str, types: dict[str, str] | None = None, *, ordered: bool, **values: dict[str, object]
+) -> Guarded:
+    """Return a base behind two guards, of which `last` acts first by its name; `ordered`: they have their phases."""
+    goal = {"command": "/move_base/goal"} if types else {}
+    files = {}
+    for name, preset in (("a", PRESETS[last]), ("z", PRESETS[first])):
+        given = {value: str(text) for value, text in values.get(preset.name, {}).items()}
+        kinds = {"command": next(iter(preset.topics["command"])), **(types or {})}
+        text = text_of(Guard(name, preset, goal, kinds, given))
+        files[f"{name}.rv"] = text if ordered else re.sub(r" in \w+ given \{", " given {", text, count=1)
+    monitors = MonitorSet.of(compiled_from(files, DEFINITIONS))
+    return Guarded.by(monitors, PRESETS[last].given_topics | PRESETS[first].given_topics | goal)
 
 
 def jumps(ordered: bool) -> bool:
-    guards = Together("sensor", "speed", ordered=ordered, speed={"aMax": 1})
+    guards = together("sensor", "speed", ordered=ordered, speed={"aMax": 1})
     for at in range(100, 1500, 100):
         guards.tell("by", seen(at), at)
         guards.drive(twist(0.5), at)
@@ -59,7 +51,7 @@ def seen(metres: float, blind: int = 0) -> bytes:
 
 def misses_a_base_that_moves(ordered: bool) -> bool:
     """The scanner falls silent, so the sensor stops the base once; the base drives on."""
-    guards = Together("sensor", "standstill", ordered=ordered)
+    guards = together("sensor", "standstill", ordered=ordered)
     guards.topics["measure"] = "/odom"
 
     def measured(speed: float, at: int) -> None:
@@ -76,14 +68,14 @@ def misses_a_base_that_moves(ordered: bool) -> bool:
 
 
 def passes_a_part(ordered: bool) -> bool:
-    guards = Together("sane", "separation", ordered=ordered)
+    guards = together("sane", "separation", ordered=ordered)
     guards.tell("by", seen(1.0), 1)
     return guards.drive(twist(math.inf, 0, 0, 0, 0, 0.5), 2)[5] > 0
 
 
 def leaves_the_fence(ordered: bool) -> bool:
     """Forward passes, backward is dropped: the base drives forward."""
-    guards = Together(
+    guards = together(
         "rate", "fence", ordered=ordered, rate={"interval": 1, "burst": 1}, fence={"silent": 10}
     )
     for at in range(100, 1000, 50):
@@ -99,7 +91,7 @@ def leaves_the_fence(ordered: bool) -> bool:
 
 
 def stops_a_node_that_commands(ordered: bool) -> bool:
-    guards = Together(
+    guards = together(
         "deadman", "rate", ordered=ordered, deadman={"resume": 0}, rate={"interval": 2, "burst": 1}
     )
     guards.drive(twist(0.5), 100)
@@ -110,13 +102,13 @@ def stops_a_node_that_commands(ordered: bool) -> bool:
 
 
 def ignores_a_command_that_is_not_a_number(ordered: bool) -> bool:
-    guards = Together("sane", "rate", ordered=ordered, rate={"interval": 1, "burst": 1})
+    guards = together("sane", "rate", ordered=ordered, rate={"interval": 1, "burst": 1})
     assert guards.drive(twist(0.5), 1000) == twist_legs(0.5)
     return guards.drive(twist(math.nan), 1100) == ()
 
 
 def cancels_a_dropped_goal(ordered: bool) -> bool:
-    guards = Together("estop", "answer", {"command": GOAL}, ordered=ordered, answer={"limit": "1s"})
+    guards = together("estop", "answer", {"command": GOAL}, ordered=ordered, answer={"limit": "1s"})
     guards.tell("stop", button(True), 1)
     assert guards.tell("command", with_id("a", 24, 72), 10).result == "dropped"
     guards.advance(3000)
@@ -125,7 +117,7 @@ def cancels_a_dropped_goal(ordered: bool) -> bool:
 
 def moves_after_a_reset_without_a_zero(ordered: bool) -> bool:
     """An autopilot begins after the reset: the deadman stops its first commands, until they have come for a while."""
-    guards = Together("estop", "deadman", ordered=ordered, estop={"silent": 0})
+    guards = together("estop", "deadman", ordered=ordered, estop={"silent": 0})
     for at, topic, pressed in (
         (1, "stop", False), (100, "stop", True), (200, "stop", False), (300, "reset", False), (500, "reset", True),
     ):  # fmt: skip
@@ -135,7 +127,7 @@ def moves_after_a_reset_without_a_zero(ordered: bool) -> bool:
 
 def moves_after_the_zone_without_a_zero(ordered: bool) -> bool:
     """Only the sensor is blind at first, since it needs more valid values than the zone."""
-    guards = Together("zone", "sensor", ordered=ordered, sensor={"least": 1})
+    guards = together("zone", "sensor", ordered=ordered, sensor={"least": 1})
     moved = False
     for at in range(100, 3000, 50):
         guards.tell("by", seen(at) if at > 1500 else seen(at, blind=1), at)

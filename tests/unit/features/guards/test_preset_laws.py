@@ -6,7 +6,7 @@ recipe, and each cell that its law does not cover needs a reason in `REASONS`.
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
@@ -234,9 +234,9 @@ def places_of(preset: str) -> list[Place]:
 
 
 class Lab(Guarded):
-    """A guard among honest nodes: `/a` has the evidence, and commands."""
+    """A guard among honest nodes: `/a` has the evidence, and commands. `before` are the texts of monitors before it."""
 
-    def __init__(self, preset: str, place: Place | None = None) -> None:
+    def __init__(self, preset: str, place: Place | None = None, *, before: Sequence[str] = ()) -> None:
         recipe = RECIPES[preset]
         first = {topic: next(iter(rows)) for topic, rows in PRESETS[preset].topics.items()}
         self.kinds = first | dict(recipe.fixed)
@@ -246,7 +246,7 @@ class Lab(Guarded):
         for kind in self.kinds.values():
             values |= recipe.by_type.get(kind, {})
         rows = {topic: kind for topic, kind in self.kinds.items() if topic in PRESETS[preset].topics}
-        super().__init__(preset, rows, **values)
+        super().__init__(preset, rows, before=before, **values)
         self.preset, self.at, self.count = preset, 0, 0
         self.monitors.name_senders(lambda source: (f"10.0.0.{source}", NODES[source]))
         for given, kind in self.kinds.items():
