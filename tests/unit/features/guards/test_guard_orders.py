@@ -28,8 +28,8 @@ from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.features.guards.released import released
 from appliance.features.guards.upgrades import upgraded
 from appliance.features.guards.view import ActingGuard, GuardsState
-from appliance.specifications.specification_files import SpecificationsRefusedError
-from appliance.specifications.specification_manager import MonitorsChangedError, SpecificationManager
+from appliance.specifications.specification_files import MonitorsChangedError, SpecificationsRefusedError
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
 from tests.support.core import FakeTrail
