@@ -50,7 +50,7 @@ GivenOfMonitor = Annotated[dict[MonitorName, GivenValue], msgspec.Meta(min_lengt
 class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A new policy."""
 
-    text: Text
+    text: Annotated[Text, doc("the whole text, as written")]
     note: Annotated[str, doc("reason for the change, stored with the revision", max_length=200)] = ""
     signature: Signature = ""
 
@@ -58,7 +58,9 @@ class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The revision to return to, or null for the revision before the present one."""
 
-    revision: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None = None
+    revision: Annotated[Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None, doc("its number")] = (
+        None
+    )
 
 
 class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,7 +87,7 @@ class GivenValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The new text of the file that contains a monitor."""
 
-    text: Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
+    text: Annotated[str, doc("the whole text, as written", min_length=1, max_length=1 << 20)]
     definitions: Definitions = {}
     note: Note = ""
     signature: Signature = ""
@@ -95,7 +97,7 @@ class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The wanted state of a monitor: exactly one of `enabled`, `shadow` and `held`."""
 
-    enabled: bool | None = None
+    enabled: Annotated[bool | None, doc("null: unchanged")] = None
     for_seconds: Annotated[
         Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
         doc("with `enabled` false: enable it again automatically after this time"),
@@ -119,4 +121,4 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The wanted state of several monitors. Nothing changes if one of the names is unknown."""
 
-    names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]
+    names: Annotated[list[MonitorName], doc("names of monitors", min_length=1, max_length=1000)]

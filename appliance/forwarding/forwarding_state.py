@@ -14,15 +14,15 @@ class ForwardingState(msgspec.Struct, frozen=True):
     `sent` messages since the forwarder started, up to the record `sequence` and the checkpoint `checkpoint`.
     """
 
-    sent: int
-    sequence: int
-    checkpoint: int
-    behind: int
-    seconds: float
-    missed: int
+    sent: Annotated[int, doc("messages sent since the forwarder started")]
+    sequence: Annotated[int, doc("sequence number in the audit log")]
+    checkpoint: Annotated[int, doc("number of the last checkpoint that was sent")]
+    behind: Annotated[int, doc("number of records that wait")]
+    seconds: Annotated[float, doc("how long the oldest record has waited")]
+    missed: Annotated[int, doc("records that retention removed before they were sent")]
     trouble: Annotated[str, doc("why forwarding is stopped, or empty if it is not")]
-    to: str
-    send: str
+    to: Annotated[str, doc("the receiver")]
+    send: Annotated[str, doc("which records are sent: all, or denials")]
 
 
 def samples_of(to: str, state: ForwardingState) -> dict[str, Samples]:

@@ -1,6 +1,6 @@
 """Answer `/healthz` (whether REST answers) and `/readyz` (whether nodes are served) from the last sampled state."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -8,6 +8,7 @@ from appliance.api.front.control import ControlLink
 from appliance.api.front.history import SampleHistory
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.routing import Responses, Routes
+from appliance.channel.answers.field_docs import doc
 from appliance.channel.status_summary import unserved
 
 _PATIENCE_SECONDS = 1.0
@@ -16,7 +17,7 @@ _PATIENCE_SECONDS = 1.0
 class Health(msgspec.Struct, frozen=True):
     """The probe's answer."""
 
-    status: Literal["live", "ready"]
+    status: Annotated[Literal["live", "ready"], doc("result of the probe")]
 
 
 def routes(control: ControlLink, history: SampleHistory) -> Routes:

@@ -36,7 +36,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     messages: Annotated[int, doc("relayed")]
     bytes: Annotated[int, doc("relayed")]
     dropped: Annotated[int, doc("messages dropped for slow subscribers")]
-    nodes: int
+    nodes: Annotated[int, doc("number of the robot's nodes")]
     monitors: Annotated[dict[str, list[int]], doc("for each monitor: verdicts, drops, changes, faults")]
 
 

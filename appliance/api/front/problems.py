@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from starlette.responses import Response
 
-from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.field_docs import FromOne, Name, doc
 
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope for the reason of its answer
@@ -19,31 +19,33 @@ _PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning):
 class Finding(msgspec.Struct, frozen=True):
     """One thing wrong with a text that was sent; `line` and `column` count from 1."""
 
-    file: str
-    line: int
-    column: int
-    severity: str
-    text: str
+    file: Name
+    line: FromOne
+    column: FromOne
+    severity: Annotated[str, doc("error or warning")]
+    text: Annotated[str, doc("the error and what to do")]
 
 
 class BadInput(msgspec.Struct, frozen=True):
     """One invalid part of a request."""
 
     where: Annotated[str, doc("for example `query.limit` or `body.revision`")]
-    text: str
+    text: Annotated[str, doc("the error")]
 
 
 class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
     """Problem details; `line` and `column` are those of the first finding."""
 
     type: Annotated[str, doc("stable name of the kind of problem: urn:rosrv:problem:…")]
-    title: str
-    status: int
+    title: Annotated[str, doc("kind of problem, in words")]
+    status: Annotated[int, doc("HTTP status")]
     detail: Annotated[str, doc("the cause and what to do, for a person")]
-    line: int | None = None
-    column: int | None = None
-    findings: list[Finding] | None = None
-    errors: list[BadInput] | None = None
+    line: Annotated[int | None, doc("from 1")] = None
+    column: Annotated[int | None, doc("from 1")] = None
+    findings: Annotated[list[Finding] | None, doc("all findings")] = None
+    errors: Annotated[
+        list[BadInput] | None, doc("each invalid part of the request, or null for another problem")
+    ] = None
     active: Annotated[str | None, doc("address of the active appliance (problem `standby`)")] = None
 
 

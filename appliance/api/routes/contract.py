@@ -30,9 +30,6 @@ _REFERENCE = CONTRACT.reference(Problem)
 # Requests and answers of a real appliance, with long texts and lists cut. The key is the kind of the body, or the
 # operation for a body without a kind. tests/integration/api/test_examples.py compares the examples with real answers.
 EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
-# Descriptions by field name, for fields that their structs do not describe. If a name has another meaning in one kind,
-# the key for that kind is `Kind.name`.
-WORDS: dict[str, str] = json.loads(files(__package__).joinpath("field_words.json").read_text("utf-8"))
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
@@ -55,7 +52,6 @@ def _made(app: FastAPI) -> dict[str, Any]:
     components |= _plain(CONTRACT.components())
     components["AuditRecord"] = RECORD
     for kind, schema in components.items():
-        _described(kind, schema)
         moments.describe(schema)
         if kind in EXAMPLES:
             schema["examples"] = [EXAMPLES[kind]]
@@ -75,17 +71,6 @@ def _plain(schema: Any) -> Any:
     if not isinstance(schema, dict):
         return schema
     return {name: _plain(part) for name, part in schema.items() if not (name == "items" and part is False)}
-
-
-def _described(kind: str, schema: dict[str, Any]) -> None:
-    for name, field in schema.get("properties", {}).items():
-        words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
-        if words is not None and "$ref" not in field and not is_described(field):
-            field["description"] = words
-
-
-def is_described(field: dict[str, Any]) -> bool:
-    return "description" in field or any(map(is_described, field.get("anyOf", ())))
 
 
 def _tagged(responses: dict[str, Any]) -> None:

@@ -35,9 +35,9 @@ class LogFinding(msgspec.Struct, frozen=True):
     """A fault of the log; `first` and `last` are sequences of records, or numbers of checkpoints."""
 
     kind: FindingKind
-    first: int
-    last: int
-    message: str
+    first: Annotated[int, msgspec.Meta(description="sequence of a record, or number of a checkpoint")]
+    last: Annotated[int, msgspec.Meta(description="sequence of a record, or number of a checkpoint")]
+    message: Annotated[str, msgspec.Meta(description="in words")]
 
 
 class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,10 +47,10 @@ class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
     since the epoch) of the last of them; `other_logs` are the ids of the logs to which the other checkpoints belong.
     """
 
-    checkpoints: int
-    through: int
+    checkpoints: Annotated[int, msgspec.Meta(description="number of copies that agree with the chain")]
+    through: Annotated[int, msgspec.Meta(description="sequence of the last checkpoint that agrees")]
     time: Annotated[int, msgspec.Meta(description="nanoseconds since the epoch")]
-    other_logs: list[str]
+    other_logs: Annotated[list[str], msgspec.Meta(description="ids of other logs that the copies belong to")]
 
 
 class Verification(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,19 +65,41 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     those that the signer signed besides this one; each that no operator set aside is a finding.
     """
 
-    ok: bool
-    log: str
-    records: int
-    first: int
-    last: int
-    removed: int
-    checkpoints: int
-    signed_checkpoints: int
-    signed_through: int
-    unsealed: int
-    key: str | None
-    findings: list[LogFinding]
-    elsewhere: Elsewhere | None = None
-    removal: str = ""
-    remembered: int | None = None
-    other_logs: list[OtherLog] = []
+    ok: Annotated[bool, msgspec.Meta(description="whether there is no error")]
+    log: Annotated[str, msgspec.Meta(description="id of the log")]
+    records: Annotated[int, msgspec.Meta(description="number of records")]
+    first: Annotated[int, msgspec.Meta(description="sequence of the first record")]
+    last: Annotated[int, msgspec.Meta(description="sequence of the last record")]
+    removed: Annotated[
+        int, msgspec.Meta(description="number of records that retention removed before the first one")
+    ]
+    checkpoints: Annotated[int, msgspec.Meta(description="number of checkpoints that were made")]
+    signed_checkpoints: Annotated[
+        int, msgspec.Meta(description="number of those checkpoints with a signature")
+    ]
+    signed_through: Annotated[
+        int, msgspec.Meta(description="sequence up to which a signature proves the chain")
+    ]
+    unsealed: Annotated[int, msgspec.Meta(description="number of later records, which only the chain proves")]
+    key: Annotated[str | None, msgspec.Meta(description="public key, in hexadecimal")]
+    findings: Annotated[list[LogFinding], msgspec.Meta(description="all findings")]
+    elsewhere: Annotated[
+        Elsewhere | None,
+        msgspec.Meta(
+            description="what the checkpoints stored on another machine prove, or null if none were given"
+        ),
+    ] = None
+    removal: Annotated[
+        str,
+        msgspec.Meta(description="proof of the removal: signed or unsigned, or empty if nothing was removed"),
+    ] = ""
+    remembered: Annotated[
+        int | None,
+        msgspec.Meta(
+            description="number of the last checkpoint in the signer's memory of this log, 0 without one, or null if "
+            "it was not compared"
+        ),
+    ] = None
+    other_logs: Annotated[
+        list[OtherLog], msgspec.Meta(description="ids of other logs that the copies belong to")
+    ] = []

@@ -48,15 +48,18 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
     JSON and syslog messages use these names.
     """
 
-    log: str
-    number: int
-    sequence: int
-    hash: str
+    log: Annotated[str, msgspec.Meta(description="id of the log")]
+    number: Annotated[int, msgspec.Meta(description="number, from 1")]
+    sequence: Annotated[int, msgspec.Meta(description="sequence of the last record that it seals")]
+    hash: Annotated[str, msgspec.Meta(description="hash of the chain at that record, in hexadecimal")]
     time: Annotated[int, msgspec.Meta(description="nanoseconds since the epoch")]
-    previous: str
-    signature: str
-    key: str
-    removed: int | None = None
+    previous: Annotated[str, msgspec.Meta(description="hash of the checkpoint before, in hexadecimal")]
+    signature: Annotated[str, msgspec.Meta(description="Ed25519, in hexadecimal")]
+    key: Annotated[str, msgspec.Meta(description="public key, in hexadecimal")]
+    removed: Annotated[
+        int | None,
+        msgspec.Meta(description="sequence up to which retention had removed records, or null if it had not"),
+    ] = None
 
     @classmethod
     def of(cls, text: bytes, signature: bytes, key: bytes) -> "SignedCheckpoint":

@@ -53,7 +53,7 @@ class CountedName(msgspec.Struct, frozen=True):
 class HostDenials(msgspec.Struct, frozen=True):
     """The denials of a host, with their most frequent rules or reasons and callers."""
 
-    host: str
+    host: Annotated[str, msgspec.Meta(description="its address")]
     count: Annotated[int, msgspec.Meta(description="number of denials, with those that a record only counts")]
     first: _Time
     last: _Time
@@ -73,7 +73,7 @@ class DenialSummary(msgspec.Struct, frozen=True):
     """The denials of a period, by host; the host with the most comes first."""
 
     denials: Annotated[int, msgspec.Meta(description="number of denials of all hosts")]
-    hosts: list[HostDenials]
+    hosts: Annotated[list[HostDenials], msgspec.Meta(description="enrolled, awaited or declared")]
     more_hosts: Annotated[int, msgspec.Meta(description="number of hosts that are left out")]
     more_denials: Annotated[int, msgspec.Meta(description="number of their denials")]
     counted_since: Annotated[

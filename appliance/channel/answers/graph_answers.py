@@ -4,28 +4,28 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.field_docs import Address, Name, RosType, doc
 
 
 class Node(msgspec.Struct, frozen=True):
     """A node; `lost`: it does not answer, and its registrations return when it does."""
 
-    name: str
-    host: str
-    state: Literal["live", "lost"]
-    publishes: list[str]
-    subscribes: list[str]
-    offers: list[str]
+    name: Name
+    host: Address
+    state: Annotated[Literal["live", "lost"], doc("its state")]
+    publishes: Annotated[list[str], doc("topics that it publishes")]
+    subscribes: Annotated[list[str], doc("topics that it subscribes to")]
+    offers: Annotated[list[str], doc("services that it offers")]
 
 
 class Flow(msgspec.Struct, frozen=True, kw_only=True):
     """The traffic since RVMaster started, and the present traffic (a second's average)."""
 
-    messages: int
-    bytes: int
+    messages: Annotated[int, doc("messages relayed since counting began")]
+    bytes: Annotated[int, doc("bytes of its messages, since counting began")]
     dropped: Annotated[int, doc("messages dropped for slow subscribers")]
-    messages_per_second: float
-    bytes_per_second: float
+    messages_per_second: Annotated[float, doc("average of the last second")]
+    bytes_per_second: Annotated[float, doc("average of the last second")]
     delay_seconds: Annotated[
         float, doc("average delay that the relay added to the messages of the last second; 0 for services")
     ]
@@ -34,43 +34,43 @@ class Flow(msgspec.Struct, frozen=True, kw_only=True):
 class Publisher(Flow, frozen=True, kw_only=True):
     """A publisher of a topic, with what came from it."""
 
-    node: str
+    node: Name
 
 
 class Connection(msgspec.Struct, frozen=True):
     """A subscriber or client that is connected through the appliance to a node."""
 
-    from_: str = msgspec.field(name="from")
-    to: str
-    host: str
+    from_: Annotated[str, doc("the node that publishes or offers it")] = msgspec.field(name="from")
+    to: Annotated[str, doc("the name given by the connected peer: a claim")]
+    host: Annotated[str, doc("address of the connected peer")]
 
 
 class Topic(msgspec.Struct, frozen=True):
     """A topic; `mediated`: its messages go through the appliance."""
 
-    name: str
-    type: str
-    mediated: bool
-    publishers: list[Publisher]
-    subscribers: list[str]
-    connections: list[Connection]
+    name: Name
+    type: RosType
+    mediated: Annotated[bool, doc("whether its messages go through the appliance")]
+    publishers: Annotated[list[Publisher], doc("nodes that publish it")]
+    subscribers: Annotated[list[str], doc("nodes that subscribe to it")]
+    connections: Annotated[list[Connection], doc("open connections through the appliance")]
 
 
 class Service(Flow, frozen=True, kw_only=True):
     """A service and the node that offers it."""
 
-    name: str
-    node: str
-    mediated: bool
-    connections: list[Connection]
+    name: Name
+    node: Name
+    mediated: Annotated[bool, doc("whether its messages go through the appliance")]
+    connections: Annotated[list[Connection], doc("open connections through the appliance")]
 
 
 class Graph(msgspec.Struct, frozen=True):
     """The graph at one moment, without the appliance's own nodes."""
 
-    nodes: list[Node]
-    topics: list[Topic]
-    services: list[Service]
+    nodes: Annotated[list[Node], doc("nodes that run or are expected back")]
+    topics: Annotated[list[Topic], doc("topics that a node publishes or subscribes to")]
+    services: Annotated[list[Service], doc("services that a node offers")]
 
 
 class Registration(msgspec.Struct, frozen=True):

@@ -4,15 +4,15 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.field_docs import Name, doc
 
 
 class Part(msgspec.Struct, frozen=True):
     """A package that the appliance depends on."""
 
-    kind: Literal["python", "debian"]
-    name: str
-    version: str
+    kind: Annotated[Literal["python", "debian"], doc("archive that the package comes from")]
+    name: Name
+    version: Annotated[str, doc("as its archive has it")]
     licences: Annotated[list[str], doc("as the package names them, or empty if not stated")]
 
 
@@ -30,18 +30,18 @@ class InUse(msgspec.Struct, frozen=True):
 class Inventory(msgspec.Struct, frozen=True):
     """Version, build, system and parts."""
 
-    version: str
+    version: Annotated[str, doc("version of the program")]
     build: Annotated[
         dict[str, str] | None,
         doc(
             "kind, commit and time of a package's or image's build, or null for a checkout or a wheel, which have none"
         ),
     ]
-    python: str
-    system: str
+    python: Annotated[str, doc("its version")]
+    system: Annotated[str, doc("name and version of the operating system")]
     kernel: Annotated[str, doc("its release")]
-    machine: str
-    parts: list[Part]
+    machine: Annotated[str, doc("its architecture")]
+    parts: Annotated[list[Part], doc("packages that it depends on")]
     parts_list: Annotated[
         str | None,
         doc("SHA-256 of the list of all parts (CycloneDX) that an image has, or null if it is not an image"),

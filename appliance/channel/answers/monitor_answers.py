@@ -4,7 +4,15 @@ from typing import Annotated, Any
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, RollbackDue, doc
+from appliance.channel.answers.field_docs import (
+    Moment,
+    Name,
+    RevisionNote,
+    RevisionNumber,
+    RollbackDue,
+    Who,
+    doc,
+)
 
 Tag = Annotated[
     str,
@@ -16,7 +24,7 @@ RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 class GivenState(msgspec.Struct, frozen=True):
     """A constant or a topic that is given to a monitor."""
 
-    name: str
+    name: Name
     kind: Annotated[str, doc("`int`, `double`, `bool` or `topic`")]
     value: Annotated[bool | int | float | str, doc("the value in force, in the unit")]
     unit: Annotated[str, doc("the unit of the values, as the text of the specification has it")]
@@ -34,7 +42,7 @@ class GivenState(msgspec.Struct, frozen=True):
 class MonitorReadout(msgspec.Struct, frozen=True):
     """The variables of a monitor, as its relay has them now or had them when it last answered."""
 
-    name: str
+    name: Name
     values: Annotated[
         dict[str, Any],
         doc(
@@ -57,18 +65,18 @@ class MonitorReadout(msgspec.Struct, frozen=True):
 class MonitorState(msgspec.Struct, frozen=True):
     """A running monitor; its counters start when it is loaded or its relay starts."""
 
-    name: str
+    name: Name
     file: Annotated[str, doc("the specification file that defines it; a file may have several monitors")]
     enabled: Annotated[bool, doc("its actions take effect; false while it is in shadow mode")]
     held: Annotated[bool, doc("blocks its topics until it is resumed")]
-    failing: bool
-    topics: list[str]
-    services: list[str]
-    events: int
-    verdicts: int
-    drops: int
-    changes: int
-    faults: int
+    failing: Annotated[bool, doc("whether its actions fault; its messages are then dropped")]
+    topics: Annotated[list[str], doc("topics of its events")]
+    services: Annotated[list[str], doc("services of its events")]
+    events: Annotated[int, doc("number of events that it received")]
+    verdicts: Annotated[int, doc("number of verdicts of its properties")]
+    drops: Annotated[int, doc("number of messages that it dropped")]
+    changes: Annotated[int, doc("number of messages that it changed")]
+    faults: Annotated[int, doc("number of actions that failed")]
     certificates: Annotated[
         list[str],
         doc("for each property: whether its automaton is proved equal to the formula, or why not"),
@@ -97,16 +105,16 @@ class MonitorState(msgspec.Struct, frozen=True):
 class Monitors(msgspec.Struct, frozen=True):
     """The specifications in force; `loaded` is seconds since the epoch."""
 
-    revision: int
+    revision: RevisionNumber
     tag: Tag
-    who: str
-    note: str
+    who: Who
+    note: RevisionNote
     loaded: Moment
     confirm_by: RollbackDue
     folder: Annotated[
         str | None, doc("the folder that `reload` reads, or null if none was given at the start")
     ]
-    differs_from_folder: bool
+    differs_from_folder: Annotated[bool, doc("whether the specifications in force differ from their folder")]
     warnings: Annotated[list[str], doc("found when they were loaded")]
     refused: Annotated[
         list[str], doc("why the relay rejects the specifications: all topics are blocked then")
@@ -133,10 +141,10 @@ class Monitors(msgspec.Struct, frozen=True):
 class GivenSet(msgspec.Struct, frozen=True):
     """Everything that is given to a monitor, after a change; `changed` names what the change set."""
 
-    name: str
-    changed: list[str]
+    name: Name
+    changed: Annotated[list[str], doc("files whose text changed")]
     given: Annotated[list[GivenState], doc("constants and topics that are given to it")]
-    revision: int
+    revision: RevisionNumber
     tag: Tag
 
 
@@ -160,13 +168,13 @@ class Replacement(msgspec.Struct, frozen=True):
     force although the folder does not have them.
     """
 
-    revision: int
-    tag: str
-    replaced: int
-    added: list[str]
-    changed: list[str]
-    removed: list[str]
-    warnings: list[str]
+    revision: RevisionNumber
+    tag: Annotated[str, doc("changes with every change; If-Match takes it in quotes")]
+    replaced: Annotated[int, doc("previous revision")]
+    added: Annotated[list[str], doc("files that were not there before")]
+    changed: Annotated[list[str], doc("files whose text changed")]
+    removed: Annotated[list[str], doc("files that no longer exist")]
+    warnings: Annotated[list[str], doc("valid lines that may not be intended")]
     moved: Annotated[list[str], doc("monitors that began because another relay process has them now")]
     began: Annotated[list[str], doc("monitors that began in their initial state")]
     kept: Annotated[list[str], doc("files that a reload left in force although the folder lacks them")]
@@ -181,26 +189,26 @@ class Replacement(msgspec.Struct, frozen=True):
 class MonitorsConfirmed(msgspec.Struct, frozen=True):
     """Whether there was something to confirm."""
 
-    confirmed: bool
-    revision: int
+    confirmed: Annotated[bool, doc("whether there was something to confirm")]
+    revision: RevisionNumber
     tag: Tag
 
 
 class MonitorRevision(msgspec.Struct, frozen=True):
     """Specifications that came into force; `loaded` is seconds since the epoch."""
 
-    revision: int
+    revision: RevisionNumber
     loaded: Moment
-    who: str
-    note: str
-    in_force: bool
+    who: Who
+    note: RevisionNote
+    in_force: Annotated[bool, doc("whether it is in force now")]
     names: Annotated[list[str], doc("names of its files")]
 
 
 class MonitorRevisionList(msgspec.Struct, frozen=True):
     """The kept revisions, newest first."""
 
-    revisions: list[MonitorRevision]
+    revisions: Annotated[list[MonitorRevision], doc("newest first")]
 
 
 class RevisionTexts(MonitorRevision, frozen=True):
@@ -214,8 +222,8 @@ class RevisionTexts(MonitorRevision, frozen=True):
 class Switched(msgspec.Struct, frozen=True):
     """The monitors whose state changed."""
 
-    names: list[str]
-    revision: int
+    names: Annotated[list[str], doc("names of monitors")]
+    revision: RevisionNumber
     tag: Tag
     began: Annotated[
         list[str], doc("monitors that entered or left shadow mode and are in their initial state")

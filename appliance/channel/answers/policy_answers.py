@@ -4,39 +4,47 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, RollbackDue, doc
+from appliance.channel.answers.field_docs import (
+    FilePath,
+    Moment,
+    RevisionNote,
+    RevisionNumber,
+    RollbackDue,
+    Who,
+    doc,
+)
 
 
 class PolicyRevision(msgspec.Struct, frozen=True):
     """A policy that came into force; `loaded` is seconds since the epoch."""
 
-    revision: int
-    file: str
+    revision: RevisionNumber
+    file: FilePath
     loaded: Moment
-    who: str
-    note: str
-    in_force: bool
+    who: Who
+    note: RevisionNote
+    in_force: Annotated[bool, doc("whether it is in force now")]
 
 
 class PolicyRevisionList(msgspec.Struct, frozen=True):
     """The kept revisions, newest first."""
 
-    revisions: list[PolicyRevision]
+    revisions: Annotated[list[PolicyRevision], doc("newest first")]
 
 
 class RevisionText(PolicyRevision, frozen=True):
     """A kept revision with its text, and the site's signature (empty if unsigned)."""
 
-    text: str
-    signature: str
+    text: Annotated[str, doc("the whole text, as written")]
+    signature: Annotated[str, doc("signature with the site key, or empty if it is unsigned")]
 
 
 class PolicyInForce(RevisionText, frozen=True, kw_only=True):
     """The policy in force. It rolls back at `confirm_by` (seconds since the epoch) unless confirmed."""
 
     policy_file: Annotated[str, doc("the file that `reload` reads")]
-    differs_from_file: bool
-    warnings: list[str]
+    differs_from_file: Annotated[bool, doc("whether the policy in force differs from its file")]
+    warnings: Annotated[list[str], doc("valid lines that may not be intended")]
     confirm_by: Moment | None
     site_keys: Annotated[list[str], doc("if there are any, one of them must have signed what is loaded")]
     robot: Annotated[list[str], doc("addresses and networks of the group robot")]
@@ -69,9 +77,9 @@ class PolicyKnown(PolicyInForce, frozen=True):
 class Loaded(msgspec.Struct, frozen=True):
     """A policy came into force and replaced the revision `replaced`."""
 
-    revision: int
-    replaced: int
-    warnings: list[str]
+    revision: RevisionNumber
+    replaced: Annotated[int, doc("previous revision")]
+    warnings: Annotated[list[str], doc("valid lines that may not be intended")]
     revoked: Annotated[int, doc("number of registrations and connections that were revoked")]
     confirm_by: RollbackDue
 
@@ -79,8 +87,8 @@ class Loaded(msgspec.Struct, frozen=True):
 class PolicyConfirmed(msgspec.Struct, frozen=True):
     """Whether there was something to confirm."""
 
-    confirmed: bool
-    revision: int
+    confirmed: Annotated[bool, doc("whether there was something to confirm")]
+    revision: RevisionNumber
 
 
 class Why(msgspec.Struct, frozen=True, kw_only=True):

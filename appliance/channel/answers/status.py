@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, RevisionNote, RevisionNumber, Who, doc
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.features.views import with_states
 
@@ -15,10 +15,10 @@ from appliance.features.views import with_states
 class ProcessInfo(msgspec.Struct, frozen=True):
     """One process of the appliance; `since` is RFC 3339 UTC, `pid` 0 while it waits to be started again."""
 
-    role: str
-    pid: int
+    role: Annotated[str, doc("which process of the appliance it is")]
+    pid: Annotated[int, doc("process id")]
     since: Annotated[str, doc("RFC 3339, UTC, milliseconds")]
-    restarts: int
+    restarts: Annotated[int, doc("number of restarts")]
     sandbox: Annotated[
         str,
         doc(
@@ -34,12 +34,12 @@ class ProcessInfo(msgspec.Struct, frozen=True):
 class FirewallRule(msgspec.Struct, frozen=True):
     """A rule with the packets that it has matched; `in_force` is false if the kernel no longer has it."""
 
-    chain: str
-    purpose: str
-    rule: str
-    packets: int
-    octets: int
-    in_force: bool
+    chain: Annotated[str, doc("chain of the firewall that contains the rule")]
+    purpose: Annotated[str, doc("purpose of the rule")]
+    rule: Annotated[str, doc("the rule as the firewall shows it")]
+    packets: Annotated[int, doc("packets that the rule matched")]
+    octets: Annotated[int, doc("bytes that the rule matched")]
+    in_force: Annotated[bool, doc("false: the kernel no longer has it")]
 
 
 class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -49,14 +49,14 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
     packets.
     """
 
-    backend: str | None = None
+    backend: Annotated[str | None, doc("nft or iptables")] = None
     not_used: Annotated[list[str] | None, doc("other back ends, and why they are not used")] = None
-    rules: list[FirewallRule] | None = None
+    rules: Annotated[list[FirewallRule] | None, doc("rules, with what each has matched")] = None
     forwarding: Annotated[
         list[FirewallRule] | None, doc("on the host, towards the appliance's namespace")
     ] = None
-    translations: list[str] | None = None
-    obstacles: list[str] | None = None
+    translations: Annotated[list[str] | None, doc("chains of other programs that translate addresses")] = None
+    obstacles: Annotated[list[str] | None, doc("chains of other programs that drop what is forwarded")] = None
     hold_lapsed: Annotated[
         str | None,
         doc(
@@ -68,12 +68,12 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
 class PolicyState(msgspec.Struct, frozen=True):
     """The policy in force; it rolls back at `confirm_by` (seconds since the epoch) unless confirmed."""
 
-    revision: int
+    revision: RevisionNumber
     file: Annotated[str, doc("the file that `reload` reads")]
     source: Annotated[str, doc("source of the text in force")]
-    who: str
-    differs_from_file: bool
-    warnings: int
+    who: Who
+    differs_from_file: Annotated[bool, doc("whether the policy in force differs from its file")]
+    warnings: Annotated[int, doc("number of warnings about the policy")]
     audit_only: Annotated[list[str], doc("sections whose denials are recorded and pass")]
     confirm_by: Moment | None
     loaded: Annotated[
@@ -95,12 +95,12 @@ class IpsecState(msgspec.Struct, frozen=True):
     ]
     post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them, or null if not known yet")]
     charon: Annotated[str | None, doc("its version")]
-    pool: str
+    pool: Annotated[str, doc("network of the virtual addresses")]
     address: Annotated[str, doc("the appliance's own address in the tunnels")]
-    hosts_file: str
-    enrolled: int
-    awaited: int
-    up: int
+    hosts_file: Annotated[str, doc("path of hosts.yaml")]
+    enrolled: Annotated[int, doc("number of hosts with a certificate")]
+    awaited: Annotated[int, doc("number of hosts whose one-time token was not used yet")]
+    up: Annotated[int, doc("number of tunnels that are up")]
     troubles: Annotated[list[str], doc("problems that need a person's attention")]
     ports: Annotated[
         dict[str, PortsSeen], doc("port checks of every host that may have nodes, by name or address")
@@ -110,17 +110,17 @@ class IpsecState(msgspec.Struct, frozen=True):
 class MonitorsState(msgspec.Struct, frozen=True):
     """The specifications in force, and the names of the monitors that need attention."""
 
-    revision: int
-    tag: str
-    loaded: int
-    enabled: int
-    held: list[str]
-    failing: list[str]
+    revision: RevisionNumber
+    tag: Annotated[str, doc("changes with every change; If-Match takes it in quotes")]
+    loaded: Annotated[int, doc("number of monitors")]
+    enabled: Annotated[int, doc("number of enabled monitors")]
+    held: Annotated[list[str], doc("monitors that hold their topics until they are resumed")]
+    failing: Annotated[list[str], doc("monitors whose actions fault; their messages are then dropped")]
     refused: Annotated[
         list[str], doc("why the relay rejects the specifications: all topics are blocked then")
     ]
-    who: str
-    differs_from_folder: bool
+    who: Who
+    differs_from_folder: Annotated[bool, doc("whether the specifications in force differ from their folder")]
     confirm_by: Moment | None
     shadow: Annotated[list[str], doc("monitors in shadow mode")] = []
     why_held: Annotated[
@@ -158,11 +158,15 @@ class ClockState(msgspec.Struct, frozen=True):
 class AuditState(msgspec.Struct, frozen=True):
     """How far the audit log is behind, why it cannot be written, and how requests are then answered."""
 
-    lag_records: int
-    lag_seconds: float
-    failed: str | None
-    on_failure: Literal["deny", "allow"]
-    degraded: str | None
+    lag_records: Annotated[int, doc("number of records that are not on disk yet")]
+    lag_seconds: Annotated[float, doc("how long the oldest such record has waited")]
+    failed: Annotated[str | None, doc("why the log cannot be written, or null if it can")]
+    on_failure: Annotated[
+        Literal["deny", "allow"], doc("decision on requests while the log cannot be written")
+    ]
+    degraded: Annotated[
+        str | None, doc("why checkpoints, index or retention are behind, or null if they are not")
+    ]
     replaced: Annotated[
         str | None, doc("which other logs the signer signed and no operator set aside, in words, or null")
     ]
@@ -187,7 +191,7 @@ class SwitchedOff(msgspec.Struct, frozen=True):
 class BlocksState(msgspec.Struct, frozen=True):
     """The hosts that operators block (`rosrv host blocks`)."""
 
-    hosts: int
+    hosts: Annotated[int, doc("enrolled, awaited or declared")]
     first_end: Annotated[
         Moment | None, doc("when the first block ends, or null if none ends without an order")
     ]
@@ -210,17 +214,17 @@ class HandledAlarm(msgspec.Struct, frozen=True):
     until: Annotated[
         Moment | None, doc("when the silence ends, or null if it is acknowledged and not silenced")
     ]
-    note: str = ""
+    note: RevisionNote = ""
 
 
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
-    version: str
+    version: Annotated[str, doc("version of the program")]
     since: Moment
     master: Annotated[str, doc("URI for the nodes' ROS_MASTER_URI")]
-    processes: list[ProcessInfo]
-    isolation: str
+    processes: Annotated[list[ProcessInfo], doc("of the appliance, the supervisor first")]
+    isolation: Annotated[str, doc("netns, container or none")]
     relaying: Annotated[str, doc("`all`, or `monitored`: only topics and services with monitors are relayed")]
     mediation: Annotated[str, doc("`full`, or `monitored`: nodes then get each other's own addresses")]
     firewall: FirewallState
@@ -228,15 +232,15 @@ class Status(msgspec.Struct, frozen=True):
     policy: PolicyState
     ipsec: IpsecState
     monitors: MonitorsState
-    rosmaster: str
-    relay: str
-    nodes: int
-    shadows: int
-    topics: int
-    services: int
-    connections: int
-    messages: int
-    dropped: int
+    rosmaster: Annotated[str, doc("reachable, or being rebuilt")]
+    relay: Annotated[str, doc("connected, or the number of its processes that are not")]
+    nodes: Annotated[int, doc("number of the robot's nodes")]
+    shadows: Annotated[int, doc("nodes that do not answer and are expected back")]
+    topics: Annotated[int, doc("number of the robot's topics")]
+    services: Annotated[int, doc("number of the robot's services")]
+    connections: Annotated[int, doc("open connections through the appliance")]
+    messages: Annotated[int, doc("messages relayed since RVMaster started")]
+    dropped: Annotated[int, doc("messages dropped for slow subscribers")]
     audit: AuditState
     clock: ClockState
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []

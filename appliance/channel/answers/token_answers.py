@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Id, Moment, Name, doc
 
 TokenRole = Literal["viewer", "investigator", "operator", "admin"]
 """Viewers read. Only investigators can also fetch the messages of recordings. Operators load the file's policy, or one
@@ -22,9 +22,9 @@ def may(held: str, least: TokenRole) -> bool:
 class Token(msgspec.Struct, frozen=True):
     """A token without its secret; times are seconds since the epoch."""
 
-    name: str
-    id: str
-    role: TokenRole
+    name: Name
+    id: Id
+    role: Annotated[TokenRole, doc("role, which decides its rights")]
     created: Moment
     expires: Moment
     revoked: Moment | None
@@ -41,7 +41,7 @@ class Token(msgspec.Struct, frozen=True):
 class Tokens(msgspec.Struct, frozen=True):
     """All tokens that were made, oldest first."""
 
-    tokens: list[Token]
+    tokens: Annotated[list[Token], doc("all tokens, including ended ones")]
     uses_since: Annotated[
         Moment | None,
         doc("since when uses are known: the first start of a version that stores them, or null if unknown"),
@@ -63,5 +63,5 @@ class RotatedToken(NewToken, frozen=True, kw_only=True):
 class Challenge(msgspec.Struct, frozen=True):
     """The challenge under which the next order is signed."""
 
-    challenge: str
+    challenge: Annotated[str, doc("the text under which the next order is signed")]
     seconds: Annotated[float, doc("seconds for which it is valid, for one order")]

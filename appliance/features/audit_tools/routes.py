@@ -36,6 +36,7 @@ from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import Follower, export
+from appliance.channel.answers.field_docs import doc
 from appliance.features.audit_tools.audit_summary import add_summary
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.record_pages import PAGE, page_of, streamed
@@ -65,7 +66,7 @@ _ONE = {
 class LogCheckpoints(msgspec.Struct, frozen=True):
     """Signed checkpoints in order; ask again after the last number for more."""
 
-    checkpoints: list[SignedCheckpoint]
+    checkpoints: Annotated[list[SignedCheckpoint], doc("checkpoints, in order")]
 
 
 def _wanted(

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.channel.admin import AdminRequest
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, RevisionNote, VirtualAddress, doc
 from appliance.channel.rest_operation import parameter, rest
 
 LONGEST_BLOCK_SECONDS = 365 * 86_400
@@ -29,12 +29,12 @@ class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BlockedHost(msgspec.Struct, frozen=True):
     """A host that an operator blocks."""
 
-    address: str
+    address: VirtualAddress
     name: Annotated[str, doc("its name if it is enrolled, else empty")]
     since: Moment
     until: Annotated[Moment | None, doc("when it ends, or null if only by an order")]
     who: Annotated[str, doc("name of the token, or `operator`")]
-    note: str
+    note: RevisionNote
 
 
 class BlockedHosts(msgspec.Struct, frozen=True):

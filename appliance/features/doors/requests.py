@@ -92,7 +92,7 @@ class NewTicket(Ticket, frozen=True, kw_only=True):
 class NewDoor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A door; an agent's door has a port, and may be limited to the agent's address or network."""
 
-    name: Annotated[str, msgspec.Meta(max_length=31)]
+    name: Annotated[str, doc("its name", max_length=31)]
     port: Annotated[
         Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None,
         doc("port of an agent; without it, only tickets open the door"),

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, RevisionNumber, doc
 from appliance.channel.answers.monitor_answers import GivenState, Tag
 
 
@@ -101,7 +101,7 @@ class GuardRow(msgspec.Struct, frozen=True):
 class GuardList(msgspec.Struct, frozen=True):
     """The presets, and the guards that are loaded, in the order in which they see messages."""
 
-    revision: int
+    revision: RevisionNumber
     tag: Tag
     presets: Annotated[list[PresetRow], doc("all presets")]
     guards: Annotated[list[GuardRow], doc("the loaded guards, in the order in which they see messages")]
@@ -113,7 +113,7 @@ class GuardList(msgspec.Struct, frozen=True):
 class GuardPlan(msgspec.Struct, frozen=True):
     """The effects of a new guard, of new values or of `enforce`; nothing has changed."""
 
-    revision: int
+    revision: RevisionNumber
     tag: Tag
     name: Annotated[str, doc("the guard")]
     file: Annotated[str, doc("the specification file that would be loaded, or empty if there is none")]

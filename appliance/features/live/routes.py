@@ -24,7 +24,7 @@ from appliance.api.front.streams import StreamResponse, Streams, peer_of
 from appliance.base import clock
 from appliance.channel.admin import GraphWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, Name, doc
 from appliance.channel.answers.status import Status
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAMS
@@ -38,13 +38,13 @@ _TEXT = file("text/event-stream", "Events `now`, `graph`, `away`, `end`.")
 class Hour(msgspec.Struct, frozen=True):
     """The last hour's samples, the newest last."""
 
-    samples: list[Sample]
+    samples: Annotated[list[Sample], doc("samples, the newest last")]
 
 
 class Holder(msgspec.Struct, frozen=True):
     """The token's name, role and end."""
 
-    name: str
+    name: Name
     role: Annotated[TokenRole, doc("role of the token")]
     expires: Moment
     left_seconds: Annotated[float, doc("until it ends; a browser's clock may differ from the appliance's")]

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from appliance.base.actors import APPLIANCE
-from appliance.channel.answers.field_docs import NanoMoment, doc
+from appliance.channel.answers.field_docs import Address, Id, Name, NanoMoment, RosType, doc
 
 OPERATORS = "operators"
 """The payer of recordings that operators order. Other recordings are charged as control's `charged_to` decides."""
@@ -18,9 +18,9 @@ class Trigger(msgspec.Struct, frozen=True):
     """Why messages were recorded."""
 
     time: NanoMoment
-    what: TriggerKind
+    what: Annotated[TriggerKind, doc("its kind")]
     record: Annotated[str, doc("id of the trigger's audit record")]
-    text: str
+    text: Annotated[str, doc("what happened, in words")]
     charged_to: Annotated[
         str, doc("who caused it: robot, operators, appliance, unknown hosts, a host or network")
     ] = APPLIANCE
@@ -36,36 +36,36 @@ class Trigger(msgspec.Struct, frozen=True):
 class RecordedTopic(msgspec.Struct, frozen=True):
     """The part of a recording with one topic of one type."""
 
-    topic: str
-    type: str
-    md5sum: str
-    messages: int
-    bytes: int
+    topic: Name
+    type: RosType
+    md5sum: Annotated[str, doc("MD5 sum of the type, as ROS computes it")]
+    messages: Annotated[int, doc("number of its messages in the recording")]
+    bytes: Annotated[int, doc("bytes of its messages in the recording")]
     missed: Annotated[int, doc("messages of that time that did not fit in the recorder's memory")]
 
 
 class LeftOutTopic(msgspec.Struct, frozen=True):
     """A topic that had messages during the recording and was left out (`recorder.never`); one for each publisher."""
 
-    topic: str
+    topic: Name
     type: Annotated[str, doc("type that the publisher declared")]
-    host: str
+    host: Address
     why: Annotated[str, doc("the setting that excluded it")]
 
 
 class Recording(msgspec.Struct, frozen=True):
     """One recording; also stored as `recording.json` beside its bag."""
 
-    id: str
+    id: Id
     began: NanoMoment
     ended: NanoMoment
-    triggers: list[Trigger]
-    topics: list[RecordedTopic]
+    triggers: Annotated[list[Trigger], doc("triggers of the recording, in order")]
+    topics: Annotated[list[RecordedTopic], doc("topics with the number of recorded messages")]
     policy: Annotated[int, doc("revision of the policy in force at the end")]
     monitors: Annotated[int, doc("revision of the specifications in force at the end")]
     size: Annotated[int, doc("bytes of the bag")]
     sha256: Annotated[str, doc("SHA-256 of the bag, in hexadecimal")]
-    complete: bool
+    complete: Annotated[bool, doc("whether it is complete")]
     why_not: Annotated[str, doc("what is missing, in words; empty if it is complete")]
     left_out: Annotated[
         list[LeftOutTopic], doc("the first topics that recorder.never excluded, and why")
@@ -78,7 +78,7 @@ class Recording(msgspec.Struct, frozen=True):
 class OpenRecording(msgspec.Struct, frozen=True):
     """A recording that is still being made."""
 
-    id: str
+    id: Id
     began: NanoMoment
     ends: Annotated[NanoMoment, doc("when it ends, or later after further triggers")]
     trigger: Annotated[Trigger, doc("the first trigger")]
@@ -87,7 +87,7 @@ class OpenRecording(msgspec.Struct, frozen=True):
 class RecordingBegun(msgspec.Struct, frozen=True):
     """A recording that is being made."""
 
-    id: str
+    id: Id
     ends: Annotated[
         NanoMoment, doc("when it ends, or later after further triggers: nanoseconds since the epoch")
     ]
@@ -96,7 +96,7 @@ class RecordingBegun(msgspec.Struct, frozen=True):
 class Recordings(msgspec.Struct, frozen=True):
     """All stored recordings, oldest first, and the topics that are recorded."""
 
-    recordings: list[Recording]
+    recordings: Annotated[list[Recording], doc("stored recordings")]
     topics: Annotated[list[str], doc("names of topics that are recorded; `*` matches anything")] = []
     never: Annotated[list[str], doc("names and types that are never recorded")] = []
     before: Annotated[float, doc("seconds of messages that the memory keeps")] = 0.0
@@ -108,15 +108,15 @@ class Recordings(msgspec.Struct, frozen=True):
 class Sender(msgspec.Struct, frozen=True):
     """A node that published, and its machine; the host is empty for messages that monitors published."""
 
-    node: str
-    host: str
+    node: Name
+    host: Address
 
 
 class RecordedFlow(msgspec.Struct, frozen=True):
     """The traffic of a topic: the number of messages in each column of the time line."""
 
-    topic: str
-    type: str
+    topic: Name
+    type: RosType
     senders: Annotated[list[Sender], doc("the publisher")]
     counts: Annotated[list[int], doc("messages in each column, in their order")]
 
@@ -127,7 +127,7 @@ class EventMarks(msgspec.Struct, frozen=True):
     Events that a record only counts are spread evenly over the time between the first and the last.
     """
 
-    kind: EventKind
+    kind: Annotated[EventKind, doc("archive that the package comes from")]
     counts: Annotated[list[int], doc("events in each column, in their order")]
 
 
@@ -135,13 +135,13 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
     """An event from an audit record of the recorded time; `notice` is a notable event of no other kind."""
 
     time: NanoMoment
-    kind: EventKind
+    kind: Annotated[EventKind, doc("archive that the package comes from")]
     record: Annotated[str, doc("id of the audit record")]
-    event: str
-    severity: str
+    event: Annotated[str, doc("its stable name")]
+    severity: Annotated[str, doc("error or warning")]
     decision: Annotated[str | None, doc("allow, deny or would deny, or null if nothing was decided")]
     host: Annotated[str | None, doc("the host that the record is about")]
-    caller_id: str | None
+    caller_id: Annotated[str | None, doc("the name the node gave: a claim")]
     resource: Annotated[str | None, doc("topic, service, call or monitor")]
     reason: Annotated[str, doc("the reason, in words")]
     times: Annotated[int, doc("how often it happened: a record may count repetitions")] = 1
@@ -150,7 +150,7 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
 class Timeline(msgspec.Struct, frozen=True):
     """A recording, or a part of it, in columns of equal time: traffic and events."""
 
-    id: str
+    id: Id
     since: Annotated[NanoMoment, doc("where the first column begins: nanoseconds since the epoch")]
     until: Annotated[NanoMoment, doc("the last moment of the last column: nanoseconds since the epoch")]
     topics: Annotated[
@@ -168,8 +168,8 @@ class RecordedMessage(msgspec.Struct, frozen=True):
 
     time: Annotated[NanoMoment, doc("when the relay received it: nanoseconds since the epoch")]
     place: Annotated[str, doc("position in the recording, which `at` takes")]
-    topic: str
-    type: str
+    topic: Name
+    type: RosType
     sender: Annotated[Sender, doc("the publisher")]
     size: Annotated[int, doc("bytes, without the length prefix")]
     fields: Annotated[dict[str, Any], doc("fields as in a message of /v1/messages")]
@@ -179,8 +179,8 @@ class RecordedMessage(msgspec.Struct, frozen=True):
 class RecordedMessages(msgspec.Struct, frozen=True):
     """Messages of a recording around a time, in order."""
 
-    id: str
-    messages: list[RecordedMessage]
+    id: Id
+    messages: Annotated[list[RecordedMessage], doc("messages relayed since counting began")]
     chosen: Annotated[
         int, doc("index of the message that the record is about, or the last one at or before the time; or 0")
     ]

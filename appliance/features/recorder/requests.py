@@ -27,7 +27,7 @@ class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     before: Annotated[Annotated[float, msgspec.Meta(ge=0, le=3600)] | None, doc("seconds")] = None
     after: Annotated[Annotated[float, msgspec.Meta(gt=0, le=3600)] | None, doc("seconds")] = None
-    note: Annotated[str, msgspec.Meta(max_length=300)] = ""
+    note: Annotated[str, doc("reason given by the person who loaded it", max_length=300)] = ""
 
 
 class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,20 +1,22 @@
 """Show the flight recorder in the status, the alarms and the metrics."""
 
 from collections.abc import Iterator
+from typing import Annotated
 
 import msgspec
 
 from appliance.base.metric import gauge
+from appliance.channel.answers.field_docs import doc
 from appliance.features.view import FeatureView, StateView, Trouble
 
 
 class RecorderState(msgspec.Struct, frozen=True):
     """The flight recorder: how many recordings are kept, their bytes, and how many are being made."""
 
-    running: bool
-    recordings: int
-    bytes: int
-    in_progress: int = 0
+    running: Annotated[bool, doc("whether it records now")]
+    recordings: Annotated[int, doc("number of stored recordings")]
+    bytes: Annotated[int, doc("bytes of all recordings")]
+    in_progress: Annotated[int, doc("number of recordings that are being made")] = 0
 
 
 _METRICS = (

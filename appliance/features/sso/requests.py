@@ -28,7 +28,7 @@ class SignedOn(msgspec.Struct, frozen=True):
     name: Annotated[str, doc("name of the person in the audit log")]
     subject: Annotated[str, doc("permanent identifier of the person at the provider (`sub`)")]
     mail: Annotated[str, doc("verified e-mail address, or empty without one")]
-    role: TokenRole
+    role: Annotated[TokenRole, doc("role, which decides its rights")]
     groups: Annotated[list[str], doc("groups of doors")]
     expires: Moment
 

@@ -30,7 +30,7 @@ _FAILS: Responses = {
 class BrowserKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A session that the browser made: a token's id, and the verifiers of its keys."""
 
-    id: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{12}$" + WHOLE)]
+    id: Annotated[str, doc("its unique id", pattern=r"^[0-9a-f]{12}$" + WHOLE)]
     reading: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE), doc("SHA-256 of the reading key, base64url")]
     verifying: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE), doc("public signing key, base64url")]
     again: Annotated[bool, doc("the person must prove to the provider again who they are")] = False

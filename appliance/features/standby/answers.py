@@ -4,14 +4,14 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, Name, VirtualAddress, doc
 
 
 class OtherAppliance(msgspec.Struct, frozen=True):
     """The other appliance, as this one sees it."""
 
-    name: str
-    address: str
+    name: Name
+    address: VirtualAddress
     connected: Annotated[bool, doc("whether the replication between both is open")]
     in_sync: Annotated[bool, doc("whether the standby has all acknowledged changes")]
     behind_changes: Annotated[int, doc("changes of the state that it lacks; on a standby always 0")]
@@ -38,7 +38,7 @@ class OtherAppliance(msgspec.Struct, frozen=True):
 class WitnessSeen(msgspec.Struct, frozen=True):
     """The witness on the robot, as this appliance sees it."""
 
-    address: str
+    address: VirtualAddress
     answered_seconds: Annotated[
         float | None, doc("seconds since its last answer, or null if it never answered")
     ]
@@ -62,7 +62,7 @@ class StandbyState(msgspec.Struct, frozen=True):
     """The state of two appliances, of which one is active; `since` is when this one took its role."""
 
     name: Annotated[str, doc("this appliance")]
-    address: str
+    address: VirtualAddress
     role: Annotated[
         Literal["active", "standby"],
         doc("active: the robot's nodes use this appliance; standby: it is ready to take over, or catches up"),

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import msgspec
 
 from appliance.channel.admin import WaitingRequest
-from appliance.channel.answers.field_docs import NanoMoment, doc
+from appliance.channel.answers.field_docs import Name, NanoMoment, RosType, doc
 from appliance.channel.rest_operation import parameter, rest
 
 
@@ -28,11 +28,11 @@ class TopicMessage(msgspec.Struct, frozen=True):
 class TopicMessages(msgspec.Struct, frozen=True):
     """The next messages of a topic, fewer than requested if no more came in time."""
 
-    topic: str
-    type: str
-    publishers: list[str]
-    subscribers: list[str]
-    messages: list[TopicMessage]
+    topic: Name
+    type: RosType
+    publishers: Annotated[list[str], doc("nodes that publish it")]
+    subscribers: Annotated[list[str], doc("nodes that subscribe to it")]
+    messages: Annotated[list[TopicMessage], doc("messages as subscribers got them")]
 
 
 @rest(

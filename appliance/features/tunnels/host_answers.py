@@ -4,15 +4,15 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, Name, RevisionNumber, VirtualAddress, doc
 from appliance.channel.answers.host_answers import Host, PortsSeen
 
 
 class Machine(msgspec.Struct, frozen=True):
     """A machine that runs nodes and connects without a tunnel, identified by its address."""
 
-    address: str
-    nodes: int
+    address: VirtualAddress
+    nodes: Annotated[int, doc("number of nodes that run on it")]
     ports: PortsSeen
 
 
@@ -20,7 +20,7 @@ class Hosts(msgspec.Struct, frozen=True):
     """All hosts, and the state of the tunnels."""
 
     revision: Annotated[int, doc("the number in the ETag")]
-    hosts: list[Host]
+    hosts: Annotated[list[Host], doc("enrolled, awaited or declared")]
     machines: Annotated[list[Machine], doc("machines of nodes without a tunnel")]
     esp: Annotated[
         Literal["kernel", "user space"] | None, doc("where ESP runs, or null if no tunnels are open")
@@ -29,9 +29,9 @@ class Hosts(msgspec.Struct, frozen=True):
         list[str], doc("key exchanges offered and accepted, best first, or empty if not known yet")
     ]
     post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them, or null if not known yet")]
-    pool: str
+    pool: Annotated[str, doc("network of the virtual addresses")]
     address: Annotated[str, doc("the appliance's own address in the tunnels")]
-    hosts_file: str
+    hosts_file: Annotated[str, doc("path of hosts.yaml")]
     troubles: Annotated[list[str], doc("problems that need a person's attention")]
 
 
@@ -64,9 +64,9 @@ class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
     """A one-time token, which is shown only once."""
 
     revision: Annotated[int, doc("revision of the table of hosts, the number in the ETag")]
-    name: str
+    name: Name
     address: Annotated[str, doc("the virtual address that is reserved for the host")]
-    token: str
+    token: Annotated[str, doc("the one-time token")]
     expires: Moment
     endpoint: Annotated[str, doc("address or name at which the host reaches the appliance")]
     endpoint_reason: Annotated[str, doc("why this endpoint was chosen if none was given; else empty")]
@@ -85,20 +85,20 @@ class Renewed(msgspec.Struct, frozen=True):
 class NewCertificate(msgspec.Struct, frozen=True):
     """The certificate for the new key; the previous one stays valid until `renewed` is called."""
 
-    name: str
-    serial: str
+    name: Name
+    serial: Annotated[str, doc("serial number of its certificate, in hexadecimal, or empty without one")]
     expires: Moment
-    certificate: str
-    authority: str
+    certificate: Annotated[str, doc("the certificate, in PEM")]
+    authority: Annotated[str, doc("certificate of the hosts' authority, in PEM")]
 
 
 class Revoked(msgspec.Struct, frozen=True):
     """A host was excluded permanently; `serial` is empty if the host had a token but never enrolled."""
 
-    revision: int
-    name: str
-    address: str
-    serial: str
+    revision: RevisionNumber
+    name: Name
+    address: VirtualAddress
+    serial: Annotated[str, doc("serial number of its certificate, in hexadecimal, or empty without one")]
     taken_back: Annotated[int, doc("revoked registrations and grants")]
 
 
@@ -113,11 +113,11 @@ class PortsReport(msgspec.Struct, frozen=True):
 class Reloaded(msgspec.Struct, frozen=True):
     """hosts.yaml was read again."""
 
-    revision: int
-    declared: list[str]
+    revision: RevisionNumber
+    declared: Annotated[list[str], doc("names in hosts.yaml")]
     opened: Annotated[list[str], doc("hosts whose tunnel is allowed again")]
     closed: Annotated[list[str], doc("hosts whose tunnel is no longer allowed")]
-    divergence: list[str]
+    divergence: Annotated[list[str], doc("differences between hosts.yaml and the enrolled hosts")]
 
 
 class Endpoint(msgspec.Struct, frozen=True):

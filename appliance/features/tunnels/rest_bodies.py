@@ -51,7 +51,7 @@ class TokenWishes(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     address: Annotated[Address | None, doc("its virtual address; by default, the next free one")] = None
     days: Days = 90
-    token_seconds: TokenSeconds = 3600
+    token_seconds: Annotated[TokenSeconds, doc("seconds for which the one-time token is valid")] = 3600
 
 
 class NewHost(TokenWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -81,8 +81,8 @@ class NewKit(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The findings of `rosrv protect --check`."""
 
-    state: PortsState
-    open: Annotated[list[Port], msgspec.Meta(max_length=100)] = []
+    state: Annotated[PortsState, doc("its state")]
+    open: Annotated[list[Port], doc("TCP ports that accepted a connection", max_length=100)] = []
     checked: Annotated[GivenMoment | None, doc("RFC 3339, or seconds since the epoch; by default, now")] = (
         None
     )

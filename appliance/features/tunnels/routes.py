@@ -24,7 +24,7 @@ from appliance.api.front.streams import peer_of
 from appliance.api.routes.operation_routes import AnsweringRoutes
 from appliance.base import clock
 from appliance.channel.admin import A, AdminRequest
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, VirtualAddress, doc
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_kit import archive, members
@@ -40,30 +40,38 @@ PROOF = r"^[A-Za-z0-9+/]+={0,2}$"
 class Enrolment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The request of a host that enrols."""
 
-    token: Annotated[str, msgspec.Meta(pattern=TOKEN + WHOLE)]
+    token: Annotated[str, doc("the one-time token", pattern=TOKEN + WHOLE)]
     request: SigningRequest
 
 
 class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
     """A host is enrolled; `files` are the files of its kit by path, without the private key."""
 
-    name: str
-    address: str
+    name: Annotated[str, doc("name of the host")]
+    address: VirtualAddress
     appliance: Annotated[str, doc("the appliance's address in the tunnel")]
     master: Annotated[str, doc("ROS_MASTER_URI through the tunnel")]
-    serial: str
+    serial: Annotated[str, doc("serial number of its certificate, in hexadecimal, or empty without one")]
     expires: Moment
-    certificate: str
-    authority: str
-    warning: str | None
-    files: dict[str, str]
+    certificate: Annotated[str, doc("the certificate, in PEM")]
+    authority: Annotated[str, doc("certificate of the hosts' authority, in PEM")]
+    warning: Annotated[str | None, doc("a problem that needs a person's attention, or null if there is none")]
+    files: Annotated[dict[str, str], doc("texts by their paths in the kit")]
 
 
 class Renewal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A signing request for a new key, and the present key's signature over its bytes (base64)."""
 
     request: SigningRequest
-    proof: Annotated[str, msgspec.Meta(min_length=1, max_length=1024, pattern=PROOF + WHOLE)]
+    proof: Annotated[
+        str,
+        doc(
+            "signature of the request with the current key, in base64",
+            min_length=1,
+            max_length=1024,
+            pattern=PROOF + WHOLE,
+        ),
+    ]
 
 
 _ALL = "all"
