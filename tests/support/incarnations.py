@@ -11,12 +11,21 @@ def incarnation(
     *,
     host: str = "10.0.0.5",
     key: str = "",
-    ports: tuple[int, int] = (19001, 19002),
+    ports: tuple[int, ...] = (19001, 19002),
+    path: str = "/",
     **more: Any,
 ) -> Incarnation:
     """Return a node with its API at `port`; its `key` is "key of NAME" unless given."""
-    uri = f"http://{host}:{port}/"
+    uri = f"http://{host}:{port}{path}"
     address = ipaddress.ip_address(host)
     return Incarnation(
-        key or f"key of {name}", name, address, parse_node_uri(uri), uri, "10.0.0.1", *ports, **more
+        key or f"key of {name}",
+        name,
+        address,
+        parse_node_uri(uri),
+        uri,
+        "10.0.0.1",
+        *ports[:2],
+        more_relay_ports=ports[2:],
+        **more,
     )

@@ -1,4 +1,3 @@
-import ipaddress
 from typing import Any
 
 from hypothesis import given, settings
@@ -8,10 +7,10 @@ from appliance.master.graph.registry import Incarnation, Kind, new_key
 from appliance.policy.live_rights import LiveRight, endings
 from appliance.policy.policy_compiler import compile_policy
 from appliance.store.state_file import PermissionRow
-from roswire.uris import parse_node_uri
 from tests.support import autojump
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples
+from tests.support.incarnations import incarnation
 from tests.support.parameters import mirror
 
 HOSTS = ("10.0.0.5", "10.0.0.6")
@@ -89,11 +88,8 @@ async def taken(
     world.parameters = mirror(tree)
     nodes: dict[tuple[str, str], Incarnation] = {}
     for number, (host, name, kind, resource) in enumerate(sorted(registrations), start=4000):
-        uri = f"http://{host}:{number}/"
         if (host, name) not in nodes:
-            node = Incarnation(
-                new_key(), name, ipaddress.ip_address(host), parse_node_uri(uri), uri, "10.0.0.1", 1, 2
-            )
+            node = incarnation(name, number, host=host, key=new_key())
             nodes[host, name] = node
             world.registry.add(node)
         world.graph.registered(nodes[host, name], kind, resource, "4001")

@@ -29,31 +29,24 @@ def virtual(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
     return run
 
 
-class Relay:
-    """Answers queries at once, unless it is `silent` or `away`."""
+class Desk:
+    """The variables of monitors, and a relay that answers queries at once unless it is `silent` or `away`."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
         self.silent = self.away = False
-        self.x = 1.0
-        self.seen: Callable[[ValuesSeen], None] = lambda _seen: None
+        self.x, self.trail, self.revision = 1.0, FakeTrail(), 1
+        self.values = MonitorValues(self._tell, lambda: self.revision, self.trail)
 
-    def tell(self, _monitor: str, message: Message) -> bool:
+    def _tell(self, _monitor: str, message: Message) -> bool:
         assert isinstance(message, ValuesWanted)
         if self.away:
             return False
         self.asked.append(message.monitor)
         if not self.silent:
             answer = ValuesSeen(message.number, {"x": self.x}, {"pose": 0.5, "foreign": None})
-            asyncio.get_running_loop().call_later(0.01, self.seen, answer)
+            asyncio.get_running_loop().call_later(0.01, self.values.received, answer)
         return True
-
-
-class Desk:
-    def __init__(self) -> None:
-        self.relay, self.trail, self.revision = Relay(), FakeTrail(), 1
-        self.values = MonitorValues(self.relay.tell, lambda: self.revision, self.trail)
-        self.relay.seen = self.values.received
 
 
 @pytest.fixture
@@ -66,8 +59,8 @@ async def test_readers_share_an_answer_for_a_quarter_of_a_second(desk: Desk) -> 
     found = await asyncio.gather(*(desk.values.of("fence", f"reader {number}") for number in range(20)))
     assert {one.values["x"] for one in found} == {1.0}
     await desk.values.of("fence", "another")
-    assert desk.relay.asked == ["fence"]
-    desk.relay.x = 2.0
+    assert desk.asked == ["fence"]
+    desk.x = 2.0
     await asyncio.sleep(FRESH_SECONDS + 0.01)
     assert (await desk.values.of("fence", "another")).values == {"x": 2.0}
 
@@ -76,7 +69,7 @@ async def test_readers_share_an_answer_for_a_quarter_of_a_second(desk: Desk) -> 
 @virtual
 async def test_without_the_relay_the_last_answer_is_shown_with_its_age(desk: Desk, how: str) -> None:
     await desk.values.of("fence", "ann")
-    setattr(desk.relay, how, True)
+    setattr(desk, how, True)
     await asyncio.sleep(5)
     found = await desk.values.of("fence", "ann")
     assert found.values == {"x": 1.0}
@@ -84,20 +77,20 @@ async def test_without_the_relay_the_last_answer_is_shown_with_its_age(desk: Des
     assert found.age_seconds is not None
     assert found.ages == {"pose": pytest.approx(found.age_seconds + 0.5), "foreign": None}
     assert "relay process" in found.why_old
-    setattr(desk.relay, how, False)
+    setattr(desk, how, False)
     assert (await desk.values.of("fence", "ann")).why_old == ""
 
 
 @virtual
 async def test_before_the_first_answer_there_are_no_values(desk: Desk) -> None:
-    desk.relay.away = True
+    desk.away = True
     found = await desk.values.of("fence", "ann")
     assert (found.values, found.age_seconds, bool(found.why_old)) == ({}, None, True)
 
 
 @virtual
 async def test_a_relay_that_ends_answers_its_readers_at_once(desk: Desk) -> None:
-    desk.relay.silent = True
+    desk.silent = True
     waiting = asyncio.ensure_future(desk.values.of("fence", "ann"))
     await asyncio.sleep(0.1)
     began = clock.now()
@@ -109,16 +102,16 @@ async def test_a_relay_that_ends_answers_its_readers_at_once(desk: Desk) -> None
 @virtual
 async def test_values_of_an_earlier_revision_are_not_shown(desk: Desk) -> None:
     await desk.values.of("fence", "ann")
-    desk.revision, desk.relay.away = 2, True
+    desk.revision, desk.away = 2, True
     assert (await desk.values.of("fence", "ann")).values == {}
 
 
 @virtual
 async def test_a_late_answer_is_discarded(desk: Desk) -> None:
-    desk.relay.silent = True
+    desk.silent = True
     await desk.values.of("fence", "ann")
     desk.values.received(ValuesSeen(1, {"x": 9.0}))
-    desk.relay.away = True
+    desk.away = True
     assert (await desk.values.of("fence", "ann")).values == {}
 
 

@@ -1,6 +1,5 @@
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -15,10 +14,8 @@ from appliance.specifications.specification_files import (
     Sources,
     SpecificationsRefusedError,
 )
-from appliance.telemetry.audit_trail import AuditTrail
 from tests.support import autojump
-from tests.support.audit import RecordingTrail
-from tests.support.engines import open_log
+from tests.support.core import FakeTrail
 from tests.support.stated import parts_here
 
 pytestmark = pytest.mark.anyio
@@ -45,10 +42,12 @@ def files_of(message: messages.SpecificationsStated) -> list[str]:
 
 
 class Fleet:
-    def __init__(self, trail: AuditTrail) -> None:
-        self.rollout = Rollout(
-            Allocation(2), trail, "drop", self, slices=1000, parts=parts_here,
-        )  # fmt: skip
+    """Two relays. `answer` is the answer of a relay to its statement."""
+
+    def __init__(self) -> None:
+        self.trail = FakeTrail()
+        self.rollout = Rollout(Allocation(2), self.trail, "drop", self, slices=1000, parts=parts_here)
+        self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()
@@ -84,173 +83,163 @@ class Fleet:
         ]
 
 
-class World:
-    def __init__(self, home: Path) -> None:
-        self.log = open_log(home / "audit.db")
-        self.trail = RecordingTrail(self.log)
-        self.fleet = Fleet(self.trail)
-        self.rollout = self.fleet.rollout
-        self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
-        autojump.run(self.rollout.start(revision(1, **self.files), restarted=False, kept=""))
-        self.fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
-
-
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    world = World(tmp_path)
-    yield world
-    world.log.close()
+def fleet() -> Fleet:
+    fleet = Fleet()
+    autojump.run(fleet.rollout.start(revision(1, **fleet.files), restarted=False, kept=""))
+    fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
+    return fleet
 
 
-async def test_a_relay_with_unchanged_specifications_gets_the_same_statement(world: World) -> None:
-    other = world.rollout.relay_of("b")
-    before = {relay: world.rollout.statement(relay).part for relay in range(2)}
-    await world.rollout.take(revision(2, **world.files, c=spec("c", "/a")))
-    after = {relay: world.rollout.statement(relay).part for relay in range(2)}
+async def test_a_relay_with_unchanged_specifications_gets_the_same_statement(fleet: Fleet) -> None:
+    other = fleet.rollout.relay_of("b")
+    before = {relay: fleet.rollout.statement(relay).part for relay in range(2)}
+    await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/a")))
+    after = {relay: fleet.rollout.statement(relay).part for relay in range(2)}
     assert after[other] == before[other]
     assert after[1 - other] != before[1 - other]
 
 
-async def test_each_relay_receives_its_own_specifications(world: World) -> None:
-    assert world.rollout.statement(0).ahead
-    assert files_of(world.rollout.statement(0)) == ["a.rv"]
-    assert files_of(world.rollout.statement(1)) == ["b.rv"]
-    assert await world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))) == []
-    assert not any(one.ahead for _, one in world.fleet.stated)
-    assert world.fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
+async def test_each_relay_receives_its_own_specifications(fleet: Fleet) -> None:
+    assert fleet.rollout.statement(0).ahead
+    assert files_of(fleet.rollout.statement(0)) == ["a.rv"]
+    assert files_of(fleet.rollout.statement(1)) == ["b.rv"]
+    assert await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/b"))) == []
+    assert not any(one.ahead for _, one in fleet.stated)
+    assert fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
 
 
-async def test_a_refusal_of_one_relay_stops_all(world: World) -> None:
+async def test_a_refusal_of_one_relay_stops_all(fleet: Fleet) -> None:
     def answer(relay: int, statement: messages.SpecificationsStated) -> messages.Message:
         if relay == 1 and statement.revision == 2:
             return messages.SpecificationsRefused(2, ["c.rv:1:1: error: no"], statement.statement)
         return taken(statement)
 
-    world.fleet.answer = answer
+    fleet.answer = answer
     with pytest.raises(SpecificationsRefusedError, match="no"):
-        await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
-    assert [one[:3] for one in world.fleet.story] == [
+        await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/b")))
+    assert [one[:3] for one in fleet.story] == [
         ("stated", 0, 2), ("stated", 1, 2), ("stated", 0, 1), ("stated", 1, 1)
     ]  # fmt: skip
-    assert world.rollout.relay_of("b") == 1
+    assert fleet.rollout.relay_of("b") == 1
 
 
 @pytest.mark.nightly
-async def test_a_relay_that_dies_counts_as_a_refusal(world: World) -> None:
-    world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
-    taking = asyncio.ensure_future(world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))))
-    while len(world.fleet.story) < 2:
+async def test_a_relay_that_dies_counts_as_a_refusal(fleet: Fleet) -> None:
+    fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
+    taking = asyncio.ensure_future(fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/b"))))
+    while len(fleet.story) < 2:
         await asyncio.sleep(0)
-    world.rollout.lost(1)
+    fleet.rollout.lost(1)
     with pytest.raises(SpecificationsRefusedError, match="try again"):
         await taking
-    world.fleet.away = {1}
-    await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
-    assert files_of(world.rollout.statement(1)) == ["b.rv", "c.rv"]
+    fleet.away = {1}
+    await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/b")))
+    assert files_of(fleet.rollout.statement(1)) == ["b.rv", "c.rv"]
 
 
-async def test_a_topic_moves_only_between_monitors(world: World) -> None:
-    moved = await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+async def test_a_topic_moves_only_between_monitors(fleet: Fleet) -> None:
+    moved = await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/a", "/b")))
     assert moved == ["b"]
-    assert world.fleet.story == [
+    assert fleet.story == [
         ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ("b",)),
         ("withdrawn", "/b", 1),
         ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ("b",)),
         ("stated", 1, 2, [], ()),
         ("placed", "/b", 0),
     ]
-    assert [fields["reason"] for event, fields in world.trail.heard if event == "topics moved"] == [
+    assert [row["reason"] for row in fleet.trail.rows if row["event"] == "topics moved"] == [
         "/b is handled by another relay process; b started in the initial state there"
     ]
 
 
-async def test_crossing_moves_go_one_way_and_are_tried_first(world: World) -> None:
+async def test_crossing_moves_go_one_way_and_are_tried_first(fleet: Fleet) -> None:
     files = {name: spec(name, f"/{name}") for name in "abcd"}
-    await world.rollout.take(revision(2, **files))
-    world.fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
-    world.fleet.story.clear()
-    await world.rollout.take(revision(3, **files, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d")))
-    shadowed = world.fleet.story[0]
+    await fleet.rollout.take(revision(2, **files))
+    fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
+    fleet.story.clear()
+    await fleet.rollout.take(revision(3, **files, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d")))
+    shadowed = fleet.story[0]
     assert shadowed[:2] == ("stated", 0)
     assert {"a.rv", "b.rv", "c.rv", "d.rv", "x.rv", "y.rv"} == set(shadowed[3])
-    assert {one[2] for one in world.fleet.story if one[0] == "placed"} == {0}
+    assert {one[2] for one in fleet.story if one[0] == "placed"} == {0}
 
 
 async def test_a_relay_that_starts_during_a_load_gets_it_before_any_topic(
-    world: World,
+    fleet: Fleet,
 ) -> None:
     """Otherwise topics would bypass the monitors that moved to this relay until it has compiled them."""
-    relay, world.fleet.away = 0, {0}
+    relay, fleet.away = 0, {0}
     stated: list[messages.SpecificationsStated] = []
 
     def answer(at: int, statement: messages.SpecificationsStated) -> messages.Message:
-        world.fleet.away = set()
-        stated.append(world.rollout.statement(relay))
+        fleet.away = set()
+        stated.append(fleet.rollout.statement(relay))
         return taken(statement)
 
-    world.files["c"] = spec("c", "/c")
-    world.fleet.answer = answer
-    await world.rollout.take(revision(2, **world.files))
+    fleet.files["c"] = spec("c", "/c")
+    fleet.answer = answer
+    await fleet.rollout.take(revision(2, **fleet.files))
     assert stated[0].revision == 2
 
 
-async def test_a_load_ends_once_the_relays_that_lost_topics_confirm(world: World) -> None:
-    world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
-    await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
-    over = asyncio.ensure_future(world.rollout.all_taken())
+async def test_a_load_ends_once_the_relays_that_lost_topics_confirm(fleet: Fleet) -> None:
+    fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
+    await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/a", "/b")))
+    over = asyncio.ensure_future(fleet.rollout.all_taken())
     for _ in range(5):
         await asyncio.sleep(0)
     assert not over.done()
-    world.rollout.received(taken([one for at, one in world.fleet.stated if at == 1][-1]), 1)
+    fleet.rollout.received(taken([one for at, one in fleet.stated if at == 1][-1]), 1)
     await over
-    assert world.rollout.refused == []
+    assert fleet.rollout.refused == []
 
 
-async def test_a_topic_published_during_a_load_moves_as_well(world: World) -> None:
-    world.fleet.carried = set()
+async def test_a_topic_published_during_a_load_moves_as_well(fleet: Fleet) -> None:
+    fleet.carried = set()
 
     def answer(_relay: int, statement: messages.SpecificationsStated) -> messages.Message:
-        world.fleet.carried = {(TOPIC, "/b")}
+        fleet.carried = {(TOPIC, "/b")}
         return taken(statement)
 
-    world.fleet.answer = answer
-    await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
-    assert ("withdrawn", "/b", 1) in world.fleet.story
-    assert world.fleet.story[-1] == ("placed", "/b", 0)
+    fleet.answer = answer
+    await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/a", "/b")))
+    assert ("withdrawn", "/b", 1) in fleet.story
+    assert fleet.story[-1] == ("placed", "/b", 0)
 
 
 async def test_an_answer_to_an_earlier_try_does_not_count(
-    world: World, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("appliance.specifications.rollout._RELAY_SECONDS", 0.01)
-    world.fleet.answer = lambda _relay, _statement: None
+    fleet.answer = lambda _relay, _statement: None
     with pytest.raises(SpecificationsRefusedError, match="try again"):
-        await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
-    late = [one for _, one in world.fleet.stated if one.revision == 2]
+        await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/b")))
+    late = [one for _, one in fleet.stated if one.revision == 2]
     monkeypatch.setattr("appliance.specifications.rollout._RELAY_SECONDS", 15)
-    again = asyncio.ensure_future(world.rollout.take(revision(2, **world.files, d=spec("d", "/b"))))
+    again = asyncio.ensure_future(fleet.rollout.take(revision(2, **fleet.files, d=spec("d", "/b"))))
     await asyncio.sleep(0)
     for relay, statement in enumerate(late):
-        world.rollout.received(taken(statement), relay)
+        fleet.rollout.received(taken(statement), relay)
     for _ in range(5):
         await asyncio.sleep(0)
     assert not again.done()
-    for relay, statement in world.fleet.stated[-2:]:
-        world.rollout.received(taken(statement), relay)
+    for relay, statement in fleet.stated[-2:]:
+        fleet.rollout.received(taken(statement), relay)
     await again
 
 
-async def test_monitors_in_their_initial_state_are_reported(world: World) -> None:
-    world.fleet.answer = lambda relay, statement: messages.SpecificationsTaken(
+async def test_monitors_in_their_initial_state_are_reported(fleet: Fleet) -> None:
+    fleet.answer = lambda relay, statement: messages.SpecificationsTaken(
         statement.revision, ["c", "b"] if relay else [], [], statement.statement
     )
-    world.rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
-    await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
-    assert world.rollout.began(["a", "b", "c"]) == ["b", "c"]
+    fleet.rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
+    await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/b")))
+    assert fleet.rollout.began(["a", "b", "c"]) == ["b", "c"]
 
 
-async def test_held_monitors_and_rows_of_both(world: World) -> None:
-    rollout = world.rollout
+async def test_held_monitors_and_rows_of_both(fleet: Fleet) -> None:
+    rollout = fleet.rollout
 
     def row(name: str, events: int) -> messages.MonitorRow:
         return messages.MonitorRow(name, f"{name}.rv", True, False, False, events, 0, 0, 0, 0)
@@ -265,8 +254,8 @@ async def test_held_monitors_and_rows_of_both(world: World) -> None:
     assert rollout.held == {"a"}
 
 
-async def test_a_relay_with_other_specifications_is_reported_until_it_agrees(world: World) -> None:
-    rollout = world.rollout
+async def test_a_relay_with_other_specifications_is_reported_until_it_agrees(fleet: Fleet) -> None:
+    rollout = fleet.rollout
     rollout.received(messages.SpecificationsRefused(1, ["no memory"]), 1)
     rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
     assert rollout.refused == ["no memory"]
@@ -274,24 +263,21 @@ async def test_a_relay_with_other_specifications_is_reported_until_it_agrees(wor
     assert rollout.refused == []
 
 
-async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) -> None:
+async def test_a_crash_of_control_changes_nothing() -> None:
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
     files = {"b": spec("b", "/b"), "z": spec("z", "/z")}
     allocation.adopt(allocation.plan(revision(1, **files).checked))
     here = {name: allocation.of_file(f"{name}.rv") for name in files}
-    log = open_log(tmp_path / "other.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False)
-    after = Fleet(trail).rollout
+    after = Fleet().rollout
     await after.start(revision(1, **files), restarted=True, kept=kept[-1])
     assert {name: after.relay_of(name) for name in files} == here
     assert after.statement(0).restarted is True
-    log.close()
 
 
 @pytest.mark.nightly
 async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
-    world: World,
+    fleet: Fleet,
 ) -> None:
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
@@ -300,28 +286,28 @@ async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
     before = revision(1, **files)
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
-    after = Fleet(world.trail).rollout
+    after = Fleet(fleet.trail).rollout
     await after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)
 
 
-async def test_a_withdrawn_load_leaves_nothing_in_memory(world: World) -> None:
-    before = dict(world.rollout.compiled_parts)
+async def test_a_withdrawn_load_leaves_nothing_in_memory(fleet: Fleet) -> None:
+    before = dict(fleet.rollout.compiled_parts)
     with awaited(lambda: True), pytest.raises(WithdrawnError):
-        await world.rollout.take(revision(2, **world.files, c=spec("c", "/c")))
-    assert world.rollout.compiled_parts == before
-    assert not world.fleet.stated
+        await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/c")))
+    assert fleet.rollout.compiled_parts == before
+    assert not fleet.stated
 
 
-async def test_each_relay_inherits_once(world: World) -> None:
+async def test_each_relay_inherits_once(fleet: Fleet) -> None:
     done: list[bool] = []
-    world.rollout.inherit(InheritedState(left=(b"state",)), lambda: done.append(True))
-    first, again = (world.rollout.statement(0) for _ in range(2))
+    fleet.rollout.inherit(InheritedState(left=(b"state",)), lambda: done.append(True))
+    first, again = (fleet.rollout.statement(0) for _ in range(2))
     assert (first.left, again.left) == ((b"state",), (b"state",))
-    world.rollout.received(taken(again), 0)
-    assert world.rollout.statement(0).left == ()
+    fleet.rollout.received(taken(again), 0)
+    assert fleet.rollout.statement(0).left == ()
     assert done == []
-    world.rollout.received(taken(world.rollout.statement(1)), 1)
+    fleet.rollout.received(taken(fleet.rollout.statement(1)), 1)
     assert done == [True]
-    assert world.rollout.statement(1).left == ()
+    assert fleet.rollout.statement(1).left == ()

@@ -4,47 +4,29 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
-from appliance.store.ends import EndKind, EndTable
-from appliance.store.revisions import Revisions
-from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
+from tests.unit.store.unconfirmed import Keeper, row
 
 pytestmark = pytest.mark.anyio
 
 
-def row(revision: int, who: str = "eve") -> MonitorRevisionRow:
-    return MonitorRevisionRow(revision, "{}", float(revision), who, "")
+async def never(revision: int) -> None:
+    raise AssertionError(revision)
 
 
-class Keeper(Revisions[MonitorRevisionRow]):
-    refusal = outdated = LookupError
-    unconfirmed = EndKind("limit")
-
-    def __init__(self, store: StateStore, ends: EndTable) -> None:
-        super().__init__(store, ends, store.monitor_revisions, store.save_monitor_revision, row(0))
-
-    async def _go_back(self, revision: int) -> None:
-        raise AssertionError(revision)
-
-    def change(self, to: MonitorRevisionRow, within: float | None = None) -> None:
-        self._put_in_force(to, within)
-
-    def started(self, *, restarted: bool) -> bool:
-        return self.find_last(restarted=restarted)
-
-    async def wanted(self, revision: int | None) -> MonitorRevisionRow:
-        return await self.wanted(revision)
-
-    def limit(self) -> dict[str, float | None]:
-        return {name: self.ends.left(self.unconfirmed, name) for name in self.ends.names(self.unconfirmed)}
+def limit(keeper: Keeper) -> dict[str, float | None]:
+    return {
+        name: keeper.ends.left(keeper.unconfirmed, name) for name in keeper.ends.names(keeper.unconfirmed)
+    }
 
 
 @pytest.fixture
 def keeper(tmp_path: Path) -> Iterator[Keeper]:
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    keeper = Keeper(store, ends_of(store, tmp_path))
+    keeper = Keeper(store, ends_of(store, tmp_path), never)
     for number in (4, 5, 7):
         keeper.change(row(number))
     yield keeper
@@ -72,10 +54,10 @@ async def test_the_error_names_the_missing_and_the_stored_revisions(
 async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keeper: Keeper) -> None:
     for number, within in ((8, 300.0), (9, 600.0)):
         keeper.change(row(number), within)
-        assert keeper.limit() == {"7": pytest.approx(within, abs=1)}
+        assert limit(keeper) == {"7": pytest.approx(within, abs=1)}
         assert keeper.confirm_by == pytest.approx(clock.wall() + within, abs=1)
     keeper.change(row(10))
-    assert (keeper.limit(), keeper.confirm_by, keeper.going_back) == ({}, None, None)
+    assert (limit(keeper), keeper.confirm_by, keeper.going_back) == ({}, None, None)
 
 
 @pytest.mark.parametrize(
@@ -86,28 +68,26 @@ async def test_only_a_start_of_the_appliance_reads_the_disk_in_place_of_its_revi
     keeper: Keeper, who: str, restarted: bool, taken: bool
 ) -> None:
     keeper.change(row(8, who))
-    again = Keeper(keeper.store, keeper.ends)
-    assert again.started(restarted=restarted) is taken
+    again = Keeper(keeper.store, keeper.ends, never)
+    assert again.find_last(restarted=restarted) is taken
     assert again.in_force == row(8, who)
 
 
-class Returning(Keeper):
-    attempts = 0
+async def test_a_change_that_cannot_go_back_is_tried_again_until_it_has(keeper: Keeper) -> None:
+    attempts = list[int]()
 
-    async def _go_back(self, revision: int) -> None:
-        self.attempts += 1
-        if self.attempts < 3:
+    async def back(revision: int) -> None:
+        attempts.append(revision)
+        if len(attempts) < 3:
             raise StoreError("the disk is full")
-        self.change(row(9, "not confirmed in time"))
+        again.change(row(9, "not confirmed in time"))
         raise StoreError("the disk is full again")
 
-
-async def test_a_change_that_cannot_go_back_is_tried_again_until_it_has(keeper: Keeper) -> None:
-    again = Returning(keeper.store, keeper.ends)
-    again.started(restarted=True)
+    again = Keeper(keeper.store, keeper.ends, back)
+    again.find_last(restarted=True)
     again.change(row(8), 0.0)
     for _ in range(5):
         keeper.ends.look()
         if again.going_back is not None:
             await again.going_back
-    assert (again.attempts, again.in_force.revision, again.confirm_by) == (3, 9, None)
+    assert (attempts, again.in_force.revision, again.confirm_by) == ([7] * 3, 9, None)

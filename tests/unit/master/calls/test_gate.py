@@ -13,6 +13,7 @@ from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer
 from roswire.uris import parse_node_uri, parse_service_uri
+from tests.support.incarnations import incarnation
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
 API = "http://127.0.0.1:4000/"
@@ -20,8 +21,7 @@ API = "http://127.0.0.1:4000/"
 
 def held(name: str, host: str, *, own: bool) -> Registry:
     registry = Registry()
-    address, uri = ipaddress.ip_address(host), parse_node_uri(API)
-    node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)
+    node = incarnation(name, host=host, own=own)
     registry.add(node)
     registry.register(node, Kind.PUBLICATION, "/rosout_agg", "rosgraph_msgs/Log")
     return registry
@@ -50,11 +50,8 @@ def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]
 def test_no_node_replaces_a_service_of_the_appliance(path: str, allowed: bool) -> None:
     policy = compile_policy("[Nodes]\ndefault = *\n", file="test.ini")
     registry = Registry()
-    uri, robot = f"http://127.0.0.1:4000{path}", ipaddress.ip_address("10.0.0.5")
-    home = ipaddress.ip_address("127.0.0.1")
-    node = Incarnation(
-        "key", "/rosrv", home, parse_node_uri(uri), uri, str(home), 19001, 19002, own=path != "/"
-    )
+    robot = ipaddress.ip_address("10.0.0.5")
+    node = incarnation("/rosrv", host="127.0.0.1", path=path, own=path != "/")
     registry.add(node)
     registry.register(node, Kind.SERVICE, "/rosrv/record_now", "4000")
     caller = Caller(Peer(robot, str(robot), "10.0.0.1"), "/namesake", 0)
@@ -85,8 +82,7 @@ def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
     assert aggregator is not None
     registry.register(aggregator, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
     here = CallGate(lambda: policy, registry, HostLimits())
-    uri = parse_node_uri(API)
-    other = Incarnation("other", "/voice", ipaddress.ip_address(OPERATOR), uri, API, OPERATOR, 19003, 19004)
+    other = incarnation("/voice", host=OPERATOR, ports=(19003, 19004))
     for host, local, topic, allowed in (
         ("127.0.0.1", "127.0.0.1", "/rosout", True),
         ("10.0.0.1", "10.0.0.1", "/rosout", True),
@@ -117,8 +113,8 @@ def register(gate: CallGate, number: int, topic: str, name: str) -> Decision:
 
 
 def joined(registry: Registry, number: int, name: str) -> Incarnation:
-    host, uri = f"10.1.0.{number}", f"http://10.1.0.{number}:4000{name}"
-    node = Incarnation(uri, name, ipaddress.ip_address(host), parse_node_uri(uri), uri, "", 1, 2)
+    host = f"10.1.0.{number}"
+    node = incarnation(name, host=host, key=f"{name} of {host}", path=name)
     registry.add(node)
     return node
 

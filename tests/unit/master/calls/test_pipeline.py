@@ -12,17 +12,17 @@ import pytest
 from appliance.master.calls import pipeline
 from appliance.master.calls.parameter_calls import ParameterRights
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
-from roswire.uris import parse_node_uri
 from roswire.xmlrpc import Value, build_call, parse_response
 from tests.support.control_parts import Records
 from tests.support.examples import examples
 from tests.support.idle import idle
+from tests.support.incarnations import incarnation
 from tests.support.master_api import MasterApi
 from tests.support.parameters import mirror, put
 
@@ -203,10 +203,7 @@ async def test_writes_after_a_waiting_read_are_decided_again() -> None:
         assert [one.allowed for _, _, one in site.trail.decisions[8:]] == [False] * (7 if denied else 0)
 
     def registers(site: Site, host: str) -> None:
-        uri = f"http://{host}:5000/"
-        node = Incarnation(
-            "key", "/me", ipaddress.ip_address(host), parse_node_uri(uri), uri, host, 19001, 19002
-        )
+        node = incarnation("/me", 5000, host=host)
         site.registry.add(node)
         site.registry.register(node, Kind.PUBLICATION, "/chatter", "std_msgs/String")
 

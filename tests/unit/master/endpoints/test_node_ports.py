@@ -13,7 +13,7 @@ from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.table import NODE_PORTS
-from roswire.uris import parse_node_uri
+from tests.support.incarnations import incarnation
 from tests.support.memory_ports import listening, memory_ports
 
 FIRST = 20_000
@@ -27,19 +27,14 @@ NAMING = compile_policy("[Nodes]\n/** = 10.0.0.1 10.1.0.0/24\n", file="a.ini")
 HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 9)]
 
 
-def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation:
-    uri = "http://127.0.0.1:4000/"
-    outer, relay, *more = ports
-    api = parse_node_uri(uri)
-    return Incarnation(
-        "key", "/node", host, api, uri, "127.0.0.1", outer, relay, more_relay_ports=tuple(more)
-    )
+def node_of(host: Address, *ports: int) -> Incarnation:
+    return incarnation("/node", host=str(host), ports=ports)
 
 
 def test_closed_ports_are_reused_last() -> None:
     here = places()
     closed = here.open(HOSTS[0])
-    here.close(incarnation(closed))
+    here.close(node_of(HOSTS[0], *closed))
     others = [here.open(host) for host in HOSTS[1:4]]
     assert closed not in others
     assert here.open(HOSTS[0]) == closed
@@ -61,7 +56,7 @@ def test_a_port_for_every_relay() -> None:
     here = places(relays=3)
     opened = [here.open(HOSTS[0]), here.open(HOSTS[1])]
     assert [len(ports) for ports in opened] == [4, 4]
-    here.close(incarnation(opened[0]))
+    here.close(node_of(HOSTS[0], *opened[0]))
     assert here.open(HOSTS[0]) == opened[0]
     with pytest.raises(NoPortError, match="4 per node"):
         here.open(HOSTS[0])
@@ -69,7 +64,7 @@ def test_a_port_for_every_relay() -> None:
 
 def test_another_number_of_relays_after_a_restart() -> None:
     before = places(relays=2)
-    node = incarnation(before.open(HOSTS[0]))
+    node = node_of(HOSTS[0], *before.open(HOSTS[0]))
     had = node.ports
     before.close_unclaimed(set())
     more = places(relays=3)
@@ -91,7 +86,7 @@ def test_a_restored_node_whose_port_another_program_has_gets_an_unused_one() -> 
         return listening(host, port)
 
     here = places(listen=busy)
-    first, second = incarnation((FIRST, FIRST + 1)), incarnation((FIRST + 2, FIRST + 3), HOSTS[1])
+    first, second = node_of(HOSTS[0], FIRST, FIRST + 1), node_of(HOSTS[1], FIRST + 2, FIRST + 3)
     here.reserve((*first.ports, *second.ports))
     here.reopen(first)
     here.reopen(second)
@@ -99,7 +94,7 @@ def test_a_restored_node_whose_port_another_program_has_gets_an_unused_one() -> 
     here.close_unclaimed({*first.ports, *second.ports})
     taken.clear()
     assert [here.open(HOSTS[2]), here.taken.total] == [(FIRST + 7, FIRST), 6]
-    lost = incarnation((FIRST + 20, FIRST + 21))
+    lost = node_of(HOSTS[0], FIRST + 20, FIRST + 21)
     taken.update(range(FIRST, FIRST + 30))
     here.unused = deque([FIRST + 1])
     with pytest.raises(NoPortError, match="in use"):
@@ -142,7 +137,7 @@ def test_no_host_takes_all_ports() -> None:
         assert len(taken) >= 3
     assert here.taken.total <= 800 - 10
     before = here.taken.held(NAMING.named_as(HOSTS[2]))
-    here.close(incarnation(taken[0], HOSTS[2]))
+    here.close(node_of(HOSTS[2], *taken[0]))
     assert here.taken.held(NAMING.named_as(HOSTS[2])) == before - 5
     assert here.open(HOSTS[3])
 

@@ -2,10 +2,10 @@ import ipaddress
 
 import pytest
 
-from appliance.master.graph.registry import Incarnation, Registry
+from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import MasterSideApi, ProxyEndpoints
 from appliance.policy.policy_compiler import compile_policy
-from roswire.uris import parse_node_uri
+from tests.support.incarnations import incarnation
 from tests.support.memory_ports import face, memory_ports
 
 POLICY = compile_policy("", file="a.ini")
@@ -14,11 +14,11 @@ POLICY = compile_policy("", file="a.ini")
 @pytest.mark.anyio
 async def test_ports_are_closed_once() -> None:
     """A node is closed when it is replaced, and again when it is forgotten: then another node may have its ports."""
-    uri, host = "http://10.0.0.5:4000/", ipaddress.ip_address("10.0.0.5")
+    host = ipaddress.ip_address("10.0.0.5")
     dropped, ended = list[str](), list[str]()
     places = memory_ports(lambda: POLICY, drop=dropped.append)
     outer, relay = places.open(host)
-    node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", outer, relay)
+    node = incarnation("/node", ports=(outer, relay))
     faces = ProxyEndpoints(
         Registry(), places, 9, lambda _sock, _handler: face(lambda: ended.append("closed"))
     )

@@ -10,16 +10,16 @@ from appliance.channel import messages
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, AllocationPlan, Move
-from roswire.uris import parse_node_uri
 from tests.support.control_parts import NoSpecifications, no_own_call
 from tests.support.core import FakeTrail
+from tests.support.incarnations import incarnation
 from tests.support.memory_channel import HeldChannel
 from tests.support.scripted_nodes import ScriptedNodes
 
@@ -42,10 +42,7 @@ class World:
         self.put(left=0, right=1)
         self.relay = self._relay_control(grants)
         self.graph = RosGraph(self.registry, self.grants, self.trail)
-        uri = "http://10.0.0.5:4000/"
-        self.node = Incarnation(
-            "key", "/node", HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, more_relay_ports=(3,)
-        )
+        self.node = incarnation("/node", key="key", ports=(1, 2, 3))
         self.registry.add(self.node)
         self.links = [HeldChannel(), HeldChannel()]
         for index, link in enumerate(self.links):
@@ -235,8 +232,7 @@ async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world:
 async def test_a_subscriber_that_lost_its_connection(
     world: World, ended: Kind | None, cut_off: list[tuple[str, str]]
 ) -> None:
-    uri = "http://10.0.0.5:4001/"
-    ear = Incarnation("ear", "/ear", HOST, parse_node_uri(uri), uri, "10.0.0.1", 4, 5, more_relay_ports=(6,))
+    ear = incarnation("/ear", 4001, ports=(4, 5, 6))
     world.registry.add(ear)
     world.registry.register(ear, Kind.SUBSCRIPTION, "/left", "std_msgs/String")
     link = world.links[0]

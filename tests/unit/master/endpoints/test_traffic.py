@@ -1,13 +1,11 @@
-import ipaddress
-
 import pytest
 
 from appliance.audit.log.record import Severity
 from appliance.channel.messages import ConnectionRefused
 from appliance.master.endpoints.traffic import RelayTraffic
-from appliance.master.graph.registry import Incarnation, Kind, Registry
-from roswire.uris import parse_node_uri
+from appliance.master.graph.registry import Kind, Registry
 from tests.support.core import FakeTrail
+from tests.support.incarnations import incarnation
 
 
 @pytest.mark.parametrize(
@@ -18,9 +16,7 @@ def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: st
     trail = FakeTrail()
     registry = Registry()
     for key, name, own in (("k", "/talker", False), ("o", "/rosout", True)):
-        uri = f"http://10.0.0.2:4000/{key}"
-        address = ipaddress.ip_address("10.0.0.2")
-        node = Incarnation(key, name, address, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, own=own)
+        node = incarnation(name, host="10.0.0.2", key=key, path=f"/{key}", own=own)
         registry.add(node)
         if own:
             registry.register(node, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")

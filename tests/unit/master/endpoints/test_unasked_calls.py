@@ -8,21 +8,14 @@ from dataclasses import dataclass, field
 import pytest
 
 from appliance.master.endpoints.unasked_calls import UnaskedCalls
+from appliance.master.graph.registry import Incarnation
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import Value
 from tests.support.autojump import run as run_alone
+from tests.support.incarnations import incarnation
 
 TAKEN: Value = [1, "", 0]
 FOREIGN: Value = [-1, "not subscribed", 0]
-
-
-@dataclass(frozen=True)
-class Node:
-    name: str
-
-    @property
-    def key(self) -> str:
-        return self.name
 
 
 @dataclass
@@ -34,7 +27,7 @@ class Robot:
     got: list[tuple[str, str, int]] = field(default_factory=list)
     tried: Counter[str] = field(default_factory=Counter)
 
-    async def call(self, node: Node, call: tuple[str, int]) -> Value:
+    async def call(self, node: Incarnation, call: tuple[str, int]) -> Value:
         self.tried[node.name] += 1
         if node.name in self.silent:
             await asyncio.sleep(3)
@@ -44,7 +37,9 @@ class Robot:
         return self.answer(node.name, call[0])
 
 
-def run(robot: Robot, story: Callable[[UnaskedCalls[Node, tuple[str, int]]], Awaitable[None]]) -> Robot:
+def run(
+    robot: Robot, story: Callable[[UnaskedCalls[Incarnation, tuple[str, int]]], Awaitable[None]]
+) -> Robot:
     async def whole() -> None:
         await story(UnaskedCalls(robot.call))
 
@@ -53,9 +48,9 @@ def run(robot: Robot, story: Callable[[UnaskedCalls[Node, tuple[str, int]]], Awa
 
 
 def test_a_node_gets_the_newest_value_of_a_key_that_changes_without_a_pause() -> None:
-    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
         for number in range(1000):
-            calls.push(Node("/cpp"), "/speed", ("/speed", number))
+            calls.push(incarnation("/cpp"), "/speed", ("/speed", number))
             await asyncio.sleep(0.005)
         await asyncio.sleep(1)
 
@@ -65,9 +60,9 @@ def test_a_node_gets_the_newest_value_of_a_key_that_changes_without_a_pause() ->
 
 
 def test_a_key_to_which_a_node_did_not_subscribe_is_sent_once() -> None:
-    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
         for number in range(10):
-            calls.push(Node("/py"), "/a/b", ("/a/b", number))
+            calls.push(incarnation("/py"), "/a/b", ("/a/b", number))
             await asyncio.sleep(1)
 
     assert run(Robot(lambda _node, _key: FOREIGN), story).got == [("/py", "/a/b", 0)]
@@ -76,9 +71,9 @@ def test_a_key_to_which_a_node_did_not_subscribe_is_sent_once() -> None:
 def test_a_key_is_sent_again_after_its_namespace_was_taken() -> None:
     """rospy knows a new part of a namespace only with the namespace."""
 
-    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
         for key in ("/a/b", "/a", "/a/b"):
-            calls.push(Node("/py"), key, (key, 1))
+            calls.push(incarnation("/py"), key, (key, 1))
             await asyncio.sleep(1)
 
     keys = [
@@ -89,10 +84,10 @@ def test_a_key_is_sent_again_after_its_namespace_was_taken() -> None:
 
 @pytest.mark.parametrize("others", [1, 50])
 def test_nodes_that_never_answer_get_nothing_more_and_others_do(others: int) -> None:
-    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
         for number in range(600):
             for name in ("/js", *(f"/cpp{one}" for one in range(others))):
-                calls.push(Node(name), "/speed", ("/speed", number))
+                calls.push(incarnation(name), "/speed", ("/speed", number))
             await asyncio.sleep(0.1)
         await asyncio.sleep(5)
 
@@ -105,9 +100,9 @@ def test_nodes_that_never_answer_get_nothing_more_and_others_do(others: int) -> 
 def test_a_node_that_hangs_for_some_seconds_gets_the_newest_value_afterwards() -> None:
     robot = Robot(silent={"/cpp"})
 
-    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
         for number in range(8):
-            calls.push(Node("/cpp"), "/speed", ("/speed", number))
+            calls.push(incarnation("/cpp"), "/speed", ("/speed", number))
             await asyncio.sleep(1)
         robot.silent.clear()
         await asyncio.sleep(5)
@@ -116,10 +111,10 @@ def test_a_node_that_hangs_for_some_seconds_gets_the_newest_value_afterwards() -
 
 
 def test_nothing_is_sent_after_the_end() -> None:
-    async def story(calls: UnaskedCalls[Node, tuple[str, int]]) -> None:
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
         for number in range(3):
-            calls.push(Node(f"/{number}"), "/speed", ("/speed", number))
-        calls.drop(Node("/0"))
+            calls.push(incarnation(f"/{number}"), "/speed", ("/speed", number))
+        calls.drop(incarnation("/0"))
         calls.clear()
         await asyncio.sleep(10)
 
