@@ -20,10 +20,24 @@ from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC
 from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
 
 _RELAY_BACKLOG = 128 << 20  # bytes; changes of the graph use half of it
 
 _log = structlog.get_logger()
+
+
+def record_death(trail: AuditTrail, death: messages.ProcessDied) -> None:
+    trail.happened(
+        "process died",
+        f"{death.role}: {death.reason}",
+        resource=death.role,
+        index=death.index,
+        pid=death.pid,
+        end=death.end,
+        lived=round(death.lived, 3),
+        restarts=death.restarts,
+    )
 
 
 class SupervisorMessages:
@@ -45,7 +59,7 @@ class SupervisorMessages:
                 self._note_failing(processes)
                 self._parts.reconciler.wake()
             case messages.ProcessDied():
-                self._record_death(message)
+                record_death(self._base.trail, message)
             case messages.PolicyReloadRequested():
                 self._spawn(self._reload())
             case messages.EndAnnounced():
@@ -90,18 +104,6 @@ class SupervisorMessages:
                 output=process.output,
             )
         self._failing = frozenset(failing)
-
-    def _record_death(self, death: messages.ProcessDied) -> None:
-        self._base.trail.happened(
-            "process died",
-            f"{death.role}: {death.reason}",
-            resource=death.role,
-            index=death.index,
-            pid=death.pid,
-            end=death.end,
-            lived=round(death.lived, 3),
-            restarts=death.restarts,
-        )
 
     def _link(self, role: str, index: int, sock: socket.socket) -> None:
         match role:

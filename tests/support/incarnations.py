@@ -17,15 +17,8 @@ def incarnation(
 ) -> Incarnation:
     """Return a node with its API at `port`; its `key` is "key of NAME" unless given."""
     uri = f"http://{host}:{port}{path}"
-    address = ipaddress.ip_address(host)
+    address, (outer, relay, *others) = ipaddress.ip_address(host), ports
     return Incarnation(
-        key or f"key of {name}",
-        name,
-        address,
-        parse_node_uri(uri),
-        uri,
-        "10.0.0.1",
-        *ports[:2],
-        more_relay_ports=ports[2:],
-        **more,
-    )
+        key or f"key of {name}", name, address, parse_node_uri(uri), uri, "10.0.0.1", outer, relay,
+        more_relay_ports=tuple(others), **more,
+    )  # fmt: skip

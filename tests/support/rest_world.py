@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import httpx
 from fastapi import FastAPI
@@ -56,14 +56,14 @@ _STATE = Settings().state
 _KIT = {"name": "laptop", "address": "10.9.0.2", "appliance": "10.9.0.1"}
 
 
-def _example_for(request: type) -> Any:
+def _example_for(request: type, **fields: Any) -> Any:
     answer: Any = answer_to(request)
-    return example(answer)
+    return example(answer, **fields)
 
 
 def _of_feature(verb: str, **fields: Any) -> dict[type, Any]:
     request = request_named(verb)
-    return {} if request is None else {request: example(cast(Any, answer_to(request)), **fields)}
+    return {} if request is None else {request: _example_for(request, **fields)}
 
 
 _ANSWERS: dict[type, Any] = {

@@ -1,19 +1,14 @@
 """The records that control makes of the supervisor's reports."""
 
-from types import SimpleNamespace
-from typing import Any
-
 from appliance.channel.messages import ProcessDied
-from appliance.control.supervisor_messages import SupervisorMessages
+from appliance.control.supervisor_messages import record_death
 from tests.support.core import FakeTrail
 
 
 def test_an_unexpected_end_of_a_process_is_recorded() -> None:
     trail = FakeTrail()
-    base: Any = SimpleNamespace(trail=trail)
-    unused: Any = None
-    reports = SupervisorMessages(base, unused, unused)
-    reports.heard(ProcessDied("relay", 1, 77, "signal SIGKILL", "it ended with signal SIGKILL", 2.5, 3), ())
+    death = ProcessDied("relay", 1, 77, "signal SIGKILL", "it ended with signal SIGKILL", 2.5, 3)
+    record_death(trail, death)
     [row] = trail.rows
     assert (row["event"], row["resource"]) == ("process died", "relay")
     assert row["reason"] == "relay: it ended with signal SIGKILL"

@@ -276,9 +276,7 @@ async def test_a_crash_of_control_changes_nothing() -> None:
 
 
 @pytest.mark.nightly
-async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
-    fleet: Fleet,
-) -> None:
+async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors() -> None:
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
     names = [f"/t{number}" for number in range(20)]
@@ -286,7 +284,7 @@ async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
     before = revision(1, **files)
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
-    after = Fleet(fleet.trail).rollout
+    after = Fleet().rollout
     await after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)
