@@ -1,3 +1,5 @@
+from pathlib import Path
+
 from appliance.features.survey.draft import draft
 from appliance.features.survey.page import page, report
 from appliance.rpc.graph_inventory import NodeConnection, SurveyedService, SurveyedTopic, problems
@@ -24,6 +26,14 @@ def test_the_report_says_in_numbers_what_any_host_may_do() -> None:
     assert "moves: /cmd_vel (geometry_msgs/Twist) from /navigation (10.0.0.1), /teleop (10.0.0.7)" in lines
     assert "acts: /arm/enable of /arm/driver (10.0.0.2)" in lines
     assert "named like a secret: /wifi/password" in lines
+
+
+def test_the_report_on_the_page_is_this_one() -> None:
+    text = (Path(__file__).parents[4] / "docs" / "try-for-an-hour.md").read_text()
+    shown = text.partition("--policy draft.ini\n")[2].partition("    …")[0]
+    lines = "".join(f"    {line}\n" for line in report(inventory()))
+    assert shown.count("\n") > 8
+    assert lines.startswith(shown)
 
 
 def test_problems_are_named() -> None:
