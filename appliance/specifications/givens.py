@@ -29,8 +29,8 @@ class DroppedValue(NamedTuple):
     @property
     def text(self) -> str:
         return (
-            f"{self.monitor}: {self.name}={_shown(self.value)} no longer applies, because the text does not allow it:"
-            f" the default of the text is in force; rosrv monitor set {self.monitor} prints it"
+            f"{self.monitor}: {self.name}={_shown(self.value)} no longer applies, because the source does not allow it:"
+            f" the default of the source is in force; rosrv monitor set {self.monitor} prints it"
         )
 
 

@@ -90,7 +90,7 @@ def judge_holds(
         changed = owner.identity != present.states[name].identity
         topics = sorted(owner.held & published.keys())
         if topics and (changed or coming.monitors[name] in moved):
-            why = "its text, or a definition, changes" if changed else "it moves to another relay"
+            why = "its source, or a definition, changes" if changed else "it moves to another relay"
             text = f"{name} loses its state, because {why}, and then holds {', '.join(topics)}: it drops every message"
             refused = not hold and any(live.moving for topic in topics for live in published[topic].values())
             (found.conflicts if refused else found.warnings).append(

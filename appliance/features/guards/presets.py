@@ -356,7 +356,7 @@ def with_values(text: str, values: Mapping[str, str]) -> str:
     preset, head = preset_of(text), head_of(text)
     if preset is None or head is None:
         raise GuardError(
-            "it was not made from a preset; change its text, and load it with rosrv monitor load"
+            "it was not made from a preset; change its source, and load it with rosrv monitor load"
         )
     checked = {name: preset.parameter(name).checked(value) for name, value in values.items()}
     if not text.startswith("preset "):

@@ -248,7 +248,7 @@ def set_given(
             say_json(one)
         return
     if not given:
-        say(f"nothing is given to {name}; its text has no `given {{ … }}`")
+        say(f"nothing is given to {name}; its source has no `given {{ … }}`")
         return
     table = table_of("given", "value", "range", "default")
     for one in given:

@@ -101,7 +101,7 @@ def held(
 def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
     """The robot would get no more commands, not even a stop."""
     what = (
-        "deadman loses its state, because its text, or a definition, changes, and then holds /cmd_vel:"
+        "deadman loses its state, because its source, or a definition, changes, and then holds /cmd_vel:"
         " it drops every message"
     )
     assert held(CHANGED) == (
