@@ -21,27 +21,27 @@ __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures
 _OLD = 1_500_000_000 * 10**9
 
 
-class _Store(SegmentStore):
-    """Calls `remove` once, after a proof has listed the files, or with `listed=False` before."""
+def _remove_once(patch: pytest.MonkeyPatch, remove: Callable[[], object], *, listed: bool) -> None:
+    """Call `remove` once, after a proof has listed the files, or with `listed=False` before."""
+    segments, calls = SegmentStore.segments, itertools.count()
 
-    remove: Callable[[], object] = staticmethod(bool)
-    listed = True
+    def listing(store: SegmentStore, robot: str, log: str) -> Iterator[SegmentPlace]:
+        before = list(segments(store, robot, log))
+        if next(calls) == 0:
+            remove()
+        yield from before if listed else segments(store, robot, log)
 
-    def segments(self, robot: str, log: str) -> Iterator[SegmentPlace]:
-        before = list(super().segments(robot, log))
-        remove, self.remove = self.remove, bool
-        remove()
-        yield from before if self.listed else super().segments(robot, log)
+    patch.setattr(SegmentStore, "segments", listing)
 
 
 @pytest.fixture
-def store(make_log: MakeLog, path: Path, tmp_path: Path) -> _Store:
-    found = _Store(tmp_path / "data", 0)
+def store(make_log: MakeLog, path: Path, tmp_path: Path) -> SegmentStore:
+    found = SegmentStore(tmp_path / "data", 0)
     _push(found, make_log, path, tmp_path)
     return found
 
 
-def _push(found: _Store, make_log: MakeLog, path: Path, tmp_path: Path) -> None:
+def _push(found: SegmentStore, make_log: MakeLog, path: Path, tmp_path: Path) -> None:
     log = make_log(checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))
@@ -74,34 +74,38 @@ def _proof(store: SegmentStore, key: Ed25519PrivateKey) -> LogProof:
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_retention_during_a_proof_loses_nothing(listed: bool, store: _Store, key: Ed25519PrivateKey) -> None:
+def test_retention_during_a_proof_loses_nothing(
+    listed: bool, store: SegmentStore, key: Ed25519PrivateKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (log,) = store.logs("arm1")
     whole, number = _proof(store, key), len(_places(store))
     assert (whole.findings, whole.segments) == ([], number)
-    store.remove = lambda: store.prune("arm1", log, _OLD, "retention.segment_days: 30")
-    store.listed = listed
+    _remove_once(
+        monkeypatch, lambda: store.prune("arm1", log, _OLD, "retention.segment_days: 30"), listed=listed
+    )
     proof = _proof(store, key)
     assert (proof.findings, proof.segments, proof.last) == ([], 1, whole.last)
     assert f"{number - 1} segments with 0 gaps" in proof.removal
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_a_removal_without_a_note_is_a_loss(listed: bool, store: _Store, key: Ed25519PrivateKey) -> None:
+def test_a_removal_without_a_note_is_a_loss(
+    listed: bool, store: SegmentStore, key: Ed25519PrivateKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (log,) = store.logs("arm1")
     places = _places(store)
     os.utime(store.path(places[1]))
     lost = store.header(places[2])
     first, last = lost.start[0] + 1, lost.end.sequence
     store.prune("arm1", log, _OLD, "retention.segment_days: 30")
-    store.remove = store.path(places[2]).unlink
-    store.listed = listed
+    _remove_once(monkeypatch, store.path(places[2]).unlink, listed=listed)
     proof = _proof(store, key)
     assert (proof.segments, proof.missing) == (len(places) - 2, last - first + 1)
     assert f"records {first} to {last} are missing" in proof.findings
 
 
 def test_an_earlier_log_that_is_no_longer_stored_is_a_loss(
-    store: _Store, make_log: MakeLog, path: Path, tmp_path: Path, key: Ed25519PrivateKey
+    store: SegmentStore, make_log: MakeLog, path: Path, tmp_path: Path, key: Ed25519PrivateKey
 ) -> None:
     """The robot began a new log; the collector has the last segment of each, or a note of its removal."""
     (first,) = store.logs("arm1")

@@ -155,29 +155,34 @@ def test_a_hold_that_cannot_be_lifted_is_an_alarm_and_the_appliance_serves() -> 
     assert hold.calls == ["lift", (11311, "veth-rosrv", None)]
 
 
-class _StuckBackend:
-    """A back end that cannot remove its rules, which are in force, or which it does not have."""
+class MemoryBackend:
+    """A back end whose rules another program may flush, or which cannot remove them."""
 
-    name = "stuck"
+    name = "memory"
 
-    def __init__(self, *, has_rules: bool) -> None:
-        self._rules = (1,) if has_rules else ()
+    def __init__(self, *held: object, stuck: bool = False) -> None:
+        self.held, self._stuck = held, stuck
+
+    def install(self, rules: tuple[object, ...]) -> None:
+        self.held = rules
 
     def remove(self) -> None:
-        raise FirewallError("it is busy")
+        if self._stuck:
+            raise FirewallError("it is busy")
+        self.held = ()
 
-    def counters(self) -> tuple[int, ...]:
-        return self._rules
+    def counters(self) -> tuple[object, ...]:
+        return self.held
 
 
 @pytest.mark.parametrize("has_rules", [True, False])
 def test_only_rules_that_are_in_force_keep_a_hold_from_being_lifted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, has_rules: bool
 ) -> None:
-    monkeypatch.setattr(boot_hold, "NftBackend", lambda *_: _StuckBackend(has_rules=has_rules))
-    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: _StuckBackend(has_rules=False))
+    monkeypatch.setattr(boot_hold, "NftBackend", lambda *_: MemoryBackend(*[1] * has_rules, stuck=True))
+    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: MemoryBackend(stuck=True))
     hold = BootHold(Namespace.own(), unit_runs=tmp_path, state=tmp_path)
-    with pytest.raises(FirewallError, match="stuck: it is busy") if has_rules else nullcontext():
+    with pytest.raises(FirewallError, match="memory: it is busy") if has_rules else nullcontext():
         hold.lift()
 
 
@@ -197,28 +202,10 @@ def test_rules_that_another_program_removed_are_restored_and_the_start_says_so()
         assert "removed the boot hold 1 time, such as `nft flush ruleset`" in run.served()
 
 
-class _Rules:
-    """A back end whose rules another program may flush."""
-
-    name = "rules"
-
-    def __init__(self) -> None:
-        self.held: tuple[object, ...] = ()
-
-    def install(self, rules: tuple[object, ...]) -> None:
-        self.held = rules
-
-    def remove(self) -> None:
-        self.held = ()
-
-    def counters(self) -> tuple[object, ...]:
-        return self.held
-
-
 def test_a_hold_knows_that_its_rules_were_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rules = _Rules()
+    rules = MemoryBackend()
     monkeypatch.setattr(boot_hold, "NftBackend", lambda *_: rules)
-    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: _Rules())
+    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: MemoryBackend())
     hold = BootHold(Namespace.own(), unit_runs=tmp_path, state=tmp_path)
     assert not hold.put(), "a hold that is not armed"
     hold.arm(HeldPorts(11311, 32768, 60999))

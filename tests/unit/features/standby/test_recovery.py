@@ -1,19 +1,16 @@
 """Whether a rebooted appliance may take over, by the witness's answers and the other appliance's state."""
 
 import asyncio
-import struct
+import socket
 from collections.abc import Iterator
-from typing import Any
 
-import msgspec
 import pytest
 
 from appliance.base import clock
 from appliance.features.standby.lease import ApplianceLease, WitnessAnswer, WitnessRequest
 from appliance.features.standby.lease_link import LeaseState
 from appliance.features.standby.replica_sync import WAIT_SECONDS, StateComparison, is_recovered
-from appliance.features.standby.replication_frames import Refused, Stored
-from tests.support import autojump
+from appliance.features.standby.replication_frames import FromActive, Refused, ReplicationLink, Stored
 from tests.support.virtual_clock import VirtualClock, let_time_pass
 
 
@@ -93,36 +90,15 @@ def test_an_appliance_that_alone_is_in_sync_need_not_wait(rebooted: Rebooted) ->
     assert rebooted.recovered()
 
 
-class FollowerStream:
-    """The other appliance's end of a link, which sends its position."""
-
-    def __init__(self, stored: Stored) -> None:
-        self.reader = asyncio.StreamReader()
-        body = msgspec.msgpack.encode(stored)
-        self.reader.feed_data(struct.pack(">I", len(body)) + body)
-        self.written = b""
-        self.transport: Any = self
-
-    def write(self, data: bytes) -> None:
-        self.written += data
-
-    async def drain(self) -> None: ...
-
-    def abort(self) -> None: ...
-
-    async def wait_closed(self) -> None: ...
-
-
-def compared(own: Stored, other: Stored) -> StateComparison:
+async def compared(own: Stored, other: Stored) -> StateComparison:
+    """Return what an appliance knows after the other one, which follows it, has sent its position."""
     comparison = StateComparison(lambda: own)
-
-    async def follow() -> None:
-        stream: Any = FollowerStream(other)
-        await comparison.serve(stream.reader, stream)
-        refused = msgspec.msgpack.decode(stream.written[4:], type=Refused)
-        assert refused.reason == "this appliance is not active either"
-
-    autojump.run(follow())
+    here, there = await asyncio.gather(*(asyncio.open_connection(sock=end) for end in socket.socketpair()))
+    follower = ReplicationLink[FromActive](*there, FromActive)
+    await follower.send(other)
+    await comparison.serve(*here)
+    assert await follower.receive(1.0) == Refused("this appliance is not active either")
+    await follower.close()
     return comparison
 
 
@@ -136,19 +112,23 @@ def compared(own: Stored, other: Stored) -> StateComparison:
         (0, 0, "", True),
     ],
 )
-def test_the_rebooted_appliance_with_more_changes_takes_over(
+@pytest.mark.anyio
+@pytest.mark.usefixtures("local_sockets")
+async def test_the_rebooted_appliance_with_more_changes_takes_over(
     rebooted: Rebooted, *, own: int, other: int, last: str, may: bool
 ) -> None:
     """With equal states it is the last holder of the lease, whose monitors need not hold their topics."""
     rebooted.holder = last
-    comparison = compared(Stored(3, "history", own), Stored(0, "history", other))
+    comparison = await compared(Stored(3, "history", own), Stored(0, "history", other))
     assert rebooted.recovered(comparison=comparison) is may
 
 
 @pytest.mark.parametrize("histories", [("one", "another"), ("", "")])
-def test_states_of_different_histories_cannot_be_compared(
+@pytest.mark.anyio
+@pytest.mark.usefixtures("local_sockets")
+async def test_states_of_different_histories_cannot_be_compared(
     rebooted: Rebooted, histories: tuple[str, str]
 ) -> None:
     rebooted.holder = "b"
-    comparison = compared(Stored(3, histories[0], 7), Stored(3, histories[1], 5))
+    comparison = await compared(Stored(3, histories[0], 7), Stored(3, histories[1], 5))
     assert not rebooted.recovered(comparison=comparison)

@@ -61,11 +61,10 @@ from appliance.hosts.host_table import (
     HostTable,
 )
 from appliance.hosts.hosts_file import DeclaredHosts
-from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.policy.model import Address
-from appliance.store.host_tables import ApplianceRow, HostTables
+from appliance.store.host_tables import ApplianceRow
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
@@ -85,8 +84,6 @@ class Bench:
         *,
         listen: str = "0.0.0.0",
         pool: str = "10.113.11.0/29",
-        kind: type[StoredAuthority] = StoredAuthority,
-        table: Callable[[HostTables, RevokedCertificates], Appliances] = Appliances,
     ) -> None:
         self.answer = TunnelsEnclosed("kernel")
         self.asked: list[Message] = []
@@ -98,8 +95,8 @@ class Bench:
         self.authority = NearAuthority(directory)
         self.trail = RecordingTrail(self.log)
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), DeclaredHosts(self.declared))
-        self.shared = authority = kind(self.authority, self.store.hosts)
-        self.appliances = appliances = table(self.store.hosts, self.table.revoked)
+        self.shared = authority = StoredAuthority(self.authority, self.store.hosts)
+        self.appliances = appliances = Appliances(self.store.hosts, self.table.revoked)
         self.tunnels = Tunnels(
             self.table,
             self.trail,
@@ -791,21 +788,7 @@ def test_a_full_disk_during_enrolment_names_the_way_out(
     run(tmp_path, work)
 
 
-class Waiting(StoredAuthority):
-    async def obstacle(self) -> str:
-        return "new certificates wait"
-
-
-class Two(Appliances):
-    paired = True
-    row: ApplianceRow | None = None
-
-    @property
-    def other(self) -> ApplianceRow | None:
-        return self.row
-
-
-def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
+def test_without_the_authoritys_key_changes_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     key, request = make_key(), request_of("a")
 
     async def first(bench: Bench) -> None:
@@ -823,19 +806,20 @@ def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
         await bench.revoke("b")
         assert [row.name for row in bench.table.enrolled()] == ["a"]
 
+    async def obstacle(_authority: StoredAuthority) -> str:
+        return "new certificates wait"
+
     run(tmp_path, first)
-    run(tmp_path, second, kind=Waiting)
+    monkeypatch.setattr(StoredAuthority, "obstacle", obstacle)
+    run(tmp_path, second)
 
 
-def test_a_kit_of_two_appliances_has_both(tmp_path: Path) -> None:
-    async def work(bench: Bench) -> None:
-        await bench.add("a")
-        kit = await bench.certification.kit("a", None)
-        assert kit.second == ""
-        assert "later, rosrv host kit a" in (kit.warning or "")
-        assert isinstance(bench.appliances, Two)
-        bench.appliances.row = ApplianceRow("key", "192.168.1.21", "sha256//B", "", "1f", 1.0)
-        kit = await bench.certification.kit("a", None)
-        assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", "sha256//pin;sha256//B", None)
-
-    run(tmp_path, work, table=Two)
+async def test_a_kit_of_two_appliances_has_both(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Appliances, "paired", True)
+    await bench.add("a")
+    kit = await bench.certification.kit("a", None)
+    assert kit.second == ""
+    assert "later, rosrv host kit a" in (kit.warning or "")
+    monkeypatch.setattr(Appliances, "other", ApplianceRow("key", "192.168.1.21", "sha256//B", "", "1f", 1.0))
+    kit = await bench.certification.kit("a", None)
+    assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", "sha256//pin;sha256//B", None)

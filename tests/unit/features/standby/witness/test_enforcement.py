@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from typing import cast
 
 import pytest
 
@@ -9,6 +8,7 @@ from appliance.features.standby.witness.firewall import LeaseFirewall
 from appliance.features.standby.witness.firewall_rules import nft_rules
 from appliance.features.standby.witness.idle_connections import IdleConnections
 from appliance.features.standby.witness.protocol import Left
+from tests.support.idle import idle
 from tests.unit.features.standby.witness.robot import PAIR_SETTINGS
 
 
@@ -59,23 +59,18 @@ class FakeProgram:
         return listed
 
 
-class NoConnections:
-    def connecting(self) -> list[object]:
-        return []
-
-    def reset(self, _name: str, _connecting: object) -> None:
-        pass
-
-    def go_on(self) -> bool:
-        return False
+def no_connections() -> IdleConnections:
+    connections = idle(IdleConnections)
+    vars(connections).update(connecting=list)
+    return connections
 
 
 def enforced(backend: str = "nft") -> tuple[FakeProgram, LeaseEnforcement, list[str]]:
     program, lines = FakeProgram(), list[str]()
     log = BoundedLog(lines.append, lambda: 0.0)
     firewall = LeaseFirewall(PAIR_SETTINGS, backend, program)
-    idle = cast("IdleConnections", NoConnections())
-    return program, LeaseEnforcement(firewall, idle, PAIR_SETTINGS.appliances, log, lambda: 0.0), lines
+    connections = no_connections()
+    return program, LeaseEnforcement(firewall, connections, PAIR_SETTINGS.appliances, log, lambda: 0.0), lines
 
 
 def looked_after(enforcement: LeaseEnforcement) -> bool:
@@ -160,9 +155,8 @@ def test_the_trial_is_of_the_other_appliances_rules(admitted: str) -> None:
         return ""
 
     firewall = LeaseFirewall(PAIR_SETTINGS, "nft", run)
-    idle = cast("IdleConnections", NoConnections())
     log = BoundedLog(lambda _line: None, lambda: 0.0)
-    enforcement = LeaseEnforcement(firewall, idle, PAIR_SETTINGS.appliances, log, lambda: 0.0)
+    enforcement = LeaseEnforcement(firewall, no_connections(), PAIR_SETTINGS.appliances, log, lambda: 0.0)
     enforcement.admit(admitted)
     enforcement.trial.run()
     assert texts == [nft_rules(PAIR_SETTINGS, "b" if admitted == "a" else "a")]
