@@ -1,6 +1,5 @@
 import asyncio
 import json
-from collections.abc import Callable
 from itertools import count, islice
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,8 @@ from rosrv_fleet.host_names import CollectorNames
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 
 from tests.support.virtual_clock import let_time_pass
+
+pytestmark = pytest.mark.anyio
 
 _NUMBERS = count(100)
 
@@ -48,58 +49,42 @@ def _opened(table: ClientConnections, address: str, number: int = 1) -> list[_So
     return accepted
 
 
-def _in_loop(story: Callable[[], None]) -> None:
-    async def run() -> None:
-        story()
-
-    asyncio.run(run())
-
-
-def test_unproven_addresses_leave_half_of_the_connections(table: ClientConnections) -> None:
-    def story() -> None:
-        others = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
-        assert sum(not one.cut for one in others) == 200
-        (operator,) = _opened(table, "10.0.0.1")
-        table.prove("10.0.0.1")
-        robots = [one for number in range(150) for one in _opened(table, f"10.1.0.{number}")]
-        assert all(table.established(one.fileno(), f"robot{one.fileno()}") for one in robots)
-        for number in range(17):
-            _opened(table, f"203.0.113.{number}", 64)
-        assert len(robots) == 150
-        assert not any(one.cut for one in (operator, *robots))
-        assert len(_opened(table, "10.0.0.1", 40)) == 40
-
-    _in_loop(story)
+async def test_unproven_addresses_leave_half_of_the_connections(table: ClientConnections) -> None:
+    others = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
+    assert sum(not one.cut for one in others) == 200
+    (operator,) = _opened(table, "10.0.0.1")
+    table.prove("10.0.0.1")
+    robots = [one for number in range(150) for one in _opened(table, f"10.1.0.{number}")]
+    assert all(table.established(one.fileno(), f"robot{one.fileno()}") for one in robots)
+    for number in range(17):
+        _opened(table, f"203.0.113.{number}", 64)
+    assert len(robots) == 150
+    assert not any(one.cut for one in (operator, *robots))
+    assert len(_opened(table, "10.0.0.1", 40)) == 40
 
 
-def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
-    def story() -> None:
-        (early,) = _opened(table, "10.0.0.7")
-        many = [one for number in range(1, 5) for one in _opened(table, f"203.0.113.{number}", 64)]
-        (late,) = _opened(table, "10.0.0.8")
-        assert not early.cut and not late.cut
-        cut = next(one for one in many if one.cut)
-        assert not table.established(cut.fileno(), None)
-        table.closed(cut.fileno())
-        assert table.established(late.fileno(), None)
-
-    _in_loop(story)
+async def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
+    (early,) = _opened(table, "10.0.0.7")
+    many = [one for number in range(1, 5) for one in _opened(table, f"203.0.113.{number}", 64)]
+    (late,) = _opened(table, "10.0.0.8")
+    assert not early.cut and not late.cut
+    cut = next(one for one in many if one.cut)
+    assert not table.established(cut.fileno(), None)
+    table.closed(cut.fileno())
+    assert table.established(late.fileno(), None)
 
 
-def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
-    def story() -> None:
-        for _ in range(3):
-            opened = [one for number in range(3) for one in _opened(table, f"203.0.113.{number}", 60)]
-            assert len(opened) == 180
-            assert table.established(opened[0].fileno(), "robot")
-            for one in opened:
-                table.closed(one.fileno())
-        assert len(_opened(table, "198.51.100.1", 64)) == 64
-
-    _in_loop(story)
+async def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
+    for _ in range(3):
+        opened = [one for number in range(3) for one in _opened(table, f"203.0.113.{number}", 60)]
+        assert len(opened) == 180
+        assert table.established(opened[0].fileno(), "robot")
+        for one in opened:
+            table.closed(one.fileno())
+    assert len(_opened(table, "198.51.100.1", 64)) == 64
 
 
-def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections) -> None:
+async def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections) -> None:
     def handshakes(seconds: int, *addresses: str) -> int:
         done = 0
         for _ in range(seconds * 100):
@@ -111,18 +96,15 @@ def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections)
                     table.closed(one.fileno())
         return done
 
-    def story() -> None:
-        table.prove("10.0.0.1")
-        assert 500 <= handshakes(10, "203.0.113.1") <= 500 + 33
-        assert 500 <= handshakes(10, "203.0.113.1", "203.0.113.2") <= 500 + 66
-        assert all(table.accepted(_Socket(), "10.0.0.1") for _ in range(60))
-        let_time_pass(60)
-        assert all(table.accepted(_Socket(), "203.0.113.1") for _ in range(32))
-        let_time_pass(60)
-        once = (f"203.{number >> 8}.{number & 255}.1" for number in range(65_536))
-        assert 10_900 <= sum(handshakes(1, *islice(once, 30)) for _ in range(50)) <= 11_000
-
-    _in_loop(story)
+    table.prove("10.0.0.1")
+    assert 500 <= handshakes(10, "203.0.113.1") <= 500 + 33
+    assert 500 <= handshakes(10, "203.0.113.1", "203.0.113.2") <= 500 + 66
+    assert all(table.accepted(_Socket(), "10.0.0.1") for _ in range(60))
+    let_time_pass(60)
+    assert all(table.accepted(_Socket(), "203.0.113.1") for _ in range(32))
+    let_time_pass(60)
+    once = (f"203.{number >> 8}.{number & 255}.1" for number in range(65_536))
+    assert 10_900 <= sum(handshakes(1, *islice(once, 30)) for _ in range(50)) <= 11_000
 
 
 async def _status(
@@ -143,7 +125,7 @@ async def _status(
     return int(sent[0]["status"])
 
 
-def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_path: Path) -> None:
+async def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_path: Path) -> None:
     async def app(_scope: Any, _receive: Any, send: Any) -> None:
         await send({"type": "http.response.start", "status": 200, "headers": []})
         await send({"type": "http.response.body", "body": json.dumps({}).encode()})
@@ -152,15 +134,12 @@ def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_pat
     token = tokens.add("alice", FleetRole.VIEWER)
     door = Door(app, table, tokens, CollectorNames([]))
 
-    async def story() -> None:
-        for word in ("", "wrong"):
-            found = [await _status(door, f"203.0.113.{len(word)}", word) for _ in range(100)]
-            assert found.count(200) == 32 and found.count(429) == 68
-        assert {await _status(door, "10.0.0.1", token) for _ in range(300)} == {200}
-        assert {await _status(door, "203.0.113.0", robot=True) for _ in range(300)} == {200}
-        behind_it = [await _status(door, "10.0.0.1", "wrong") for _ in range(300)]
-        assert behind_it.count(429) > 0
-        assert await _status(door, "203.0.113.77", name="evil.example.org") == 421
-        assert await _status(door, "203.0.113.77", robot=True, name="evil.example.org") == 200
-
-    asyncio.run(story())
+    for word in ("", "wrong"):
+        found = [await _status(door, f"203.0.113.{len(word)}", word) for _ in range(100)]
+        assert found.count(200) == 32 and found.count(429) == 68
+    assert {await _status(door, "10.0.0.1", token) for _ in range(300)} == {200}
+    assert {await _status(door, "203.0.113.0", robot=True) for _ in range(300)} == {200}
+    behind_it = [await _status(door, "10.0.0.1", "wrong") for _ in range(300)]
+    assert behind_it.count(429) > 0
+    assert await _status(door, "203.0.113.77", name="evil.example.org") == 421
+    assert await _status(door, "203.0.113.77", robot=True, name="evil.example.org") == 200
