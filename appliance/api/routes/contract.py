@@ -4,6 +4,7 @@ import json
 from importlib.resources import files
 from typing import Any
 
+import msgspec
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
@@ -24,11 +25,13 @@ _WITH_TOKEN = {
     "401": "No token, or a wrong, expired or revoked one.",
     "503": "The appliance cannot answer now.",
 }
+GENERAL = frozenset({"400", *_ALWAYS, *_WITH_TOKEN})
+"""The statuses that calls may answer whatever they do; the page lists them once."""
 _NOT_HTTP = "The request is not HTTP, or its first line or headers are too long (64 KiB); the text is the server's own."
 _HASH = {"description": "ETag of this body; If-None-Match takes it", "schema": {"type": "string"}}
 _REFERENCE = CONTRACT.reference(Problem)
 # Requests and answers of a real appliance, with long texts and lists cut. The key is the kind of the body, or the
-# operation for a body without a kind. tests/integration/api/test_examples.py compares the examples with real answers.
+# operation for a body without a kind. Answers get their fields with defaults, and their times as RFC 3339.
 EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
 
 
@@ -51,10 +54,12 @@ def _made(app: FastAPI) -> dict[str, Any]:
         components.pop(name, None)
     components |= _plain(CONTRACT.components())
     components["AuditRecord"] = RECORD
+    bodies, kinds = _bodies(document), {kind.__name__: kind for kind in CONTRACT.kinds}
     for kind, schema in components.items():
         moments.describe(schema)
         if kind in EXAMPLES:
-            schema["examples"] = [EXAMPLES[kind]]
+            shown = kind in bodies or kind not in kinds
+            schema["examples"] = [EXAMPLES[kind] if shown else _as_answered(EXAMPLES[kind], kinds[kind])]
     for path in document["paths"].values():
         for method, operation in path.items():
             _complete(operation)
@@ -62,6 +67,18 @@ def _made(app: FastAPI) -> dict[str, Any]:
             if method == "get":
                 _tagged(operation["responses"])
     return document
+
+
+def _bodies(document: dict[str, Any]) -> set[str]:
+    """Return the kinds of requests' bodies."""
+    operations = [operation for path in document["paths"].values() for operation in path.values()]
+    sent = [part for one in operations for part in one.get("requestBody", {}).get("content", {}).values()]
+    return {part["schema"].get("$ref", "").rpartition("/")[2] for part in sent}
+
+
+def _as_answered(example: Any, kind: Any) -> Any:
+    """Return the example with the fields that have defaults, and with each time written twice."""
+    return json.loads(msgspec.json.encode(moments.in_full(msgspec.convert(example, kind))))
 
 
 def _plain(schema: Any) -> Any:

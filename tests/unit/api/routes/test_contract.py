@@ -210,6 +210,36 @@ def test_examples_match_their_schemas(contract: dict[str, Any]) -> None:
     assert len(told) > len(EXAMPLES)
 
 
+def _absent(written: Any, shown: Any, where: str) -> list[str]:
+    """Return the fields of an example that its kind lacks: the contract leaves them out."""
+    if isinstance(written, dict) and isinstance(shown, dict):
+        absent = [f"{where}.{name}" for name in written.keys() - shown.keys()]
+        return absent + [
+            line
+            for name in written.keys() & shown.keys()
+            for line in _absent(written[name], shown[name], f"{where}.{name}")
+        ]
+    if isinstance(written, list) and isinstance(shown, list):
+        return [
+            line for one, other in zip(written, shown, strict=True) for line in _absent(one, other, where)
+        ]
+    return []
+
+
+@pytest.mark.complete
+def test_examples_have_only_fields_of_their_kinds(contract: dict[str, Any]) -> None:
+    shown = {
+        kind: one["examples"][0]
+        for kind, one in contract["components"]["schemas"].items()
+        if "examples" in one
+    }
+    absent = [
+        line for kind, one in EXAMPLES.items() if kind in shown for line in _absent(one, shown[kind], kind)
+    ]
+    assert not absent, "\n".join([f"{EXAMPLE_FILE}: remove the fields that do not exist:", *absent])
+    assert {"token_by", "last_seen_utc"} <= shown["Hosts"]["hosts"][0].keys()
+
+
 def test_the_console_reads_fields_of_the_contract(contract: dict[str, Any]) -> None:
     schemas = contract["components"]["schemas"].values()
     fields = {name for schema in schemas for name in schema.get("properties", {})}
