@@ -14,9 +14,9 @@ from appliance.base import clock
 from appliance.channel.messages import CertificateMade
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
-from appliance.features.tunnels.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.features.tunnels.host_view import soon
 from appliance.features.tunnels.rest_address import RestAddress
+from appliance.features.tunnels.tunnel_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable

@@ -7,8 +7,8 @@ from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.certification import Certification
-from appliance.features.tunnels.host_answers import PortsReport
 from appliance.features.tunnels.host_view import HostView
+from appliance.features.tunnels.tunnel_answers import PortsReport
 from appliance.hosts.host_table import HostRefusedError
 from appliance.policy.host_names import HostInWords
 from appliance.store.host_tables import PortsRow

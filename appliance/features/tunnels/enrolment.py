@@ -17,16 +17,16 @@ from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Settings
-from appliance.features.tunnels import host_answers as answers
 from appliance.features.tunnels import requests as host_requests
+from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.checked_ports import PortChecks
 from appliance.features.tunnels.enrolment_kit import filled
 from appliance.features.tunnels.enrolment_tokens import LONGEST_SECONDS, MOST
-from appliance.features.tunnels.host_answers import Endpoint
 from appliance.features.tunnels.host_view import HostView
 from appliance.features.tunnels.rest_address import NO_TUNNELS
 from appliance.features.tunnels.self_service import HostSelfService
+from appliance.features.tunnels.tunnel_answers import Endpoint
 from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHostsError
 from appliance.hosts.tunnel_hosts import TunnelHosts
@@ -136,18 +136,7 @@ class HostEnrolment(TunnelHosts):
             self._table.require_name(name)
             if request.new:
                 self._require_not_enrolled(name)
-            if not 0 < request.token_seconds <= LONGEST_SECONDS:
-                raise HostRefusedError(
-                    f"a one-time token is valid for at most {LONGEST_SECONDS / 86_400:.0f} days"
-                )
-            if not 0 < request.days <= LONGEST_DAYS:
-                raise HostRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
-            if self._certification.rest.port is None:
-                raise HostRefusedError(self._certification.rest.trouble)
-            if not await self._certification.served.wait():
-                raise HostRefusedError("REST is not running: see `rosrv status` and the log", ours=True)
-            if len(self._awaited.rows()) >= MOST:
-                raise HostRefusedError(f"{MOST} hosts are already awaited: revoke some")
+            await self._require_token_possible(request)
             promised = self._table.address_for(name, request.address, self._awaited.addresses())
             await self._tunnels.open()
             authority = await self._certification.authority_certificate()
@@ -291,6 +280,20 @@ class HostEnrolment(TunnelHosts):
             raise HostRefusedError(
                 f"{name} is already enrolled: `rosrv host kit {name}` issues a new certificate"
             )
+
+    async def _require_token_possible(self, request: host_requests.HostToken) -> None:
+        if not 0 < request.token_seconds <= LONGEST_SECONDS:
+            raise HostRefusedError(
+                f"a one-time token is valid for at most {LONGEST_SECONDS / 86_400:.0f} days"
+            )
+        if not 0 < request.days <= LONGEST_DAYS:
+            raise HostRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
+        if self._certification.rest.port is None:
+            raise HostRefusedError(self._certification.rest.trouble)
+        if not await self._certification.served.wait():
+            raise HostRefusedError("REST is not running: see `rosrv status` and the log", ours=True)
+        if len(self._awaited.rows()) >= MOST:
+            raise HostRefusedError(f"{MOST} hosts are already awaited: revoke some")
 
     async def _await_no_longer(self, awaited: EnrolmentTokenRow, who: str) -> answers.Revoked:
         self._table.changed()

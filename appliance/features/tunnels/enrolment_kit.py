@@ -12,7 +12,7 @@ from importlib.resources import files
 from string import Template
 
 from appliance.channel.messages import APPLIANCE_NAME
-from appliance.features.tunnels.host_answers import KitParts
+from appliance.features.tunnels.tunnel_answers import KitParts
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 
 CONNECTION, SECOND = "rosrv", "rosrv-2"  # the scripts find both by the beginning of these names

@@ -18,8 +18,8 @@ from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer,
 from appliance.api.front.services import Services
 from appliance.api.routes.operation_routes import Answer, OperationCall
 from appliance.channel.answers.host_answers import Host, PortsSeen
-from appliance.features.tunnels import host_answers as answers
 from appliance.features.tunnels import requests as host_requests
+from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.enrolment_kit import archive
 from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.rest_bodies import ENDPOINT, HOST_NAME, KitWishes

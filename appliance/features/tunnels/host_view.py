@@ -8,7 +8,7 @@ from appliance.base import clock
 from appliance.channel.answers.host_answers import Host, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
-from appliance.features.tunnels.host_answers import Machine
+from appliance.features.tunnels.tunnel_answers import Machine
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.policy.host_names import HostInWords

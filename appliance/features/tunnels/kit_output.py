@@ -10,10 +10,10 @@ from appliance.base.input_files import open_given
 from appliance.cli.connection.target import Appliance
 from appliance.cli.output import moment, say_json
 from appliance.features.tunnels.enrolment_kit import archive
-from appliance.features.tunnels.host_answers import EnrolmentToken, KitParts
 from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.private_output import Output, usage_error
 from appliance.features.tunnels.requests import HostEndpoint
+from appliance.features.tunnels.tunnel_answers import EnrolmentToken, KitParts
 from appliance.ipsec.requests import make_key, signing_request
 
 _ENDPOINT = re.compile(r"[A-Za-z0-9][A-Za-z0-9.:-]{0,252}")

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.features.tunnels.enrolment_kit import Kit
-from appliance.features.tunnels.host_answers import KitParts
+from appliance.features.tunnels.tunnel_answers import KitParts
 from appliance.network.close_ports import parse_ports, parse_services, protection
 
 

@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.rest_operation import Versioned, parameter, rest
-from appliance.features.tunnels import host_answers
 from appliance.features.tunnels import rest_bodies as bodies
+from appliance.features.tunnels import tunnel_answers
 
 HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 _NO_HOST = {404: "There is no such host."}
@@ -30,7 +30,7 @@ OneHost = Annotated[
     "admin", "POST", "/v1/hosts/{name}/token", name="host_token", body=bodies.TokenWishes, fixed={"new": False},
     of=HOSTS, seconds=_CHARON_SECONDS,
 )  # fmt: skip
-class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="host token"):
+class HostToken(WaitingRequest[tunnel_answers.EnrolmentToken], frozen=True, tag="host token"):
     """A one-time token: with it the host enrols itself, for the first time or again with another key."""
 
     name: OneHost
@@ -49,7 +49,7 @@ class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="h
     "admin", "POST", "/v1/hosts", says={"how": "kit"}, of=HOSTS, seconds=_CHARON_SECONDS, filled=("request",),
     machine_only=_KIT,
 )  # fmt: skip
-class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"):
+class HostAdd(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host add"):
     """Enrol a host by a signing request (PKCS #10, PEM) for its own key, for `days`.
 
     `address` is its virtual address; None: the next free one.
@@ -63,7 +63,7 @@ class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"
 
 
 @rest(None, seconds=_CHARON_SECONDS, changes=True)
-class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host enrol"):
+class HostEnrol(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host enrol"):
     """A host at the real address `peer` enrols itself with its token and a signing request (PEM)."""
 
     token: str
@@ -75,7 +75,7 @@ class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host en
     "admin", "POST", "/v1/hosts/{name}/kit", name="new_host_kit", body=bodies.NewKit, of=HOSTS, problems=_NO_HOST,
     seconds=_CHARON_SECONDS, filled=("request",), good="The kit: an archive (.tar.gz)", machine_only=_KIT,
 )  # fmt: skip
-class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host renew"):
+class HostRenew(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host renew"):
     """A new certificate for an enrolled host, in a kit; the earlier one is revoked and its tunnel closed."""
 
     name: OneHost
@@ -85,7 +85,7 @@ class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host re
 
 
 @rest(None, seconds=_CHARON_SECONDS, changes=True)
-class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, tag="host renew itself"):
+class HostRenewItself(WaitingRequest[tunnel_answers.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
     `proof` is the signature of its present key over the bytes of `request`. The earlier certificate is valid
@@ -99,7 +99,7 @@ class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, 
 
 
 @rest(None, seconds=_CHARON_SECONDS, changes=True)
-class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host renewed"):
+class HostRenewed(AdminRequest[tunnel_answers.Renewed], frozen=True, tag="host renewed"):
     """A host at its virtual address `peer` has installed its new certificate, so the earlier one ends now."""
 
     name: str
@@ -107,24 +107,24 @@ class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host ren
 
 
 @rest("viewer", "GET", "/v1/hosts", name="hosts", of=HOSTS)
-class HostList(AdminRequest[host_answers.Hosts], frozen=True, tag="host list"):
+class HostList(AdminRequest[tunnel_answers.Hosts], frozen=True, tag="host list"):
     """Every host that is enrolled, declared or awaited, with its tunnel, and the machines with nodes."""
 
 
 @rest("viewer", machine_only=_KIT)
-class HostEndpoint(AdminRequest[host_answers.Endpoint], frozen=True, tag="host endpoint"):
+class HostEndpoint(AdminRequest[tunnel_answers.Endpoint], frozen=True, tag="host endpoint"):
     """The address at which hosts reach the appliance unless one is given: `endpoint`, with the `reason`."""
 
 
 @rest("operator")
-class HostKit(AdminRequest[host_answers.KitParts], frozen=True, tag="host kit"):
+class HostKit(AdminRequest[tunnel_answers.KitParts], frozen=True, tag="host kit"):
     """The parts of an enrolled host's kit, without its private key."""
 
     name: str
 
 
 @rest("admin", "DELETE", "/v1/hosts/{name}", name="revoke_host", of=HOSTS, problems=_NO_HOST)
-class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revoke"):
+class HostRevoke(AdminRequest[tunnel_answers.Revoked], frozen=True, tag="host revoke"):
     """Exclude a host: its certificate, tunnel, registrations and connections end within a second."""
 
     name: OneHost
@@ -135,7 +135,7 @@ class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revo
     "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", body=bodies.PortsTold, of=HOSTS,
     problems=_NO_HOST, answer_field="ports",
 )  # fmt: skip
-class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host ports"):
+class HostPorts(AdminRequest[tunnel_answers.PortsReport], frozen=True, tag="host ports"):
     """Report whether the ROS ports of a host are closed, as `rosrv protect --check` found from outside."""
 
     name: Annotated[
@@ -151,19 +151,19 @@ class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host p
 
 
 @rest("operator", "POST", "/v1/hosts/reload", name="reload_hosts", of=HOSTS)
-class HostsReload(AdminRequest[host_answers.Reloaded], frozen=True, tag="hosts reload"):
+class HostsReload(AdminRequest[tunnel_answers.Reloaded], frozen=True, tag="hosts reload"):
     """Read hosts.yaml again, and open and close tunnels accordingly. Enrolments and revocations do not change."""
 
     expected: int | None = None
 
 
 @rest(None)
-class RevocationsWanted(AdminRequest[host_answers.RevocationList], frozen=True, tag="host revocations"):
+class RevocationsWanted(AdminRequest[tunnel_answers.RevocationList], frozen=True, tag="host revocations"):
     """The authority's signed list of revoked certificates, in PEM."""
 
 
 @rest(None)
-class AuthorityWanted(AdminRequest[host_answers.AuthorityCertificate], frozen=True, tag="host authority"):
+class AuthorityWanted(AdminRequest[tunnel_answers.AuthorityCertificate], frozen=True, tag="host authority"):
     """The authority's certificate, in PEM."""
 
 

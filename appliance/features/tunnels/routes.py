@@ -28,10 +28,10 @@ from appliance.channel.answers.field_docs import Moment, VirtualAddress, doc
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_kit import archive, members
-from appliance.features.tunnels.host_answers import NewCertificate
 from appliance.features.tunnels.host_routes import ANSWERS, OneName, add_host_routes
 from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.rest_bodies import SigningRequest
+from appliance.features.tunnels.tunnel_answers import NewCertificate
 
 TOKEN = r"^rosrv-enrol_[0-9a-f]{12}_[A-Za-z0-9_-]{43}$"  # noqa: S105  the form of one
 PROOF = r"^[A-Za-z0-9+/]+={0,2}$"

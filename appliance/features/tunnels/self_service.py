@@ -16,8 +16,8 @@ from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.enrolment_tokens import BadEnrolmentTokenError
-from appliance.features.tunnels.host_answers import KitParts, NewCertificate, Renewed
 from appliance.features.tunnels.host_view import span
+from appliance.features.tunnels.tunnel_answers import KitParts, NewCertificate, Renewed
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
 from appliance.store.host_tables import HostRow
 

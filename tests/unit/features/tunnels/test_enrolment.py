@@ -29,14 +29,6 @@ from appliance.channel.messages import (
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.enrolment import HostEnrolment
-from appliance.features.tunnels.host_answers import (
-    Endpoint,
-    EnrolmentToken,
-    KitParts,
-    NewCertificate,
-    Reloaded,
-    Revoked,
-)
 from appliance.features.tunnels.requests import (
     AuthorityWanted,
     HostAdd,
@@ -52,6 +44,14 @@ from appliance.features.tunnels.requests import (
     RevocationsWanted,
 )
 from appliance.features.tunnels.rest_address import RestAddress
+from appliance.features.tunnels.tunnel_answers import (
+    Endpoint,
+    EnrolmentToken,
+    KitParts,
+    NewCertificate,
+    Reloaded,
+    Revoked,
+)
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import StoredAuthority
 from appliance.hosts.host_table import (

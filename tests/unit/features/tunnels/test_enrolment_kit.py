@@ -8,7 +8,7 @@ import pytest
 from msgspec import structs
 
 from appliance.features.tunnels.enrolment_kit import Kit, archive, swanctl_conf
-from appliance.features.tunnels.host_answers import KitParts
+from appliance.features.tunnels.tunnel_answers import KitParts
 from appliance.network.close_ports import protection
 from appliance.network.firewall.firewall_rules import PortRange
 

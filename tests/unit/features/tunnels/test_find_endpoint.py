@@ -5,7 +5,7 @@ import pytest
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Ipsec, Settings
 from appliance.features.tunnels.enrolment import find_endpoint
-from appliance.features.tunnels.host_answers import Endpoint
+from appliance.features.tunnels.tunnel_answers import Endpoint
 from appliance.hosts.host_table import HostRefusedError
 from tests.support import autojump
 

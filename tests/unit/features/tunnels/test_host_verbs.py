@@ -12,7 +12,7 @@ from appliance.channel.admin import (
 )
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.main import app
-from appliance.features.tunnels.host_answers import KitParts
+from appliance.features.tunnels.tunnel_answers import KitParts
 from tests.support.answers import example
 
 
