@@ -43,8 +43,10 @@ LimitNOFILE=65536
 WantedBy=multi-user.target
 """
 # Not started at boot: the tests start the services that they need.
-_QUIET = ("strongswan.service", "nftables.service", "e2scrub_reap.service", "apt-daily.timer")
-_QUIET_TOO = ("apt-daily-upgrade.timer", "dpkg-db-backup.timer", "e2scrub_all.timer", "fstrim.timer")
+_QUIET = (
+    "strongswan.service", "nftables.service", "e2scrub_reap.service", "apt-daily.timer", "apt-daily-upgrade.timer",
+    "dpkg-db-backup.timer", "e2scrub_all.timer", "fstrim.timer",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def _furnish(tree: Path, kernel: Kernel) -> None:
     wanted = units / "multi-user.target.wants"
     wanted.mkdir(exist_ok=True)
     (wanted / "rosrv-agent.service").symlink_to("/etc/systemd/system/rosrv-agent.service")
-    for name in (*_QUIET, *_QUIET_TOO):
+    for name in _QUIET:
         for place in units.glob(f"*.wants/{name}"):
             place.unlink()
     (tree / "etc/machine-id").write_text("")  # a new one at each start

@@ -5,12 +5,11 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
+from appliance.api.routes.contract import GENERAL
+
 PATH = "/v1/openapi.html"
 _STYLE = "/console/static/css/contract.css"
 _ROLES = "docs/reference/rest.md"
-_GENERAL = frozenset({"400", "401", "403", "408", "413", "421", "429", "503"})
-"""The statuses that every call may answer; the page lists them once."""
-
 _Json = Mapping[str, Any]
 
 
@@ -35,7 +34,7 @@ def _lines(document: _Json) -> Iterator[str]:
         yield f'<h2 id="{escape(tag)}">{escape(tag)}</h2>'
         for method, path, operation in operations:
             general |= {
-                one: found["description"] for one, found in operation["responses"].items() if one in _GENERAL
+                one: found["description"] for one, found in operation["responses"].items() if one in GENERAL
             }
             yield from _operation(method, path, operation, document)
     yield '<h2 id="every">Answers that each call may give</h2><dl>'
@@ -73,7 +72,7 @@ def _operation(method: str, path: str, operation: _Json, document: _Json) -> Ite
     others = [
         f"<dt>{status}</dt><dd>{escape(response['description'])}</dd>"
         for status, response in sorted(operation["responses"].items())
-        if not status.startswith("2") and status not in _GENERAL
+        if not status.startswith("2") and status not in GENERAL
     ]
     if others:
         yield f"<dl>{''.join(others)}</dl>"
