@@ -1,7 +1,7 @@
 import grimp
 import pytest
 
-from distribution.sizes import OUTSIDE, kernel_modules, kernel_parts
+from distribution.sizes import KERNEL_FILE, OUTSIDE, kernel_modules, kernel_parts
 from tests.support.rows import require_rows
 from tests.support.sources import ROOT
 
@@ -24,8 +24,5 @@ def test_the_kernel_imports_only_the_modules_on_the_list() -> None:
         for found in graph.find_modules_directly_imported_by(module)
         if found not in kernel
     }
-    where = (
-        "distribution/kernel.txt: to a part, as a path, if an error in it can let a call or a message pass undecided,"
-        f" else to [{OUTSIDE}]"
-    )
+    where = f"[{OUTSIDE}] of {KERNEL_FILE.name}, or to a part of it if it can let a call or a message pass undecided"
     require_rows(imported, kernel_parts()[OUTSIDE], where)

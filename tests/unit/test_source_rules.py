@@ -148,6 +148,7 @@ LOOKUPS = {
     "appliance/api/front/moments.py _units": "msgspec names the schemas of structs by their classes",
     "appliance/api/front/routing.py add_api_route": _LIBRARY,
     "appliance/api/front/routing.py components": "the schemas in the contract have the names of their structs",
+    "appliance/api/routes/contract.py _made": "the examples have the names of their structs",
     "appliance/api/front/routing.py tagged": "monitors have a tag, other answers with an ETag a revision",
     "appliance/audit/search/query.py conditions": "the fields of a filter have the names of the log's columns",
     "appliance/audit/log/record_format.py as_object": _FIELDS,
