@@ -54,7 +54,13 @@ def _made(app: FastAPI) -> dict[str, Any]:
         components.pop(name, None)
     components |= _plain(CONTRACT.components())
     components["AuditRecord"] = RECORD
-    bodies, kinds = _bodies(document), {kind.__name__: kind for kind in CONTRACT.kinds}
+    kinds = {kind.__name__: kind for kind in CONTRACT.kinds}
+    bodies = {
+        body["schema"].get("$ref", "").rpartition("/")[2]
+        for path in document["paths"].values()
+        for operation in path.values()
+        for body in operation.get("requestBody", {}).get("content", {}).values()
+    }
     for kind, schema in components.items():
         moments.describe(schema)
         if kind in EXAMPLES:
@@ -69,14 +75,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
     return document
 
 
-def _bodies(document: dict[str, Any]) -> set[str]:
-    """Return the kinds of requests' bodies."""
-    operations = [operation for path in document["paths"].values() for operation in path.values()]
-    sent = [part for one in operations for part in one.get("requestBody", {}).get("content", {}).values()]
-    return {part["schema"].get("$ref", "").rpartition("/")[2] for part in sent}
-
-
-def _as_answered(example: Any, kind: Any) -> Any:
+def _as_answered(example: object, kind: type[msgspec.Struct]) -> object:
     """Return the example with the fields that have defaults, and with each time written twice."""
     return json.loads(msgspec.json.encode(moments.in_full(msgspec.convert(example, kind))))
 
