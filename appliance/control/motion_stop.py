@@ -14,6 +14,9 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 _READY_SECONDS = 0.1
 
+StopAfter = Callable[[str, Iterable[str], str], Awaitable[None]]
+"""Stops the topics that a host commanded, and gives the reason, as `MotionStop.after` does."""
+
 Commands = set[tuple[str, str]]
 """Hosts, each with a topic that it published."""
 

@@ -28,7 +28,7 @@ async def begin(core: Core) -> ControlPart:
         policy.current,
         core.trail,
         core.graph.signs,
-        stop,
+        stop.after,
         core.ends,
         first=10_000 + secrets.randbelow(80_000),
         decide_again=policy.decide_again,

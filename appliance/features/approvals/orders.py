@@ -17,7 +17,7 @@ from appliance.channel.answers.token_answers import may
 from appliance.channel.messages import HeldRequestDecided, RequestHeld
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.motion_stop import MotionStop
+from appliance.control.motion_stop import StopAfter
 from appliance.features.approvals import requests
 from appliance.features.approvals.approval_table import (
     WAIT_SECONDS,
@@ -55,7 +55,7 @@ class ApprovalOrders:
         policy: Callable[[], Policy],
         trail: AuditTrail,
         signs: HostSigns,
-        stop: MotionStop,
+        stop: StopAfter,
         ends: EndTable,
         *,
         first: int,
@@ -314,7 +314,7 @@ class ApprovalOrders:
             return
         await self._carried_out({call.resource})
         if self._policy().may_command(call.resource, call.host):
-            await self._stop.after(str(call.host), {call.resource}, f"approval {entry.number} ended")
+            await self._stop(str(call.host), {call.resource}, f"approval {entry.number} ended")
 
     # --- inside ---
 

@@ -17,7 +17,7 @@ async def begin(core: Core) -> ControlPart:
         policy.current,
         core.trail,
         core.relay,
-        stop,
+        stop.after,
         node=core.settings.publish_as,
         find=lambda key: ((name := core.graph.name_of(key)), core.graph.host_of(name)),
     )
@@ -25,7 +25,7 @@ async def begin(core: Core) -> ControlPart:
         policy.current,
         core.trail,
         core.graph.signs,
-        stop,
+        stop.after,
         ranked,
         decide_again=policy.decide_again,
         carried_out=core.relay.carried_out,

@@ -12,7 +12,7 @@ from appliance.base import clock
 from appliance.base.withdrawal import take_effect
 from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
-from appliance.control.motion_stop import MotionStop
+from appliance.control.motion_stop import StopAfter
 from appliance.features.authority import requests
 from appliance.features.authority.group_holders import GroupHolders, Holding
 from appliance.features.authority.ranked_groups import RankedGroups
@@ -37,7 +37,7 @@ class DriveOrders:
         policy: Callable[[], Policy],
         trail: AuditTrail,
         signs: HostSigns,
-        stop: MotionStop,
+        stop: StopAfter,
         ranked: RankedGroups,
         *,
         decide_again: Callable[[], int],
@@ -208,7 +208,7 @@ class DriveOrders:
                 self._decide_again()
                 if stop:
                     await self._carried_out(group.names)
-                    await self._stop.after(str(before.host), group.names, f"{group.name}: {reason}")
+                    await self._stop(str(before.host), group.names, f"{group.name}: {reason}")
                 await self._carried_out(None)  # all: a topic of the group may have moved between relays
             heir = to or self._next(group)
             # A relay whose link was lost in the meantime may still let the earlier holder through.

@@ -13,7 +13,7 @@ from appliance.channel.messages import OwnHeaderStated, OwnPublished, RankReport
 from appliance.channel.messages.relay_link import RankStanding
 from appliance.control.core import RelayOrders
 from appliance.control.errors import SenselessError, UnavailableError
-from appliance.control.motion_stop import MotionStop
+from appliance.control.motion_stop import StopAfter
 from appliance.policy.authority import AuthorityGroup
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
@@ -75,7 +75,7 @@ class RankedGroups:
         policy: Callable[[], Policy],
         trail: AuditTrail,
         relay: RelayOrders,
-        stop: MotionStop,
+        stop: StopAfter,
         *,
         node: str,
         find: Callable[[str], tuple[str, Address | None]],
@@ -125,7 +125,7 @@ class RankedGroups:
             lost = await self._lost.get()
             group, driver = self._policy().commanded(lost.topic), self._drivers.get(lost.topic)
             if group is not None and driver is not None and driver.report == lost:
-                await self._stop.after(driver.host, {lost.topic}, f"{group.name}: {driver.why(group)}")
+                await self._stop(driver.host, {lost.topic}, f"{group.name}: {driver.why(group)}")
 
     def _reported(self, report: RankReported) -> None:
         group = self._policy().commanded(report.topic)

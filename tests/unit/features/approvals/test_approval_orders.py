@@ -5,8 +5,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -66,7 +65,7 @@ class Site:
             lambda: self.policy,
             self.trail,
             HostSigns(lambda _host: True, lambda _host, _names: self.moved),
-            cast(Any, SimpleNamespace(after=self.stop)),
+            self.stop,
             ends,
             first=17,
             decide_again=self.decide_again,
@@ -87,11 +86,11 @@ class Site:
         if self.hanging.intersection(topics):
             await self.replaced.wait()
 
-    async def stop(self, host: str, topics: set[str], _why: str) -> None:
+    async def stop(self, host: str, topics: Iterable[str], _why: str) -> None:
         assert not any(
             (address_of(host), Category.PUBLISH, topic) in self.orders.approved() for topic in topics
         )
-        self.stops.append((host, topics))
+        self.stops.append((host, {*topics}))
 
     async def guards(self, topic: str) -> list[str] | None:
         self.asked.append(topic)

@@ -1,9 +1,9 @@
+import asyncio
 import hashlib
 import hmac
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -12,12 +12,13 @@ from appliance.base import clock
 from appliance.channel.channel import ChannelFullError
 from appliance.features.approvals.approval_table import ApprovalEntry, HeldCall
 from appliance.features.approvals.hook import UNSENT_SECONDS, WebHook
-from appliance.features.approvals.hook_link import CallSent, CallWaits
+from appliance.features.approvals.hook_link import CallSent, CallWaits, HookLink
 from appliance.features.approvals.hook_process import HookSender
 from appliance.features.approvals.hook_request import body_of, request_of
 from appliance.features.approvals.settings import ApprovalHook
 from appliance.policy.model import Category, address_of
-from tests.support.virtual_clock import VirtualClock
+from tests.support.memory_channel import memory_link
+from tests.support.virtual_clock import let_time_pass
 
 CALL = CallWaits(7, "10.0.0.7", "/agent", "publish", "/goal", "", 120.0)
 GIVEN: dict[str, Any] = {
@@ -76,7 +77,7 @@ def test_a_hook_needs_https_an_address_and_a_secret(given: dict[str, Any], error
         TypeAdapter(ApprovalHook).validate_python(fields)
 
 
-def _full(_message: object) -> bool:
+def _full(*_message: object, **_when: bool) -> None:
     raise ChannelFullError
 
 
@@ -85,28 +86,38 @@ def _entry() -> ApprovalEntry:
     return ApprovalEntry(7, call, None, "/agent", "", b"", 0, clock.now())  # type: ignore[arg-type]  # the hook reads no rule
 
 
-def test_an_unsent_call_is_counted_until_one_is_sent_or_ten_minutes_have_passed() -> None:
-    with clock.using(time := VirtualClock()):
-        hook = WebHook(wanted=True)
-        hook.notify(_entry(), 120.0)
-        assert hook.unsent() == (1, "its process is not running")
-        sent: list[object] = []
-        hook.link = cast(Any, SimpleNamespace(send=lambda one: not sent.append(one)))  # type: ignore[func-returns-value]  # true for `send`
-        hook.notify(_entry(), 120.0)
-        assert sent == [CALL]
-        heard = hook.heard
-        heard(CallSent(7, "no answer within 5 s"))
-        assert hook.unsent() == (2, "no answer within 5 s")
-        heard(CallSent(8, ""))
-        assert hook.unsent() == (0, "")
-        hook.link = cast(Any, SimpleNamespace(send=_full, close=lambda: None))
-        hook.notify(_entry(), 120.0)
-        assert hook.unsent() == (1, "its process does not read")
-        time.advance(UNSENT_SECONDS)
-        assert hook.unsent() == (0, "")
-        quiet = WebHook(wanted=False)
-        quiet.notify(_entry(), 120.0)
-        assert quiet.unsent() == (0, "")
+@pytest.mark.anyio
+async def test_an_unsent_call_is_counted_until_one_is_sent_or_ten_minutes_have_passed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hook = WebHook(wanted=True)
+    hook.notify(_entry(), 120.0)
+    assert hook.unsent() == (1, "its process is not running")
+    channel, process = memory_link(HookLink)
+    hook.link.attach(channel)
+    process.attach(asyncio.get_running_loop(), lambda *_message: None, lambda: None)
+    hook.notify(_entry(), 120.0)
+    await asyncio.sleep(0)
+    assert process.messages == [CALL]
+    for sent, unsent in (
+        (CallSent(7, "no answer within 5 s"), (2, "no answer within 5 s")),
+        (CallSent(8, ""), (0, "")),
+    ):
+        process.send(sent)
+        await asyncio.sleep(0)
+        assert hook.unsent() == unsent
+    monkeypatch.setattr(channel, "send", _full)
+    hook.notify(_entry(), 120.0)
+    assert hook.unsent() == (1, "its process does not read")
+    assert channel.closed
+    let_time_pass(UNSENT_SECONDS)
+    assert hook.unsent() == (0, "")
+
+
+def test_without_a_hook_no_call_is_counted() -> None:
+    quiet = WebHook(wanted=False)
+    quiet.notify(_entry(), 120.0)
+    assert quiet.unsent() == (0, "")
 
 
 @pytest.mark.anyio

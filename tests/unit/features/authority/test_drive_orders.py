@@ -1,15 +1,15 @@
 import asyncio
 import random
 from collections.abc import Iterable, Iterator
-from typing import Any, cast
 
 import pytest
 
 from appliance.base import clock
-from appliance.channel.messages import OwnServiceCalled, RankReported
+from appliance.channel.messages import OwnServiceCalled
+from appliance.control.core import RelayOrders
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.features.authority.orders import CHECK_SECONDS, DriveOrders
-from appliance.features.authority.ranked_groups import RankedDriver
+from appliance.features.authority.ranked_groups import RankedGroups
 from appliance.features.authority.requests import (
     DriveAsk,
     DriveGive,
@@ -18,11 +18,12 @@ from appliance.features.authority.requests import (
     GroupState,
 )
 from appliance.master.endpoints.host_signs import HostSigns
-from appliance.policy.authority import AuthorityGroup
+from appliance.master.endpoints.rank_states import RankStates
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from tests.support.core import FakeTrail
+from tests.support.idle import idle
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
@@ -38,25 +39,6 @@ lease base = {RELEASE_AFTER:g}s
 """
 
 
-class RankedGiver:
-    """Stands in for the groups with a rank, which have their own tests."""
-
-    def __init__(self) -> None:
-        self.given: list[str] = []
-
-    def policy_changed(self) -> None: ...
-
-    def driver(self, _group: AuthorityGroup) -> RankedDriver:
-        return RankedDriver(RankReported("", "", 0, "unknown"))
-
-    async def free(self, group: AuthorityGroup, who: str) -> None:
-        self.given.append(f"{group.name} by {who}")
-
-
-def as_any(double: Any) -> Any:
-    return double
-
-
 class Site:
     def __init__(self, chance: random.Random, time: VirtualClock) -> None:
         self.time = time
@@ -69,19 +51,23 @@ class Site:
         self.ordered: list[list[Address | None]] = [[], []]
         self.ready = True
         self.hanging: set[str] = set()  # topics of a relay that does not answer
-        self.ranked = RankedGiver()
+        relay = idle(RelayOrders)
+        relay.ranks = RankStates(lambda _order: True)
+        ranked = RankedGroups(
+            lambda: self.policy, self.trail, relay, self.stop, node="/rosrv", find=lambda _key: ("", None)
+        )
         self.orders = DriveOrders(
             lambda: self.policy,
             self.trail,
             HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
-            cast(Any, self),
-            as_any(self.ranked),
+            self.stop,
+            ranked,
             decide_again=self.decide_again,
             carried_out=self.carried_out,
             relays_ready=lambda: self.ready,
         )
 
-    async def after(self, host: str, topics: frozenset[str], why: str) -> None:
+    async def stop(self, host: str, topics: Iterable[str], why: str) -> None:
         assert address_of(host) not in self.applied
         assert self.orders.holders() == {}
         self.trail.happened("motion stopped", why, topics=sorted(topics))
@@ -273,7 +259,7 @@ async def test_a_relay_that_is_lost_during_a_hand_over_lets_no_two_hosts_through
         await asyncio.sleep(0)
         site.ready = False
         [answer] = await asyncio.gather(order, return_exceptions=True)
-        assert isinstance(answer, UnavailableError) or not cast(Any, answer).success
+        assert isinstance(answer, UnavailableError) or not getattr(answer, "success", True)
         assert (await site.state()).holder == ""
         site.ready = True
 

@@ -1,12 +1,12 @@
 from ipaddress import IPv4Address
-from types import SimpleNamespace
-from typing import Any
 
 from appliance.features.authority.group_holders import MOST_WAITING, GroupHolders
 from appliance.policy.authority import Claim
 from appliance.policy.model import Address
+from appliance.policy.policy_compiler import compile_policy
 
-GROUP: Any = SimpleNamespace(name="base", release_after=2.0)
+TEXT = "[Authority]\nbase = /cmd_vel\ntake base = 10.0.0.1\nlease base = 2s\n"
+GROUP = compile_policy(TEXT, file="site.ini").authority["base"]
 DRIVERS: dict[Address, Claim] = {IPv4Address("10.0.0.1"): Claim.TAKE, IPv4Address("10.0.0.2"): Claim.OVERRIDE}
 
 

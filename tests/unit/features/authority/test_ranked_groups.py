@@ -63,7 +63,7 @@ class Site:
             lambda: self.policy,
             self.trail,
             as_any(self.relay),
-            as_any(self),
+            self.stop,
             node="/rosrv",
             find=self.find,
         )
@@ -78,8 +78,8 @@ class Site:
         rows = [row for row in self.trail.rows if row["event"] == "authority handed over"]
         return [f"{row['earlier']} -> {row['holder']}: {row['reason']}" for row in rows]
 
-    async def after(self, host: str, topics: set[str], _why: str) -> None:
-        self.stopped.append((host, topics))
+    async def stop(self, host: str, topics: Iterable[str], _why: str) -> None:
+        self.stopped.append((host, {*topics}))
 
     def report(self, key: str, standing: Any, rank: int = 0) -> None:
         self.relay.ranks.reported(RankReported("/cmd_vel", key, rank, standing))

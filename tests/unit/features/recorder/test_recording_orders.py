@@ -1,7 +1,7 @@
 import asyncio
 import socket
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import pytest
@@ -18,6 +18,7 @@ from appliance.features.recorder.recording_answers import OpenRecording, Recordi
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.recording_store import MOST_TEMPORARY
 from appliance.features.recorder.settings import RecorderRules
+from appliance.features.recorder.view import RecorderState
 from tests.support.core import FakeTrail
 from tests.support.memory_channel import memory_link
 
@@ -37,6 +38,12 @@ class Scene:
             lambda: (4, 2),
             RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
         )
+
+    @property
+    def state(self) -> RecorderState:
+        state = self.orders.state()
+        assert state is not None
+        return state
 
     def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:
         ours, theirs = socket.socketpair()
@@ -182,12 +189,12 @@ async def test_an_open_recording_is_listed(scene: Scene) -> None:
     scene.orders.link.attach(ours)
     opened = OpenRecording(KEPT.id, 1_000, 5 * 10**9, Trigger(1_000, "drop", "record", "so"))
     recorder.send(recorder_link.RecordingsStated([], [opened]))
-    await told(scene, lambda: bool(cast(Any, scene.orders.state()).in_progress))
+    await told(scene, lambda: bool(scene.state.in_progress))
     assert (await scene.orders.recordings(recording_requests.RecordingsWanted())).in_progress == [opened]
     with pytest.raises(UnknownThingError, match="still being made: ask again after 1970-01-01T00:00:05"):
         await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id))
     recorder.send(recorder_link.RecordingClosed(KEPT))
-    await told(scene, lambda: not cast(Any, scene.orders.state()).in_progress)
+    await told(scene, lambda: not scene.state.in_progress)
     assert await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id)) == KEPT
 
 
@@ -195,7 +202,7 @@ async def test_an_open_recording_is_listed(scene: Scene) -> None:
 async def test_a_fetch_needs_a_record(scene: Scene) -> None:
     recorder = scene.attach(lambda _message: [])
     recorder.send(recorder_link.RecordingsStated([KEPT]))
-    await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
+    await told(scene, lambda: bool(scene.state.recordings))
     assert scene.orders.limits() == (LimitUse("bytes of recordings", KEPT.size, 2 << 30, "recorder.disk"),)
     assert await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve") == KEPT
     scene.trail.log.failure = "the disk is full"
@@ -247,7 +254,7 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
 async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
     recorder = scene.attach(lambda _message: [])
     recorder.send(recorder_link.RecordingsStated([KEPT]))
-    await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
+    await told(scene, lambda: bool(scene.state.recordings))
     for topics in ([f"/t{number}" for number in range(21)], ["/" + "t" * 500]):
         with pytest.raises(SenselessError, match="at most 20 topics"):
             await scene.orders.read(recording_requests.RecordingRead(KEPT.id, topics), "eve")

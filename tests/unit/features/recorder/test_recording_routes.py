@@ -1,20 +1,24 @@
+import asyncio
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from starlette.responses import StreamingResponse
 
-from appliance.api.front.access import Bearer
+from appliance.api.front.access import Bearer, TokenAuthenticator
+from appliance.api.front.control import ControlLink
+from appliance.api.front.history import SampleHistory
+from appliance.api.front.journal import Journal
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.services import Services
 from appliance.channel.admin import AdminAnswer
+from appliance.configuration.config_sources import read
 from appliance.features.recorder import routes as recording_routes
 from appliance.features.recorder.bag_writer import BagMessage, BagWriter
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import Recording
 from tests.support.answers import example
+from tests.support.idle import idle
 from tests.support.inline_loop import run
 from tests.unit.features.recorder.test_bag_writer import HEADER, SECOND, body
 
@@ -22,7 +26,9 @@ _EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 
 
 @pytest.mark.parametrize("mcap", [False, True])
-def test_a_started_download_is_completed(tmp_path: Path, *, mcap: bool) -> None:
+def test_a_started_download_is_completed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, mcap: bool
+) -> None:
     kept = tmp_path / "recordings" / ("a" * 20)
     kept.mkdir(parents=True)
     bag = BagWriter(kept / "recording.bag", {})
@@ -33,11 +39,13 @@ def test_a_started_download_is_completed(tmp_path: Path, *, mcap: bool) -> None:
     size = (kept / "recording.bag").stat().st_size
     whole = b"".join(as_mcap(kept / "recording.bag")) if mcap else (kept / "recording.bag").read_bytes()
 
-    class Control:
-        async def ask(self, *_asked: Any) -> AdminAnswer[Any]:
-            return AdminAnswer(True, example(Recording, id="a" * 20, size=size))
+    async def ask(*_asked: object) -> AdminAnswer[Recording]:
+        return AdminAnswer(True, example(Recording, id="a" * 20, size=size))
 
-    services: Any = SimpleNamespace(control=Control(), settings=SimpleNamespace(state=tmp_path))
+    control, settings = idle(ControlLink), read({"state": str(tmp_path)})
+    monkeypatch.setattr(control, "ask", ask)
+    keeper, journal, history = idle(TokenAuthenticator), idle(Journal), idle(SampleHistory)
+    services = Services(settings, control, keeper, journal, asyncio.Event(), history)
 
     async def fetched() -> bytes:
         response = await _asked(services, mcap=mcap)
