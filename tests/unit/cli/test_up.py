@@ -18,26 +18,23 @@ from appliance.supervisor.supervisor import ControlReady
 READY = ControlReady("http://127.0.0.1:11311", 1, "http://127.0.0.1:2", 3, 4, "secret")
 
 
-class Full(io.StringIO):
-    def flush(self) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
+def a_terminal(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """Let standard error be a terminal, and return it."""
+    shown = io.StringIO()
+    monkeypatch.setattr(shown, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", shown)
+    return shown
 
 
 def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shown = Terminal()
-    monkeypatch.setattr(sys, "stderr", shown)
+    terminal = a_terminal(monkeypatch)
     _announce(READY, Settings(state=tmp_path, api="127.0.0.1:8443"), as_json=False)
     kept = tmp_path / "first-token"
     assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
     assert capsys.readouterr().out.count("\n") == 1
-    assert shown.getvalue().endswith(
+    assert terminal.getvalue().endswith(
         f"Console: https://127.0.0.1:8443/console/\nREST: https://127.0.0.1:8443\n"
         f"The first access token (admin) is in {kept}\n"
     )
@@ -67,15 +64,14 @@ def test_without_a_terminal_all_lines_are_of_the_log(tmp_path: Path) -> None:
 def test_the_policys_warnings_are_printed_at_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shown = Terminal()
-    monkeypatch.setattr(sys, "stderr", shown)
+    terminal = a_terminal(monkeypatch)
     said = msgspec.structs.replace(
         READY, token=None, warnings=tuple(f"p.ini:{n}:1: warning" for n in range(12))
     )
     settings = Settings(state=tmp_path, api="off", policy=Path("p.ini"))
     _announce(said, settings, as_json=False)
     assert capsys.readouterr().out.count("\n") == 1
-    assert "p.ini:9:1: warning\nand 2 more warnings: rosrv policy check p.ini\n" in shown.getvalue()
+    assert "p.ini:9:1: warning\nand 2 more warnings: rosrv policy check p.ini\n" in terminal.getvalue()
     _announce(said, settings, as_json=True)
     event = json.loads(capsys.readouterr().out)
     assert event["warnings"] == [*said.warnings]
@@ -101,8 +97,13 @@ def test_a_partial_token_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_closed_standard_output_does_not_end_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, as_json: bool
 ) -> None:
-    monkeypatch.setattr(sys, "stdout", Full())
-    monkeypatch.setattr(sys, "stderr", Terminal())
+    def full() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    closed = io.StringIO()
+    monkeypatch.setattr(closed, "flush", full)
+    a_terminal(monkeypatch)
+    monkeypatch.setattr(sys, "stdout", closed)
     with capture_logs() as said:
         _announce(READY, Settings(state=tmp_path, api="off"), as_json=as_json)
     assert (tmp_path / "first-token").read_text() == "secret\n"

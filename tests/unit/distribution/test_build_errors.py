@@ -3,7 +3,6 @@
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -44,11 +43,9 @@ def test_a_missing_program(
 def test_a_program_that_fails(
     main: Main, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def run(command: list[str], **_options: Any) -> SimpleNamespace:
+    def run(command: list[str], **_options: Any) -> subprocess.CompletedProcess[str]:
         git = command[0] == "git"  # of which the time of the commit is asked
-        return SimpleNamespace(
-            returncode=0 if git else 7, stdout="1700000000" if git else "", stderr="no space"
-        )
+        return subprocess.CompletedProcess(command, 0 if git else 7, "1700000000" if git else "", "no space")
 
     monkeypatch.setattr(subprocess, "run", run)
     assert main(arguments) == 1

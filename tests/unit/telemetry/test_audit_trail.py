@@ -1,46 +1,37 @@
 import asyncio
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 
 from appliance.audit.log.budget import Budget
-from appliance.audit.log.ids import IdSource
+from appliance.audit.log.log import AuditLog
 from appliance.audit.log.record import Severity
-from appliance.base import clock
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
 from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail
+from tests.support.core import MemoryLog
 
 GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"
 
 
-class Log:
-    def __init__(self) -> None:
-        self.ids = IdSource(clock=clock.wall_ns)
-        self.failed: str | None = "/var/lib/rosrv/control/audit.db: database or disk is full"
-        self.records: list[Any] = []
-        self.budget = Budget(lambda host: QuotaClass.UNKNOWN if host == UNKNOWN else QuotaClass.NAMED)
-
-    def record(self, record: Any) -> str:
-        self.budget.charge(record)
-        self.records.append(record)
-        return str(record.id)
-
-    async def wait_durable(self) -> str | None:
-        return self.failed
+FULL = "/var/lib/rosrv/control/audit.db: database or disk is full"
 
 
-def trail(log: Log, *, deny: bool) -> AuditTrail:
-    return AuditTrail(
-        log,  # type: ignore[arg-type]  # stands for the log
-        strict=True,
-        deny_when_failed=deny,
-    )
+def log_of(failure: str | None = FULL, on_disk: Callable[[], None] = lambda: None) -> MemoryLog:
+    """Return a log in memory that charges each record to its host."""
+    budget = Budget(lambda host: QuotaClass.UNKNOWN if host == UNKNOWN else QuotaClass.NAMED)
+    log = MemoryLog(budget.charge, on_disk)
+    log.budget, log.failure = budget, failure
+    return log
+
+
+def trail(log: AuditLog, *, deny: bool) -> AuditTrail:
+    return AuditTrail(log, strict=True, deny_when_failed=deny)
 
 
 def test_errors_do_not_reveal_the_path_of_the_log() -> None:
     """While the log cannot be written, requests are denied, and a node does not learn the cause."""
-    one = trail(Log(), deny=True)
+    one = trail(log_of(), deny=True)
     assert one.obstacle == NOT_RECORDED
     assert "/" not in NOT_RECORDED
     assert asyncio.run(one.durable()) is not None
@@ -48,15 +39,14 @@ def test_errors_do_not_reveal_the_path_of_the_log() -> None:
 
 @pytest.mark.parametrize("failed", [None, "full"])
 def test_changes_go_on_without_the_log_where_allowed(failed: str | None) -> None:
-    log = Log()
-    log.failed = failed
+    log = log_of(failed)
     assert trail(log, deny=failed is None).obstacle is None
     if failed is not None:
         assert asyncio.run(trail(log, deny=False).durable()) is None
 
 
 def test_refusals_of_unknown_hosts_are_marked() -> None:
-    log = Log()
+    log = log_of()
     one = trail(log, deny=True)
     one.happened("limit exceeded", "too much", decision="deny", host=UNKNOWN)
     one.happened("limit exceeded", "too much", decision="deny", host=GUEST)
@@ -67,7 +57,7 @@ def test_refusals_of_unknown_hosts_are_marked() -> None:
 
 
 def test_an_event_has_the_severity_of_the_registry() -> None:
-    log = Log()
+    log = log_of()
     one = trail(log, deny=True)
     one.happened("tunnel refused", "no certificate")
     one.happened("limit exceeded", "no room", severity=Severity.ALARM)
@@ -76,7 +66,7 @@ def test_an_event_has_the_severity_of_the_registry() -> None:
 
 
 def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
-    log = Log()
+    log = log_of()
     one = trail(log, deny=True)
     one.happened("connection opened", "", host=GUEST)
     one.happened("malformed", "x" * AUDIT_BYTES.bounds.host, host=GUEST)
@@ -89,7 +79,7 @@ def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
 
 
 def test_details_of_features_are_added_to_a_record() -> None:
-    log = Log()
+    log = log_of()
     one = trail(log, deny=False)
     one.add_details(lambda event, *_: {"kept": f"in {event}"})
     for severity in (Severity.NOTICE, Severity.INFO):
@@ -105,14 +95,12 @@ def test_details_of_features_are_added_to_a_record() -> None:
 
 
 def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
-    class Behind(Log):
-        async def wait_durable(self) -> str | None:
-            for record in self.records:
-                self.budget.correct(record, -1)
-            self.records.clear()
-            return None
+    def correct() -> None:
+        for record in log.records:
+            log.budget.correct(record, -1)
+        log.records.clear()
 
-    log = Behind()
+    log = log_of(None, correct)
     one = trail(log, deny=True)
     while not one.owing(GUEST):
         one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
@@ -120,7 +108,7 @@ def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
 
 
 def test_records_that_are_written_are_owed() -> None:
-    log = Log()
+    log = log_of()
     one = trail(log, deny=True)
     while not one.owing(GUEST):
         one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)

@@ -29,7 +29,6 @@ from appliance.base.clock import wall_ns
 from appliance.features.evidence import bundle as bundles
 from appliance.features.evidence.bundle import BundleError, TimeSpan, export, verifier_program
 from appliance.formats import bundle_verifier
-from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
 from tests.support.engines import open_log
@@ -37,7 +36,7 @@ from tests.support.examples import examples
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.log.test_retention import make_old, retain
-from tests.unit.features.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control, Topic, Trigger
+from tests.unit.features.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control
 
 Members = dict[str, bytes]
 
@@ -546,8 +545,8 @@ def test_copied_checkpoints_show_a_rewritten_history(
 @pytest.mark.nightly
 def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
     bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
-    trigger = Trigger(control.begun, "drop", "r", "<b>\x1b")
-    kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(Topic, topic="/scan")])
+    trigger = {"time": control.begun, "what": "drop", "record": "r", "text": "<b>\x1b"}
+    kept = control.record(tmp_path, bag, triggers=[trigger], topics=[{"topic": "/scan"}])
     control.work(2)
     place = control.export(kept, tmp_path / "incident.zip")
     members = members_of(place)

@@ -9,7 +9,7 @@ from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 from appliance.telemetry.audit_trail import Asker, AuditTrail
-from tests.unit.telemetry.test_audit_trail import Log
+from tests.unit.telemetry.test_audit_trail import log_of
 
 ROBOT = "192.168.1.10"
 _POLICY = compile_policy(
@@ -44,9 +44,9 @@ def test_other_hosts_hide_no_illness_of_the_robot() -> None:
 
 
 def test_denials_are_counted_by_host() -> None:
-    log = Log()
+    log = log_of()
     log.budget = Budget(lambda host: QuotaClass.UNKNOWN if host.startswith("203.") else QuotaClass.NAMED)
-    trail = AuditTrail(log, strict=True, deny_when_failed=False)  # type: ignore[arg-type]  # stands for the log
+    trail = AuditTrail(log, strict=True, deny_when_failed=False)
     for host, allowed in (
         (ROBOT, True),
         ("10.0.0.66", False),
