@@ -147,7 +147,7 @@ def test_an_agent_in_a_container_needs_no_published_port(site: Site, doors: Comp
     assert other.returncode != 0 and not other.stdout
 
     def recorded() -> bool:
-        ended = doors.audit(event="door disconnected", resource="agent-2")
-        return any("the agent's address is 172.29.78.30" in record["reason"] for record in ended)
+        refused = doors.audit(event="door entry refused", resource="agent-2")
+        return any("the agent's address is 172.29.78.30" in record["reason"] for record in refused)
 
     eventually(recorded, doors.story)

@@ -273,9 +273,9 @@ def test_an_appliance_in_a_container_joins(walk: Walk) -> None:
     (folder / "compose.override.yaml").write_text(json.dumps(often))
     compose("up", "--detach", "--no-build", "appliance")
     compose.wait_healthy()
-    invite = "rosrv-fleet robot invite arm7 --group site-a/arms"
-    assert f"`{invite}`" in PAGE
-    walk.run(f"{invite} > arm7.json".replace("arm7", "arm21"))
+    invite = "rosrv-fleet robot invite arm-1 --group site-a/arms > arm-1.json"
+    assert invite in PAGE
+    walk.run(invite.replace("arm-1", "arm21"))
     (walk.folder / "arm21.json").rename(folder / "arm7.json")
     said = walk.run(NAMED["joins"], folder.name)
     assert "arm21 is enrolled at https://10.0.0.9:8444: certificate SHA-256 " in said
