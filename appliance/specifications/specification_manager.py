@@ -121,7 +121,7 @@ class SpecificationManager:
             held=lambda: self.rollout.held,
             moved=self.rollout.moved_files,
         )
-        self._present = SpecificationsInForce(
+        self.present = SpecificationsInForce(
             self._folder,
             enable,
             store,
@@ -133,8 +133,8 @@ class SpecificationManager:
             go_back=self._go_back,
             come_back=self._come_back,
         )
-        self.returns = self._present.returns
-        self._change_records = self._present.change_records
+        self.returns = self.present.returns
+        self._change_records = self.present.change_records
         self.records = MonitorRecords(
             trail,
             lambda topic, data: self.checked.fields(topic, data),  # noqa: PLW0108 - of whatever is in force then
@@ -150,25 +150,25 @@ class SpecificationManager:
     async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
         """As `SpecificationsInForce.start`."""
         self.records.start(self._store.settings().get(_STOPS, "[]"))
-        await self._present.start(restarted=restarted, taken_over=taken_over)
+        await self.present.start(restarted=restarted, taken_over=taken_over)
 
     # --- queries ---
 
     @property
     def now(self) -> InForce:
-        return self._present.now
+        return self.present.now
 
     @property
     def in_force(self) -> MonitorRevisionRow:
-        return self._present.in_force
+        return self.present.in_force
 
     @property
     def confirm_by(self) -> float | None:
-        return self._present.confirm_by
+        return self.present.confirm_by
 
     @property
     def differs_from_folder(self) -> bool:
-        return self._present.differs_from_folder
+        return self.present.differs_from_folder
 
     @property
     def folder(self) -> Path | None:
@@ -217,17 +217,17 @@ class SpecificationManager:
         return self.checked.monitors[name]
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        rows = [self._present.described(row) for row in await self._present.rows()]
+        rows = [self.present.described(row) for row in await self.present.rows()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
-        row = await self._present.find(request.revision)
+        row = await self.present.find(request.revision)
         if row is None:
             raise UnknownMonitorError(
                 f"there is no revision {request.revision} of the specifications: rosrv monitor revisions lists all"
             )
         texts = msgspec.structs.asdict(sources_of(row))
-        return msgspec.convert(self._present.described(row) | texts, answers.RevisionTexts)
+        return msgspec.convert(self.present.described(row) | texts, answers.RevisionTexts)
 
     async def shown(self, request: admin.MonitorValuesWanted, who: str) -> answers.MonitorReadout:
         """Return the variables of a monitor. Raises `UnknownMonitorError`."""
@@ -242,13 +242,13 @@ class SpecificationManager:
         With `enable`, monitors are enabled even if the setting `enable` would disable them. With `confirm_within`, the
         change is rolled back after that many seconds unless confirmed.
         """
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             topics, constants = split(request.given)
             new = Sources(request.files, request.definitions, request.signatures, topics)
             sources = self.sources.with_files(new)
             asks = request.shadow or request.given or new.files.keys() & broken(self.now).keys()
             if self.in_force.who != DISK and sources == self.sources and not asks:
-                return self._present.replaced(self.revision, loaded=new.files)  # same texts: no new revision
+                return self.present.replaced(self.revision, loaded=new.files)  # same texts: no new revision
             files = frozenset(new.files)
             shadow, enabled = files if request.shadow else (), files if enable else ()
             order = ChangeOrder(
@@ -302,7 +302,7 @@ class SpecificationManager:
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
         """Load the folder; files that are not in it stay in force, unless `prune` is set."""
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             if self._folder.path is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
@@ -321,10 +321,10 @@ class SpecificationManager:
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
         """Bring exactly these sources into force."""
-        async with self._present.changing(None):
+        async with self.present.changing(None):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
-                return self._present.replaced(self.revision)  # same texts: no new revision
+                return self.present.replaced(self.revision)  # same texts: no new revision
             order = ChangeOrder(who, note, consent=Consent(hold=True))
             return await self._change(Wanted(sources), self.judge.strictly, order)
 
@@ -337,7 +337,7 @@ class SpecificationManager:
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, or the files of monitors, if no other monitor is in them or uses their variables."""
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             names, owners = request.names, self.checked.monitors
             known = set(self.sources.files) | set(owners)
             unknown = [name for name in names if name not in known]
@@ -354,7 +354,7 @@ class SpecificationManager:
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
             keeper, within = who, request.confirm_within
-            if within is None and self._present.is_folder(sources):
+            if within is None and self.present.is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
             check = partial(self.judge.beside_broken, self.now, self.judge.checks.order)
             return await self._change(Wanted(sources), check, ChangeOrder(who, note, within, author=keeper))
@@ -364,8 +364,8 @@ class SpecificationManager:
 
         The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start.
         """
-        async with self._present.changing(request.expected):
-            row = NOTHING if request.revision == 0 else await self._present.wanted(request.revision)
+        async with self.present.changing(request.expected):
+            row = NOTHING if request.revision == 0 else await self.present.wanted(request.revision)
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
             as_before = partial(self.judge.as_at_start, known=last.warnings)
             check = as_before if who == UNCONFIRMED else self.judge.strictly
@@ -373,11 +373,11 @@ class SpecificationManager:
             return await self._change(wanted, check, ChangeOrder(who, note, consent=_ALL))
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             promoted = self.returns.unconfirmed()
             waited = self.confirm_by is not None or bool(promoted)
             if waited:
-                self._present.end_limit()
+                self.present.end_limit()
                 self.returns.end(promoted)
                 self._change_records.confirmed(self.revision, promoted, who)
                 await self._store.settled()
@@ -387,7 +387,7 @@ class SpecificationManager:
         """Switch monitors; return those that changed. A monitor is not enabled if it is in shadow mode, or shares
         variables with such a monitor.
         """
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             self._all_known(request.names)
             seconds = request.for_seconds
             if seconds is not None and (request.enabled or not 0 < seconds <= LONGEST):
@@ -402,7 +402,7 @@ class SpecificationManager:
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
         """Return the monitors that changed. With `confirm_within`, they return to shadow mode unless confirmed."""
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             self.judge_shadow(request)
             names = await self._switch(
                 request.names, SHADOW if request.shadow else True, who, request.confirm_within
@@ -442,7 +442,7 @@ class SpecificationManager:
             raise SpecificationsRefusedError([text])
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        async with self._present.changing(None):
+        async with self.present.changing(None):
             for to in (True, SHADOW):
                 names = [name for name in self.switches.states if back.get(name) == to]
                 unconfirmed = [name for name in names if self.returns.confirm_by(name) is not None]
@@ -489,9 +489,9 @@ class SpecificationManager:
                 self.returns.begin(back, seconds, to)
 
         told = [(name, messages.MonitorSwitched(name, to is True)) for name in changed]
-        await self._present.bring(new, store, tell=None if shadow else told, due=due)
+        await self.present.bring(new, store, tell=None if shadow else told, due=due)
         for name in changed:
-            self._present.say_switched(name, to, who, earlier=switches.states[name])
+            self.present.say_switched(name, to, who, earlier=switches.states[name])
         if due:
             await self._store.settled()
         await self.rollout.carried_out()
@@ -502,7 +502,7 @@ class SpecificationManager:
 
         A relay that is not running is refused, because the next process will hold the topics again.
         """
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             self._all_known(request.names)
             rows = self.rollout.rows
             held = [
@@ -510,7 +510,7 @@ class SpecificationManager:
                 if name in self.rollout.held or (name in rows and rows[name].awaits)
             ]  # fmt: skip
             if held:
-                await self._present.bring(replace(self.now, acts=self.now.acts + 1), tell=())
+                await self.present.bring(replace(self.now, acts=self.now.acts + 1), tell=())
             away = []
             for name in held:
                 if not self.rollout.tell(name, messages.MonitorResumed(name)):
@@ -525,7 +525,7 @@ class SpecificationManager:
             return self._switched(held)
 
     async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
-        async with self._present.changing(request.expected):
+        async with self.present.changing(request.expected):
             name = request.name
             self._all_known([name])
             present = {one.name: one.value for one in self.givens.states(self.checked, name)}
@@ -534,9 +534,9 @@ class SpecificationManager:
             if changed:
                 coming = in_force.given(self.now, name, new)
                 values = coming.givens.in_force(coming.checked)[name]
-                await self._present.bring(coming, tell=[(name, messages.MonitorGiven(name, values))])
+                await self.present.bring(coming, tell=[(name, messages.MonitorGiven(name, values))])
                 self._change_records.given(
-                    name, self._present.given_states(name), {one: present[one] for one in changed}, who
+                    name, self.present.given_states(name), {one: present[one] for one in changed}, who
                 )
                 await self.rollout.carried_out()
             given = self.givens.states(self.checked, name)
@@ -544,7 +544,7 @@ class SpecificationManager:
 
     async def _change(self, wanted: Wanted, check: SourceCheck, order: ChangeOrder) -> Replacement:
         try:
-            return await self._present.change(wanted, check, order)
+            return await self.present.change(wanted, check, order)
         finally:
             self._published()
 

@@ -155,7 +155,7 @@ class Database:
     def _submit(self, change: Change, *, ahead: bool) -> None:
         self.tables.check(change)
         if self._gathered.changes is None:
-            self._keep([(change, ahead)])
+            self.keep([(change, ahead)])
         else:
             self._gathered.changes.append((change, ahead))
 
@@ -171,9 +171,9 @@ class Database:
         finally:
             self._gathered.changes = None
             if gathered:
-                self._keep(gathered)
+                self.keep(gathered)
 
-    def _keep(self, changes: list[tuple[Change, bool]]) -> None:
+    def keep(self, changes: list[tuple[Change, bool]]) -> None:
         encoded = [
             (change, ahead, self._encoder.encode(change) if ahead or self._feeds else b"")
             for change, ahead in joined(changes)

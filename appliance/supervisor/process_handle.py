@@ -39,9 +39,10 @@ class ProgramOutput:
         self._loop = loop
         self._rest = b""
         os.set_blocking(output.fileno(), False)
-        loop.add_reader(output.fileno(), self._read)
+        loop.add_reader(output.fileno(), self.read)
 
-    def _read(self) -> None:
+    def read(self) -> None:
+        """Log the lines that there are."""
         try:
             data = os.read(self._output.fileno(), 1 << 16)
         except BlockingIOError:

@@ -66,8 +66,8 @@ def idle_core(state: Path) -> Core:
     policies.policy = CurrentPolicy()
     policies.policy.set(compile_policy(EMPTY, file="policy"))
     specifications = idle(SpecificationManager)
-    specifications._present = idle(SpecificationsInForce)
-    specifications._present.now = InForce()
+    specifications.present = idle(SpecificationsInForce)
+    specifications.present.now = InForce()
     trail.audit, relay.taps = idle(AuditLog), idle(TapRequests)
     relay.ranks = RankStates(lambda _order: False)
     return Core(

@@ -6,8 +6,10 @@ from typing import Any, TypeVar, cast
 T = TypeVar("T")
 
 
-def idle(part: type[T]) -> T:
-    return cast(T, idle_class(part)())
+def idle(part: type[T], **attributes: Any) -> T:
+    made = idle_class(part)()
+    vars(made).update(attributes)
+    return cast(T, made)
 
 
 def idle_class(part: type[object]) -> Any:

@@ -33,6 +33,6 @@ def call_of(
     """Return the call of a verb whose requests `answer` answers. `names` gives a host in words."""
     call = Appliance(TyperCommand("verb"))
     call.params = {"as_json": as_json}
-    call._target = _Target(MemorySocket(answer), said=True, place=place)
+    call.target = _Target(MemorySocket(answer), said=True, place=place)
     call.host_in_words = names
     return call

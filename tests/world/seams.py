@@ -18,7 +18,7 @@ from appliance.base import clock
 from appliance.channel import child_process
 from appliance.control import process as control_process
 from appliance.control import supervisor_messages
-from appliance.control.assembly import assembly, foundation, listener_limits, open_audit
+from appliance.control.assembly import assembly, endpoints, foundation, listener_limits, open_audit
 from appliance.control.links import supervisor_link
 from appliance.features.standby import passive, replica, replication, takeover_check
 from appliance.features.standby import process as lease_process
@@ -27,7 +27,6 @@ from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.master import rosmaster
-from appliance.master.endpoints import node_ports
 from appliance.rpc.server import Handler, HttpRequest, Peer, Refusal
 from appliance.rpc.xmlrpc_client import XmlRpcClient
 from appliance.store import changes, writer_thread
@@ -152,7 +151,7 @@ def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]
         (log_database, "sqlite3", databases),
         (XmlRpcClient, "_exchange", exchange),
         (listener_limits, "HttpServer", partial(_Server, network)),
-        (node_ports, "listen", listen),
+        (endpoints, "listen", listen),
         (foundation, "listen", listen),
         (control_process, "AdminServer", _AdminServer),
         (passive, "AdminServer", _AdminServer),

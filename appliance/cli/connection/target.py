@@ -90,12 +90,12 @@ class Appliance(typer.Context):
     """
 
     @cached_property
-    def _target(self) -> _Target:
+    def target(self) -> _Target:
         return _CHOICE.value(self.params)
 
     @property
     def way(self) -> "AdminSocket | RestWay":
-        return self._target.way
+        return self.target.way
 
     def state_here(self, verb: str) -> Path:
         """Return the state directory of this machine's appliance; exit with status 2 for one that REST reaches."""
@@ -105,11 +105,11 @@ class Appliance(typer.Context):
 
     @property
     def said(self) -> bool:
-        return self._target.said
+        return self.target.said
 
     @property
     def place(self) -> str | None:
-        return self._target.place
+        return self.target.place
 
     @property
     def as_json(self) -> bool:

@@ -19,6 +19,7 @@ from appliance.master.reconcile.liveness import Liveness
 from appliance.master.reconcile.sinks import Enforcement, MasterSideApi, ProxyEndpoints, Sinks, StoredGraph
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations, RosMaster, limits_of_answers
+from appliance.rpc.server import listen
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.specifications_in_force import ALLOCATION
 from roswire.standard import standard_definitions
@@ -84,6 +85,7 @@ def _make_node_ports(settings: Settings, lifeline: ControlLifeline, core: Master
         drop=lifeline.drop,
         policy=core.policy,
         relays=settings.relays,
+        listen=listen,
     )
 
 

@@ -21,7 +21,7 @@ from appliance.policy.model import Address, plain_address
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import NODE_PORTS
-from appliance.rpc.server import Peer, listen
+from appliance.rpc.server import Peer
 
 _TIMES_THE_REST = 3
 
@@ -42,7 +42,7 @@ class NodePorts:
         drop: Callable[[str], None],
         policy: Callable[[], Policy],
         relays: int = 1,
-        listen: Callable[[str, int], sockets.socket] = listen,
+        listen: Callable[[str, int], sockets.socket],
     ) -> None:
         self._each = 1 + relays
         self._listen = listen

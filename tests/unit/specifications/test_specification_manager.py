@@ -80,7 +80,7 @@ async def test_a_kill_between_two_writes_disables_no_monitor_forever(
         await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
         desk.kill()
         with monkeypatch.context() as context:
-            context.setattr(desk.store.database, "_keep", first(writes, desk.store.database._keep))
+            context.setattr(desk.store.database, "keep", first(writes, desk.store.database.keep))
             await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
         monitors = await desk.monitors(restarted=True)
         assert monitors.switches.enabled("a") or monitors.returns.until("a") is not None, writes

@@ -65,14 +65,14 @@ def reopened(desk: Desk) -> StateStore:
 
 
 def at_the_next_change(desk: Desk, breaks: Callable[[Desk], None]) -> None:
-    keep = desk.store.database._keep
+    keep = desk.store.database.keep
 
     def breaking(changes: list[tuple[Change, bool]]) -> None:
-        del vars(desk.store.database)["_keep"]
+        del vars(desk.store.database)["keep"]
         breaks(desk)
         keep(changes)
 
-    vars(desk.store.database)["_keep"] = breaking
+    vars(desk.store.database)["keep"] = breaking
 
 
 def limits(monitors: SpecificationManager) -> list[int]:

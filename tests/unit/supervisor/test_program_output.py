@@ -13,7 +13,7 @@ async def test_each_line_is_a_line_of_the_log() -> None:
     reader, writer = os.pipe()
     with capture_logs() as logged, os.fdopen(reader, "rb", buffering=0) as output:
         program = ProgramOutput("rosout", output, asyncio.get_running_loop())
-        program._read()  # nothing yet
+        program.read()  # nothing yet
         for piece in (b"subscribed to ", b"/rosout\nbad \x1b[2J\n", b"x" * 2001 + b"\n", b"the end"):
             os.write(writer, piece)
             await asyncio.sleep(1)

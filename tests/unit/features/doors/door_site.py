@@ -93,7 +93,7 @@ class DoorSite:
 
     def define(self, **definitions: str) -> None:
         """Bring specifications with these definitions into force."""
-        self.core.specifications._present.now = InForce(sources=Sources(definitions=definitions))
+        self.core.specifications.present.now = InForce(sources=Sources(definitions=definitions))
         self.processes.define()
 
     def load_policy(self, revision: int) -> None:

@@ -9,9 +9,7 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
-    session = idle(DoorSession)
-    session._socket = ServerProtocol()
-    session.received = session.sent = session.refusals = 0
+    session = idle(DoorSession, _socket=ServerProtocol(), received=0, sent=0, refusals=0)
     machine = VirtualClock()
     clients = []
     with clock.using(machine):

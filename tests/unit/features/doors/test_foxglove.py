@@ -331,12 +331,12 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
 @pytest.mark.parametrize(
     ("frame", "words"),
     [
-        ("{", "refused"),
+        ("{", "rejected"),
         ("[]", "Expected `object`"),
-        ("[" * 100_000, "refused"),
+        ("[" * 100_000, "rejected"),
         ('{"op":"nonsense"}', "Invalid value 'nonsense'"),
         ('{"op":"subscribe","subscriptions":[{"id":-1,"channelId":1}]}', ">= 0"),
-        ('{"op":"subscribe","subscriptions":[{"id":1e99,"channelId":1}]}', "refused"),
+        ('{"op":"subscribe","subscriptions":[{"id":1e99,"channelId":1}]}', "rejected"),
         ('{"op":"subscribe","subscriptions":[{"id":4294967296,"channelId":1}]}', "<= 4294967295"),
         ('{"op":"subscribe","subscriptions":[{"id":1,"channelId":9}]}', "the channel 9 is not announced"),
         (
@@ -347,7 +347,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
             '{"op":"advertise","channels":[{"id":1,"topic":" /a","encoding":"ros1","schemaName":"a/B"}]}',
             "' /a'",
         ),
-        ('{"op":"subscribeParameterUpdates","parameterNames":["/a b "]}', "refused"),
+        ('{"op":"subscribeParameterUpdates","parameterNames":["/a b "]}', "rejected"),
         (b"", "begins with nothing"),
         (b"\x01\x01", "a binary frame of 2 bytes"),
         (b"\x07" + bytes(20), "begins with 07"),

@@ -43,16 +43,16 @@ class Guarded:
         part, given = part_with(preset, types or {}, values, before=before)
         monitors = on_its_module(part)
         monitors.give({"guard": given})
-        self._begin(monitors, named(preset).given_topics)
+        self.begin(monitors, named(preset).given_topics)
 
     @classmethod
     def by(cls, monitors: MonitorSet, topics: dict[str, str]) -> Self:
         """Return a base behind these monitors; `topics` are those of the guard."""
         guarded = cls.__new__(cls)
-        guarded._begin(monitors, topics)
+        guarded.begin(monitors, topics)
         return guarded
 
-    def _begin(self, monitors: MonitorSet, topics: dict[str, str]) -> None:
+    def begin(self, monitors: MonitorSet, topics: dict[str, str]) -> None:
         self.monitors, self.topics = monitors, topics
         self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
         self.got: list[tuple[int, Any]] = []

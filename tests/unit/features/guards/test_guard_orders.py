@@ -2,7 +2,6 @@ from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -218,7 +217,11 @@ async def test_a_plan_says_what_a_change_would_do(
     assert plan.shadow is not (request_.keys() > {"topics"} or "enforce" in request_)
     assert plan.acts.keys() == {"command", "by"}
     refusal = SpecificationsRefusedError(["fence would hold /cmd_vel"])
-    monkeypatch.setattr(monitors.judge, "judged", Mock(side_effect=refusal))
+
+    def refused(*_judged: object, **_named: object) -> None:
+        raise refusal
+
+    monkeypatch.setattr(monitors.judge, "judged", refused)
     plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
     assert plan.refused == ([] if not loads and "enforce" not in request_ else refusal.findings)
     assert monitors.tag == before

@@ -111,9 +111,9 @@ async def test_no_report_is_older_than_the_changes_before_it(
         changed.wait(_LIMIT_SECONDS)
         return []
 
-    async def start(tunnels: process.TunnelProcess, _wanted: TunnelsStated) -> ViciClient:
+    async def start(self: process.TunnelProcess, _wanted: TunnelsStated) -> ViciClient:
         vici = charon_that(listen=listen, seen=seen)
-        asyncio.get_running_loop().run_in_executor(None, tunnels._listen, vici)
+        asyncio.get_running_loop().run_in_executor(None, self._listen, vici)
         return vici
 
     def told(message: Any) -> None:
