@@ -1,9 +1,10 @@
 """Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
 
-It never stops at a failure, and ends with a table of the stages and the list of the failures. `--from STAGE`
+The stages stand in two lines that run side by side, because stages with real parts wait most of their time. It never
+stops at a failure, and ends with a table of the stages and the list of the failures. `--from STAGE`
 (`make nightly FROM=nodes`) resumes: the results of the same commit stand for the stages before it.
 `build/nightly/results.json` has passes, failures and seconds of each test, and the commit, start, end and load average
-of each run. Runs of the same commit add up. Network namespaces that are left after a stage, and a robot's start
+of each run. Runs of the same commit add up. Network namespaces that are left after all stages, and a robot's start
 (`benchmarks/launch.py`) or a delay of a lone message (`benchmarks/cold.py`) that differs by more than 20 % from the
 table in `benchmarks/RESULTS.md`, are printed as findings. The exit status is 1 if a test failed that
 `tests/unsteady.txt` does not list, or if one of these programs failed.
@@ -19,9 +20,11 @@ import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 import xml.etree.ElementTree
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +39,7 @@ MEASUREMENTS = {
     "lone message": _LONE,
     "lone message, busy": (*_LONE, "--busy"),
 }
+_RESULTS_LOCK = threading.Lock()
 UNSTEADY = ROOT / "tests" / "unsteady.txt"
 _STAGE_SECONDS = 90 * 60.0  # a stage that hangs ends, and counts as failed
 _END_SECONDS = 60.0  # for an interrupted stage to write its report
@@ -61,13 +65,15 @@ LANES = {
 class Stage:
     """Tests that run side by side on `workers` of pytest-xdist, or one after the other.
 
-    The tests of a file share a worker, and what the file makes for all of them, unless `spread`.
+    The tests of a file share a worker, and what the file makes for all of them, unless `spread`. A stage that
+    `computes` leaves the processors to the other line.
     """
 
     name: str
     folders: tuple[str, ...]
     workers: str = ""
     spread: bool = False
+    computes: bool = False
 
     def options(self) -> list[str]:
         distribution = ("load",) if self.spread else ("loadfile", "--no-loadscope-reorder")
@@ -76,27 +82,38 @@ class Stage:
 
 # A worker has no network but a loopback of its own, so tests that fetch packages run without workers, as do those that
 # start many processes themselves.
-STAGES = (
-    Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical"),
-    Stage(  # files that each compute for a quarter of an hour or more
-        "worlds", ("tests/world", "tests/integration/test_entrance_mutants.py"), "logical", spread=True
-    ),
-    Stage("nodes", ("tests/integration",), "auto"),
-    Stage(
-        "machine",
-        (
-            "tests/integration/examples/test_ros2.py",
-            "tests/system/vm",
-            "tests/system/console/test_sign_on.py",
-            "tests/system/test_examples.py",
-            "tests/system/test_generated_client.py",
-            "tests/system/test_recordings_cluster.py",
+LINES = (
+    (
+        Stage(
+            "machine",
+            (
+                "tests/integration/examples/test_ros2.py",
+                "tests/system/features/doors/test_roslib.py",
+                "tests/system/network/test_adopt_nodes.py",
+                "tests/system/vm",
+                "tests/system/console/test_sign_on.py",
+                "tests/system/test_examples.py",
+                "tests/system/test_generated_client.py",
+                "tests/system/test_recordings_cluster.py",
+            ),
+        ),
+        Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical", computes=True),
+        Stage(  # files that each compute for a quarter of an hour or more
+            "worlds",
+            ("tests/world", "tests/integration/test_entrance_mutants.py"),
+            "logical",
+            spread=True,
+            computes=True,
         ),
     ),
-    Stage("containers", ("tests/smoke", "tests/system/containers")),
-    Stage("namespaces", ("tests/system",), "auto"),
-    Stage("packages", ("tests/package",)),
+    (
+        Stage("nodes", ("tests/integration",), "auto"),
+        Stage("containers", ("tests/smoke", "tests/system/containers")),
+        Stage("namespaces", ("tests/system",), "auto"),
+        Stage("packages", ("tests/package",)),
+    ),
 )
+STAGES = tuple(stage for line in LINES for stage in line)
 
 
 STEPS = (*(stage.name for stage in STAGES), *MEASUREMENTS)
@@ -169,7 +186,9 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     report.unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
     command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    status = run_limited(command, FOLDER / f"{stage.name}.log", _STAGE_SECONDS, {"TESTS_EXAMPLES": "all"})
+    environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # the other line computes meanwhile
+    log = FOLDER / f"{stage.name}.log"
+    status = run_limited(command, log, _STAGE_SECONDS, environment, low=stage.computes)
     wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"
     wrong = _late() if status is None else wrong
     return (list(outcomes_of(report)) if report.exists() else []), wrong
@@ -179,10 +198,20 @@ def _late() -> str:
     return f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
 
 
+_RUNNING: set[int] = set()  # leaders of process groups
+
+
 def run_limited(
-    command: Sequence[str], output: Path, seconds: float, environment: Mapping[str, str] | None = None
+    command: Sequence[str],
+    output: Path,
+    seconds: float,
+    environment: Mapping[str, str] | None = None,
+    *,
+    low: bool = False,
 ) -> int | None:
     """Run a program and return its status, or None if it was interrupted after `seconds`.
+
+    A `low` one has what other programs leave of the processors.
 
     An interrupted pytest reports the tests that have ended. A minute later all processes of the program are killed, so
     that none disturbs the next stage.
@@ -198,6 +227,12 @@ def run_limited(
             start_new_session=True,
         ) as program,
     ):
+        _RUNNING.add(program.pid)
+        if low:
+            os.setpriority(os.PRIO_PROCESS, program.pid, 10)
+            # Where the kernel groups processes by session, only the group's own value counts against other sessions.
+            with contextlib.suppress(FileNotFoundError):
+                Path(f"/proc/{program.pid}/autogroup").write_text("10")
         try:
             return program.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -206,6 +241,7 @@ def run_limited(
                 program.wait(_END_SECONDS)
             return None
         finally:
+            _RUNNING.discard(program.pid)
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(program.pid, signal.SIGKILL)
 
@@ -239,13 +275,46 @@ def main() -> int:
     lane, first = arguments.lane, arguments.first
     open_folders_above(ROOT)
     for end in (signal.SIGINT, signal.SIGTERM):  # a script's background process ignores SIGINT
-        signal.signal(end, lambda number, _frame: sys.exit(128 + number))
+        signal.signal(end, _end)
     FOLDER.mkdir(parents=True, exist_ok=True)
     results, steps = _earlier(_commit()), steps_of(lane)
-    for step in steps:
-        if STEPS.index(step) >= STEPS.index(first):
+    waiting = [step for step in steps if not is_before(step, first)]
+    namespaces = _namespaces()
+    with ThreadPoolExecutor(len(LINES)) as lines:
+        runs = [lines.submit(run_line, line, waiting, lane, results) for line in LINES]
+    for run in runs:
+        run.result()
+    left = sorted(_namespaces() - namespaces)
+    results["findings"] += [f"finding: new network namespaces: {', '.join(left)}"] if left else []
+    for step in waiting:
+        if step in MEASUREMENTS:
             run_step(step, lane, results)
     return _report(rows_of(results["runs"], lane, steps), results["findings"])
+
+
+def _end(number: int, _frame: object) -> None:
+    """End the programs of both lines, then this one: a line that waits for its program would not end."""
+    for leader in _RUNNING.copy():
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(leader, signal.SIGKILL)
+    os._exit(128 + number)
+
+
+def is_before(step: str, first: str) -> bool:
+    """Return whether a run that resumes with `first` has a step behind it: an earlier one of the same line.
+
+    A measurement comes after both lines.
+    """
+    if first in MEASUREMENTS:
+        return STEPS.index(step) < STEPS.index(first)
+    [line] = ([stage.name for stage in line] for line in LINES if first in {stage.name for stage in line})
+    return step in line[: line.index(first)]
+
+
+def run_line(line: Sequence[Stage], waiting: Sequence[str], lane: str, results: dict[str, Any]) -> None:
+    for stage in line:
+        if stage.name in waiting:
+            run_step(stage.name, lane, results)
 
 
 def files_of(stage: str, lane: str) -> list[str]:
@@ -259,17 +328,14 @@ def steps_of(lane: str) -> list[str]:
 
 
 def run_step(name: str, lane: str, results: dict[str, Any]) -> None:
-    began, clock, load, namespaces = _moment(), time.monotonic(), os.getloadavg()[0], _namespaces()
+    began, clock, load = _moment(), time.monotonic(), os.getloadavg()[0]
+    findings: list[str] = []
     outcomes: list[tuple[str, str, float]] = []
     if name in MEASUREMENTS:
         findings, wrong = measure(name)
     else:
         [stage] = (stage for stage in STAGES if stage.name == name)
         outcomes, wrong = run_stage(stage, files_of(name, lane))
-        left = sorted(_namespaces() - namespaces)
-        findings = [f"finding: new network namespaces after {name}: {', '.join(left)}"] if left else []
-    _add(results["tests"], outcomes)
-    results["findings"] += findings
     failed = [test for test, outcome, _seconds in outcomes if outcome == "failed"]
     run = {
         "stage": name,
@@ -283,8 +349,11 @@ def run_step(name: str, lane: str, results: dict[str, Any]) -> None:
         "skipped": sum(1 for _, outcome, _ in outcomes if outcome == "skipped"),
         "failed": failed + ([f"{name}: {wrong} ({_log_of(name).relative_to(ROOT)})"] if wrong else []),
     }
-    results["runs"].append(run)
-    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    with _RESULTS_LOCK:
+        _add(results["tests"], outcomes)
+        results["findings"] += findings
+        results["runs"].append(run)
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print("\n".join([*findings, row_of(run)]), flush=True)
 
 
@@ -309,12 +378,23 @@ def row_of(run: dict[str, Any]) -> str:
 def _report(runs: Sequence[dict[str, Any]], findings: Sequence[str]) -> int:
     known = unsteady()
     failed = [name for run in runs for name in run.get("failed", ())]
-    total = sum(run.get("minutes", 0) for run in runs)
+    total = minutes_of(runs)
     print("\n".join(["", *map(row_of, runs), f"{'all':<20}{total:>6.1f} min", *findings]))
     for name in failed:
         print(f"FAILED {name}" + (" (known to fail by chance)" if name in known else ""))
     print(f"results: {RESULTS.relative_to(ROOT)}")
     return int(any(name not in known for name in failed))
+
+
+def minutes_of(runs: Sequence[dict[str, Any]]) -> float:
+    """Return the minutes in which at least one of the runs went on."""
+    moments = ((run["began"], run["ended"]) for run in runs if "began" in run)
+    spans = sorted(tuple(datetime.datetime.fromisoformat(text) for text in pair) for pair in moments)
+    total, last = datetime.timedelta(), datetime.datetime.min.replace(tzinfo=datetime.UTC)
+    for began, ended in spans:
+        total += max(ended - max(began, last), datetime.timedelta())
+        last = max(last, ended)
+    return total.total_seconds() / 60
 
 
 def _add(tests: dict[str, Any], outcomes: list[tuple[str, str, float]]) -> None:

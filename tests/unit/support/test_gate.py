@@ -1,3 +1,4 @@
+import itertools
 import re
 import socket
 import subprocess
@@ -12,13 +13,16 @@ from benchmarks.cold import LONE
 from benchmarks.launch import RESULTS, findings, table_ratios
 from tests.nightly import (
     LANES,
+    LINES,
     MEASUREMENTS,
     STAGES,
     STEPS,
     UNSTEADY,
     files_of_stages,
     findings_of,
+    is_before,
     lane_of,
+    minutes_of,
     outcomes_of,
     row_of,
     rows_of,
@@ -28,6 +32,7 @@ from tests.nightly import (
 )
 from tests.steady import largest_chance
 from tests.support.determinism import WATCH, ChanceError
+from tests.support.sources import ROOT
 from tests.support.waiting import eventually
 
 REPORT = """<testsuites><testsuite>
@@ -73,6 +78,60 @@ def test_a_lane_has_the_stages_of_its_tests() -> None:
     assert steps_of("console") == ["machine", "namespaces"]
     assert MEASUREMENTS.keys().isdisjoint(steps_of("standby"))
     assert MEASUREMENTS.keys() <= {*steps_of("core")}
+
+
+# A worker has no network, as tests/conftest.py says.
+FETCHES = re.compile(r'npm, "ci"|"pip", "(sync|install)"')
+
+
+def test_files_that_fetch_packages_run_where_there_is_a_network() -> None:
+    stages = files_of_stages()
+    fetching = {
+        file: stage.name
+        for stage in STAGES
+        for file in stages[stage.name]
+        if file != "tests/unit/support/test_gate.py" and FETCHES.search((ROOT / file).read_text())
+    }
+    assert len(fetching) > 1
+    assert [
+        file for file, name in fetching.items() if name not in {"machine", "containers", "packages"}
+    ] == []
+    assert all(not stage.workers for stage in STAGES if stage.name in fetching.values())
+
+
+def test_what_computes_leaves_the_processors_to_what_waits() -> None:
+    """A computing stage beside another one would take a processor from real parts that keep time."""
+    for beside in itertools.combinations(LINES, 2):
+        assert any(stage.computes for stage in itertools.chain(*beside))
+    [line] = (line for line in LINES if any(stage.computes for stage in line))
+    assert [stage.computes for stage in line] == sorted(stage.computes for stage in line)
+
+
+def test_a_night_resumes_in_the_line_of_its_stage() -> None:
+    assert [step for step in STEPS if is_before(step, "containers")] == ["nodes"]
+    assert [step for step in STEPS if is_before(step, "computing")] == ["machine"]
+    assert [step for step in STEPS if is_before(step, "start")] == [stage.name for stage in STAGES]
+
+
+def test_minutes_of_stages_side_by_side_count_once() -> None:
+    day = "2026-01-01T"
+    runs = [
+        {"began": f"{day}01:00:00+00:00", "ended": f"{day}01:30:00+00:00"},
+        {"began": f"{day}01:10:00+00:00", "ended": f"{day}01:20:00+00:00"},
+        {"began": f"{day}01:20:00+00:00", "ended": f"{day}01:45:00+00:00"},
+        {"began": f"{day}09:00:00+00:00", "ended": f"{day}09:05:00+00:00"},
+        {"stage": "machine"},
+    ]
+    assert minutes_of(runs) == 50
+
+
+@pytest.mark.nightly
+def test_a_low_program_yields_the_processors(tmp_path: Path) -> None:
+    command = ["sh", "-c", "sleep 0.5; nice; cat /proc/self/autogroup 2>/dev/null || echo nice 10"]
+    assert run_limited(command, tmp_path / "log", 60.0, low=True) == 0
+    value, group = (tmp_path / "log").read_text().splitlines()
+    assert value == "10"
+    assert group.endswith("nice 10")
 
 
 def test_a_resumed_night_has_the_newest_run_of_each_stage_of_its_lane() -> None:
