@@ -1,6 +1,6 @@
 """Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
 
-The stages stand in two lines that run side by side, because stages with real parts wait most of their time. It never
+The stages are in two lines that run side by side, because stages with real parts wait most of their time. It never
 stops at a failure, and ends with a table of the stages and the list of the failures. `--from STAGE`
 (`make nightly FROM=nodes`) resumes: the results of the same commit stand for the stages before it.
 `build/nightly/results.json` has passes, failures and seconds of each test, and the commit, start, end and load average
@@ -186,7 +186,7 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     report.unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
     command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # the other line computes meanwhile
+    environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # while the other line computes
     log = FOLDER / f"{stage.name}.log"
     status = run_limited(command, log, _STAGE_SECONDS, environment, low=stage.computes)
     wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"

@@ -99,7 +99,7 @@ def test_files_that_fetch_packages_run_where_there_is_a_network() -> None:
     assert all(not stage.workers for stage in STAGES if stage.name in fetching.values())
 
 
-def test_what_computes_leaves_the_processors_to_what_waits() -> None:
+def test_a_computing_stage_leaves_the_processors_to_others() -> None:
     """A computing stage beside another one would take a processor from real parts that keep time."""
     for beside in itertools.combinations(LINES, 2):
         assert any(stage.computes for stage in itertools.chain(*beside))
