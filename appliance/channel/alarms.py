@@ -22,7 +22,7 @@ _ORDER = ("alarm", "warning", "notice")
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """A condition that holds now. `kind` is a stable name; the alarm ends together with the condition."""
 
-    kind: Annotated[str, doc("archive that the package comes from")]
+    kind: Annotated[str, doc("stable name of the condition")]
     severity: Annotated[Severity, doc("`notice` for a silenced alarm")]
     text: Annotated[str, doc("the problem and what to do, for a person")]
     about: Annotated[About, doc("what it belongs to")]

@@ -142,7 +142,7 @@ class GivenSet(msgspec.Struct, frozen=True):
     """Everything that is given to a monitor, after a change; `changed` names what the change set."""
 
     name: Name
-    changed: Annotated[list[str], doc("files whose text changed")]
+    changed: Annotated[list[str], doc("constants and topics that the change set")]
     given: Annotated[list[GivenState], doc("constants and topics that are given to it")]
     revision: RevisionNumber
     tag: Tag

@@ -127,7 +127,7 @@ class EventMarks(msgspec.Struct, frozen=True):
     Events that a record only counts are spread evenly over the time between the first and the last.
     """
 
-    kind: Annotated[EventKind, doc("archive that the package comes from")]
+    kind: Annotated[EventKind, doc("kind of the event")]
     counts: Annotated[list[int], doc("events in each column, in their order")]
 
 
@@ -135,10 +135,10 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
     """An event from an audit record of the recorded time; `notice` is a notable event of no other kind."""
 
     time: NanoMoment
-    kind: Annotated[EventKind, doc("archive that the package comes from")]
+    kind: Annotated[EventKind, doc("kind of the event")]
     record: Annotated[str, doc("id of the audit record")]
     event: Annotated[str, doc("its stable name")]
-    severity: Annotated[str, doc("error or warning")]
+    severity: Annotated[str, doc("severity of the audit record")]
     decision: Annotated[str | None, doc("allow, deny or would deny, or null if nothing was decided")]
     host: Annotated[str | None, doc("the host that the record is about")]
     caller_id: Annotated[str | None, doc("the name the node gave: a claim")]
