@@ -158,7 +158,7 @@ def _make_relay(
     return RelayControl(
         core.registry,
         core.grants,
-        lambda port: places.socket(port).fileno(),
+        places.descriptor,
         nodes,
         core.carried,
         allocation=Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text)),

@@ -114,6 +114,9 @@ class NodePorts:
     def socket(self, port: int) -> sockets.socket:
         return self._sockets[f"port:{port}"]
 
+    def descriptor(self, port: int) -> int:
+        return self.socket(port).fileno()
+
     def adopt(self, name: str, sock: sockets.socket) -> None:
         self._sockets[name] = sock
         port = sock.getsockname()[1]
