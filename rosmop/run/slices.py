@@ -48,7 +48,7 @@ GROWING_LIMIT = 1_000
 """The most slices if a run needs more than an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
 
 TOGETHER_LIMIT = 250
-"""The most slices if an event or a tick may concern all of them: each takes 2 µs, or 20 µs with a verdict."""
+"""The most slices if an event or a tick may concern all of them: each takes 2 µs, or 12 µs with a verdict."""
 
 MAX_BINDING = 256
 """The most bytes of all strings of a binding together."""

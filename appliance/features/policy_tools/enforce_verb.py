@@ -200,4 +200,7 @@ def _load(
         return
     say(f"enforces {names}")
     say_loaded(body)
-    say(f"{known.policy_file} still says audit-only: change it before the next reload", "yellow")
+    if written is None:
+        say(f"{known.policy_file} still says audit-only: change it before the next reload", "yellow")
+    else:
+        say(f"before the next reload, {known.policy_file} must have the text of {written}", "yellow")
