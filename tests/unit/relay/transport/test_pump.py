@@ -59,6 +59,11 @@ class Pumped:
     def wait(self, longest: float = 0.0) -> list[tuple[int, int]]:
         return self.pump.wait(longest, _ROOM, True)
 
+    def pass_all(self) -> None:
+        """Perform a step that leaves nothing; on a busy machine it may take long, and then `wait` returns it, too."""
+        if self.wait():
+            assert self.connection.step() is None
+
     def left(self) -> Left | None:
         found = self.wait(10)
         assert found == [(self.ours.fileno(), READ)]
@@ -87,7 +92,7 @@ def pumped() -> Iterator[Pumped]:
 def test_whole_frames_pass_without_python(pumped: Pumped) -> None:
     data = frame(b"one") + frame(b"") + frame(b"three")
     pumped.publisher.send(data)
-    assert pumped.wait() == []
+    pumped.pass_all()
     assert pumped.received() == data
     messages, size, counts, seconds = pumped.topic.counters.take()
     assert (messages, size, sum(counts)) == (3, len(data), 3)
@@ -175,7 +180,7 @@ def test_a_large_batch_passes_only_while_its_rest_could_be_kept(pumped: Pumped) 
     pumped.pairs[1][0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     data = frame(bytes(4092)) * 40
     assert pumped.publisher.send(data) == len(data) > LARGE
-    assert pumped.wait() == []
+    pumped.pass_all()
     assert pumped.received() == data
     pumped.topic.keeps_large = False
     pumped.publisher.send(data)
@@ -273,7 +278,8 @@ def test_a_flood_does_not_delay_a_timer(pumped: Pumped) -> None:
     connection.arm(ours.fileno(), pumped.topic, [], None, b"")
     pumped.epoll.register(ours.fileno(), READ)
     pump.put(ours.fileno(), connection)
-    assert pump.wait(0.0, _ROOM, True) == []
+    if pump.wait(0.0, _ROOM, True):  # the step took long
+        assert connection.step() is None
     assert pumped.topic.counters.messages == 1000
     endless.close()
     ours.close()
@@ -288,7 +294,7 @@ def test_a_connection_in_a_crowd_is_pumped_if_it_is_ready_alone(pumped: Pumped) 
     pumped.epoll.register(crowd.fileno(), READ)
     pumped.pump.crowd(crowd.fileno())
     pumped.publisher.send(frame(b"x"))
-    assert pumped.wait() == []
+    pumped.pass_all()
     assert pumped.received() == frame(b"x")
     pumped.topic.plain.change()
     pumped.publisher.send(frame(b"x"))
