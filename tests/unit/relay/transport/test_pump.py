@@ -60,7 +60,7 @@ class Pumped:
         return self.pump.wait(longest, _ROOM, True)
 
     def pass_all(self) -> None:
-        """Perform a step that leaves nothing; on a busy machine it may take long, and then `wait` returns it, too."""
+        """Perform a step that leaves nothing. On a busy machine the step can be slow; `wait` then also returns it."""
         if self.wait():
             assert self.connection.step() is None
 
