@@ -23,7 +23,7 @@ RECORDER_MEMORY = QuotaRow(
 RECORDER_DISK = QuotaRow(
     thing="bytes of recordings",
     bounds=Bounds(whole=2 << 30, host=512 << 20, unknown=512 << 20, kept=512 << 20),
-    at_limit="the host's oldest recording of its most frequent kind of trigger is removed; a host starts at most six"
+    at_limit="the host's oldest recording of the kind of trigger with most bytes is removed; a host starts at most six"
     " recordings an hour for each kind of trigger",
     between="no host displaces recordings of the robot, which gets half of the whole back; two hosts besides the"
     " robot are recorded at once",
