@@ -18,6 +18,12 @@ from roswire.uris import service_uri
 from roswire.xmlrpc import Value
 
 ANY_TYPE = "*"
+
+CLOCK = "/clock"
+"""Simulated time. Its subscribers get no new list until their connections have ended: rospy keeps a connection that its
+list lacks, and would hear each time twice. Time would go back, at which `rospy.sleep` raises an exception.
+"""
+
 _REGISTER = {
     PUBLICATION: "registerPublisher",
     SUBSCRIPTION: "registerSubscriber",
@@ -97,16 +103,24 @@ class AdoptedGraph:
         self.denied.pop(entry, None)
         await self.order(place.host, _UNREGISTER[kind], name, resource, detail)
 
-    def tell(self, names: Iterable[str], besides: Mapping[str, Iterable[str]] = MappingProxyType({})) -> None:
+    def tell(
+        self,
+        names: Iterable[str],
+        besides: Mapping[str, Iterable[str]] = MappingProxyType({}),
+        *,
+        clock_too: bool = False,
+    ) -> None:
         """Send the subscribers of adopted nodes their lists, with the URIs of the appliance.
 
-        `besides` has more URIs for topics.
+        `besides` has more URIs for topics. Those of `CLOCK` are left out unless `clock_too`.
         """
         for name in names:
             node = self.registry.holder(name)
             if node is None:
                 continue
             for topic in node.resources(Kind.SUBSCRIPTION):
+                if topic == CLOCK and not clock_too:
+                    continue
                 if topic in besides:
                     self.subscribers.remind_besides(node, topic, besides[topic])
                 else:
@@ -117,8 +131,8 @@ class AdoptedGraph:
         return self.subscribers.publishers_for(node, topic)
 
     async def absent(self) -> int:
-        """Return the number of subscriptions that are not yet connected through the appliance."""
-        return sum(1 for _absent in self.subscribers.absent(self.nodes()))
+        """Return the number of subscriptions that are not yet connected through the appliance, without `CLOCK`."""
+        return sum(1 for _node, topic, _absent in self.subscribers.absent(self.nodes()) if topic != CLOCK)
 
     def nodes(self) -> list[Incarnation]:
         """Return the nodes of the robot, also those that the policy or a failure suspended."""

@@ -6,7 +6,7 @@ later. So at a change of masters a node first gets a list with both, and only af
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 
 from appliance.base import clock
 from appliance.features.adopt.places import NodeCaller
@@ -67,12 +67,6 @@ async def until_least(number: Callable[[], Awaitable[int]]) -> None:
         if now < least:
             least, still = now, clock.now() + _STILL_SECONDS
         await asyncio.sleep(_PAUSE_SECONDS)
-
-
-def rows_of(lists: Mapping[str, list[str]], rows: Iterable[Subscription]) -> dict[Subscription, set[str]]:
-    """Return the URIs to which each subscription shall connect; a node connects to itself without a socket."""
-    wanted = {(node, topic): {*lists.get(topic, [])} - {node.api_text} for node, topic in rows}
-    return {row: uris for row, uris in wanted.items() if uris}
 
 
 async def until_connected(

@@ -40,7 +40,7 @@ from appliance.base.actors import OPERATOR
 from appliance.base.counted import counted
 from appliance.features.adopt.adopt_answers import GiveBackReport, TakeOverReport
 from appliance.features.adopt.adopt_record import Phase
-from appliance.features.adopt.graph_side import AdoptedGraph, service_text
+from appliance.features.adopt.graph_side import CLOCK, AdoptedGraph, service_text
 from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts
 from appliance.features.adopt.places import (
     NodeCaller,
@@ -54,7 +54,6 @@ from appliance.features.adopt.places import (
 from appliance.features.adopt.subscriber_lists import (
     Subscription,
     lists_of,
-    rows_of,
     send_lists,
     until_connected,
     until_least,
@@ -126,6 +125,11 @@ class LastWord:
 
     def of_nodes_that_answer(self) -> dict[Subscription, list[str]]:
         return {row: uris for row, uris in self.lists.items() if row[0].name not in self.failed}
+
+    def wanted(self, rows: Iterable[Subscription]) -> dict[Subscription, set[str]]:
+        """Return the URIs to which each of these shall connect; a node connects to itself without a socket."""
+        wanted = {row: {*self.lists[row]} - {row[0].api_text} for row in rows}
+        return {row: uris for row, uris in wanted.items() if uris}
 
 
 @dataclass
@@ -244,7 +248,7 @@ class AdoptOperation:
             await self._tell(places)
             await self.passed("tell")
             cut += sum(msgspec.convert(await self.machine("cut", **cuts), dict[str, int]).values())
-            await self._tell(places)
+            await self._tell(places, clock_too=True)
             await self.passed("cut")
             readings += 1
             if not reads:
@@ -319,8 +323,8 @@ class AdoptOperation:
             if entry not in graph.entries and place is not None:
                 await self.graph.unregister(entry, place, before)
 
-    async def _tell(self, places: Places) -> None:
-        self.graph.tell(places.found)
+    async def _tell(self, places: Places, *, clock_too: bool = False) -> None:
+        self.graph.tell(places.found, clock_too=clock_too)
         await self._until_told()
 
     async def _until_told(self) -> None:
@@ -353,7 +357,7 @@ class AdoptOperation:
         await self._connect(graph, late)
         await self._tell(late)
         await self.machine("cut", **cuts)
-        await self._tell(late)
+        await self._tell(late, clock_too=True)
         await self.passed("missing nodes")
 
     async def _connect(self, graph: MasterGraph, places: Places) -> None:
@@ -522,6 +526,7 @@ class AdoptOperation:
         await self.passed("given")
         await self.machine("leave")
         await send_lists(self.call, _BESIDES_SECONDS, last.of_nodes_that_answer())
+        await self._remind(last, [row for row in last.of_nodes_that_answer() if row[1] == CLOCK])
         self.graph.forget()
         self.graph.denied.clear()
         self.left = LeftThere()
@@ -639,32 +644,37 @@ class AdoptOperation:
         """Send each subscriber its list in this graph.
 
         Before, it gets the list of the appliance, which removes dead connections, then both lists in one, and keeps its
-        connections until the new ones stand. A node that does not connect gets its list again: roscpp gives a publisher
-        up after one failed call. A host that does not answer delays only its own nodes, and the whole by less than 9
-        seconds.
+        connections until the new ones stand. Subscribers of `CLOCK` get theirs when the earlier connections have ended.
+        A node that does not connect gets its list again: roscpp gives a publisher up after one failed call. A host that
+        does not answer delays only its own nodes, and the whole by less than 9 seconds.
         """
         lists = lists_of(graph)
-        rows = [
+        subscriptions = [
             (node, topic)
             for node, entries in nodes
             for kind, topic, _name in sorted(entries)
             if kind == SUBSCRIPTION
         ]
-        last = LastWord({(node, topic): lists.get(topic, []) for node, topic in rows})
+        last = LastWord({(node, topic): lists.get(topic, []) for node, topic in subscriptions})
+        rows = [row for row in subscriptions if row[1] != CLOCK]
         present = {
             (node, topic): [*self.graph.given(node, topic)] if self.forwards else [] for node, topic in rows
         }
         both = {row: [*dict.fromkeys((*last.lists[row], *present[row]))] for row in rows}
         await send_lists(self.call, _BESIDES_SECONDS, present, both)
-        await until_connected(self.call, rows_of(lists, rows))
-        until = clock.now() + LAST_WORD_SECONDS
-        last.failed = await send_lists(self.call, _LISTS_SECONDS, last.lists)
-        for _ in range(_REMINDERS):
-            missing = await until_connected(self.call, rows_of(lists, rows))
-            if not missing or clock.now() >= until:
-                break
-            await send_lists(self.call, _BESIDES_SECONDS, {row: last.lists[row] for row in missing})
+        await until_connected(self.call, last.wanted(rows))
+        last.failed = await send_lists(self.call, _LISTS_SECONDS, {row: last.lists[row] for row in rows})
+        await self._remind(last, rows)
         return last
+
+    async def _remind(self, last: LastWord, rows: Iterable[Subscription]) -> None:
+        """Send the last lists of these again to nodes that do not connect."""
+        until = clock.now() + LAST_WORD_SECONDS
+        for _ in range(_REMINDERS):
+            missing = await until_connected(self.call, last.wanted(rows))
+            if not missing or clock.now() >= until:
+                return
+            await send_lists(self.call, _BESIDES_SECONDS, {row: last.lists[row] for row in missing})
 
 
 def _graph_of(nodes: list[HeldNode]) -> MasterGraph:

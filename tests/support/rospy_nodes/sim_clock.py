@@ -1,4 +1,4 @@
-"""Publish `/clock` a hundred times a second, and stop and go on by `pause` and `go` on standard input.
+"""Publish `/clock` a thousand times a second, as Gazebo does, and stop and go on by `pause` and `go` on standard input.
 
 The event `paused` has the ROS time at which the clock stands.
 """
@@ -10,7 +10,7 @@ import rospy
 from report import init_node, report
 from rosgraph_msgs.msg import Clock
 
-STEP_SECONDS = 0.01
+STEP_SECONDS = 0.001
 
 
 def main():

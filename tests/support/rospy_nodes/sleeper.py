@@ -1,11 +1,24 @@
-"""Sleep 0.1 s of ROS time again and again: the event `slept` has the ROS time after it, in seconds."""
+"""Sleep 0.1 s of ROS time again and again: the event `slept` has the ROS time after it, in seconds.
+
+The event `back` has the seconds by which time went back; `rospy.sleep` may raise an exception then, and ends the node.
+"""
 
 import rospy
 from report import init_node, report
+from rosgraph_msgs.msg import Clock
 
 
 def main():
     init_node("sleeper")
+    latest = [0.0]
+
+    def hear(message):
+        now = message.clock.to_sec()
+        if now < latest[0]:
+            report("back", seconds=latest[0] - now)
+        latest[0] = now
+
+    rospy.Subscriber("/clock", Clock, hear)
     report("ready", name=rospy.get_name())
     while not rospy.is_shutdown():
         try:

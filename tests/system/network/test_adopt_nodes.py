@@ -306,6 +306,7 @@ def test_simulated_time_goes_on_over_each_change_and_may_stand_during_it(
         def sleep() -> None:
             for sleeper in sleepers.values():
                 sleeper.wait_for_count(5, since=sleeper.mark(), event="slept")
+            assert not sleepers["rospy"].seen(event="back"), "time never goes back"
 
         sleep()
         rosrv(robot, appliance, "adopt")

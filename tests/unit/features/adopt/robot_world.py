@@ -55,12 +55,16 @@ class RobotNode:
     hangs: bool = False
     held: list[tuple[str, list[str]]] = field(default_factory=list)
     """The lists that wait for a node that hangs: its kernel has taken them."""
+    keeps: bool = False
+    """As in rospy, a list ends no connection."""
     slow: bool = False
     """It is still connecting when the next list comes."""
     links: dict[str, dict[str, bool]] = field(default_factory=dict)
     """By topic and publisher, whether the connection stands."""
     begun: list[tuple[str, str]] = field(default_factory=list)
     """The connections that it makes later."""
+    most: dict[str, int] = field(default_factory=dict)
+    """By topic, the most connections that stood together."""
 
     @property
     def connected(self) -> dict[str, list[str]]:
@@ -71,7 +75,7 @@ class RobotNode:
     def take_list(self, topic: str, uris: list[str]) -> None:
         """Connect as roscpp does: it neither drops a connection that it is making, nor repeats one that has ended."""
         links = self.links.setdefault(topic, {})
-        for uri in links.keys() - {*uris}:
+        for uri in [uri for uri in links if not links[uri]] if self.keeps else links.keys() - {*uris}:
             del links[uri]
         added = [
             uri for uri in uris if uri not in links and uri != self.uri and (topic, uri) not in self.begun
@@ -86,6 +90,7 @@ class RobotNode:
             if reaches(uri):
                 self.links.setdefault(topic, {})[uri] = True
         self.begun.clear()
+        self.most = {topic: max(len(uris), self.most.get(topic, 0)) for topic, uris in self.connected.items()}
 
     def entries(self) -> set[Entry]:
         return {

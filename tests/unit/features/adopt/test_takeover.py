@@ -460,6 +460,43 @@ def test_a_node_keeps_its_connections_until_the_new_ones_stand() -> None:
     run(story)
 
 
+def test_no_node_hears_simulated_time_on_two_connections() -> None:
+    """Time would go back then, which ends a rospy node that sleeps."""
+
+    async def story(world: RobotWorld) -> None:
+        topics = ("/clock", "/odom")
+        world.add("/gazebo", 4004, publishes=("/clock",))
+        sleepers = [
+            world.add("/rospy", 4005, subscribes=topics, keeps=True),
+            world.add("/roscpp", 4006, subscribes=topics),
+        ]
+        for _ in range(2):
+            world.record = msgspec.structs.replace(world.record, wanted=True)
+            await world.until_settled()
+            require_taken(world)
+            world.record = msgspec.structs.replace(world.record, wanted=False)
+            await world.until_settled()
+            require_given(world)
+        assert [sleeper.most for sleeper in sleepers] == [{"/clock": 1, "/odom": 2}] * 2
+
+    run(story)
+
+
+@pytest.mark.parametrize("fails", [1, 2])
+def test_a_node_without_a_clock_after_the_release_gets_its_list_again(fails: int) -> None:
+    async def story(world: RobotWorld) -> None:
+        gazebo = world.add("/gazebo", 4004, publishes=("/clock",))
+        sleeper = world.add("/sleeper", 4005, subscribes=("/clock",))
+        await world.until_settled()
+        sleeper.fails = fails
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        require_given(world)
+        assert sleeper.connected == {"/clock": [gazebo.uri]}
+
+    run(story)
+
+
 def test_a_node_that_does_not_connect_after_the_release_gets_its_list_again() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()
