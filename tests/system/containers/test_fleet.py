@@ -299,7 +299,7 @@ def test_a_bundle_reaches_a_robot_in_a_container(walk: Walk) -> None:
     with (walk.folder / "fleet" / "fleet.yaml").open("a") as config:
         config.write(line)
     walk.run(NAMED["restarts"])
-    (text,) = re.findall(r"`compose.override.yaml`.*?```yaml\n(.*?)```", PAGE, re.DOTALL)
+    (text,) = re.findall(r"write this file `compose.override.yaml`.*?```yaml\n(.*?)```", PAGE, re.DOTALL)
     override = yaml.safe_load(text)
     override["services"]["appliance"]["environment"] |= {
         "ROSRV_AUDIT__CHECKPOINT_SECONDS": "1", "ROSRV_FLEET__BUNDLES__CONFIRM_SECONDS": "2",
