@@ -17,7 +17,6 @@ from appliance.features.guards.view import BypassedGuard
 
 _PAUSE_SECONDS = 2.0
 """Between two questions, so that each of ten drivers is asked every 20 seconds."""
-_MOST_DRIVERS = 50
 _MOST_UNANSWERED = 3
 
 
@@ -107,12 +106,11 @@ class Placement:
         graph = self._graph()
         hosts = {node.name: node.host for node in graph.nodes}
         robots = RobotGraph(tuple(facts_of(graph)))
-        found = [
+        return [
             GuardedDriver(topic.name, node, hosts[node])
             for topic in robots.topics if topic.name in commands
             for node in sorted(robots.ends(topic)) if node in hosts
         ]  # fmt: skip
-        return found[:_MOST_DRIVERS]
 
     def _sentences(self, drivers: Iterable[GuardedDriver]) -> Iterator[str]:
         for topic, host in dict.fromkeys((driver.topic, driver.host) for driver in drivers):

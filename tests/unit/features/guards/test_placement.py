@@ -76,6 +76,17 @@ def test_the_node_that_carries_a_command_out_is_asked_and_no_observer(robot: str
     assert (placeless.look(), placeless.elsewhere) == ([], [])
 
 
+def test_each_node_that_carries_a_command_out_is_asked_however_many_there_are() -> None:
+    names = [f"/arm_{number}" for number in range(200)]
+    topic = example(
+        Topic, name="/arm/goal", type="control_msgs/FollowJointTrajectoryActionGoal", subscribers=names
+    )
+    nodes = [example(Node, name=name, host="10.0.0.5") for name in names]
+    graph, connections = Graph(nodes, [topic], []), Connections()
+    place = Placement(lambda: ["/arm/goal"], lambda: graph, connections, connections.reported.append)
+    assert {driver.node for driver in place.look()} == {*names}
+
+
 async def test_an_unknown_publisher_is_reported_when_it_is_there_twice_and_until_it_is_gone() -> None:
     place, connections = placed("turtlebot3", "10.0.0.5", "/cmd_vel")
     [driver] = place.look()
