@@ -40,12 +40,27 @@ def start(
             help="How long a ring must stay healthy: 90s, 15m",
         ),
     ] = 600.0,
+    ring_within: Annotated[
+        float,
+        typer.Option(
+            "--ring-within",
+            parser=duration("1s", "30d", bare="s"),
+            metavar="DURATION",
+            show_default="1h",
+            help="The longest time in which a ring must reach its share: 90m, 2d",
+        ),
+    ] = 3600.0,
 ) -> None:
     """Begin a rollout; the rings are those that were signed with the bundle.
 
     Example: rosrv-fleet rollout start site-a/arms/13.tar --healthy 15m
     """
-    gates = {"share": share, "tolerance": tolerance, "healthy_seconds": healthy}
+    gates = {
+        "share": share,
+        "tolerance": tolerance,
+        "healthy_seconds": healthy,
+        "ring_seconds": ring_within,
+    }
     _show(_asked("POST", "", collector, ca, token_file, {"bundle": bundle, "gates": gates}))
 
 

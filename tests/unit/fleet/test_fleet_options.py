@@ -1,11 +1,16 @@
 """The options of `rosrv-fleet` have the names and the kinds of values of `rosrv`'s."""
 
+import contextlib
+import io
 from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
 
+import pytest
 import typer
 from rosrv_fleet.cli import app
+from rosrv_fleet.rollouts import commands
+from rosrv_fleet.rollouts.machine import HealthGates
 from typer.testing import CliRunner
 
 from tests.unit.cli.test_option_words import DURATIONS, MEANINGS, OPTIONS, POINTS
@@ -19,7 +24,7 @@ OTHER_THINGS = {
     "--robot": {""},  # a name; in `rosrv` an address
     "--role": {""},
 }
-OWN_DURATIONS = {"--healthy"}
+OWN_DURATIONS = {"--healthy", "--ring-within"}
 
 
 def _commands(command: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -90,3 +95,27 @@ def test_a_number_of_seconds_is_accepted_with_a_note() -> None:
         app, ["rollout", "start", "a/b/1.tar", "--collector", "https://x", "--healthy", "9999999"]
     )
     assert (done.exit_code, "9999999 is now 9999999s" in done.output) == (2, True)
+
+
+def started(monkeypatch: pytest.MonkeyPatch, *options: str) -> dict[str, float]:
+    """Return the gates of the request that `rollout start` with these options makes."""
+    requests: list[dict[str, Any]] = []
+
+    @contextlib.contextmanager
+    def answer(*_connection: object, json: dict[str, Any], **_texts: str) -> Iterator[io.StringIO]:
+        requests.append(json)
+        yield io.StringIO('{"site": "a", "group": "b", "rollout": null, "robots_known": 0, "conditions": {}}')
+
+    monkeypatch.setattr(commands, "answer_to", answer)
+    done = CliRunner().invoke(app, ["rollout", "start", "a/b/1.tar", "--collector", "https://x", *options])
+    assert done.exit_code == 0, done.output
+    return dict(requests[0]["gates"])
+
+
+def test_a_rollout_starts_with_the_gates_that_the_page_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    gates = started(monkeypatch)
+    assert gates == {name: getattr(HealthGates(), name) for name in gates}
+    given = started(
+        monkeypatch, "--share", "0.5", "--tolerance", "0.1", "--healthy", "2m", "--ring-within", "26h"
+    )
+    assert given == {"share": 0.5, "tolerance": 0.1, "healthy_seconds": 120.0, "ring_seconds": 93_600.0}
