@@ -188,14 +188,15 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
     environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # while the other line computes
     log = FOLDER / f"{stage.name}.log"
-    status = run_limited(command, log, _STAGE_SECONDS, environment, low=stage.computes)
+    seconds = _STAGE_SECONDS * (2 if stage.computes else 1)  # the other line may have the processors for an hour
+    status = run_limited(command, log, seconds, environment, low=stage.computes)
     wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"
-    wrong = _late() if status is None else wrong
+    wrong = _late(seconds) if status is None else wrong
     return (list(outcomes_of(report)) if report.exists() else []), wrong
 
 
-def _late() -> str:
-    return f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
+def _late(seconds: float) -> str:
+    return f"not finished after {seconds / 60:.0f} minutes"
 
 
 _RUNNING: set[int] = set()  # leaders of process groups
@@ -250,7 +251,7 @@ def measure(name: str) -> tuple[list[str], str]:
     """Run a program of `MEASUREMENTS`. Return its findings, or the reason why it has none."""
     status = run_limited([sys.executable, "-m", *MEASUREMENTS[name]], _log_of(name), _STAGE_SECONDS)
     if status is None:
-        return [], _late()
+        return [], _late(_STAGE_SECONDS)
     wrong = f"{MEASUREMENTS[name][0]} ended with status {status}" if status else ""
     return findings_of(_log_of(name).read_text(encoding="utf-8")), wrong
 
