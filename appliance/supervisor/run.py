@@ -181,8 +181,11 @@ def _listeners(
 
 def _build(settings: Settings, isolation: NoIsolation, hold: HoldAround) -> dict[str, socket.socket]:
     hold.keep()
-    if settings.isolation != "netns":
-        require_free(*settings.listen_address)  # before the firewall is built, which takes a second
+    if settings.isolation != "netns":  # before the firewall is built, because a wait tries every two seconds
+        require_free(*settings.listen_address)
+        require_free("127.0.0.1", settings.rosmaster_port)
+        if settings.api_address is not None:
+            require_free(*settings.api_address)
     isolation.build()
     try:
         with isolation.inside():

@@ -85,8 +85,9 @@ def test_a_port_in_use_is_an_error(lab: Lab) -> None:
         other.stdout.readline()
         appliance = Appliance(machine, isolation="container", options=("--api", "127.0.0.1:8443"))
         try:
-            with pytest.raises(AssertionError, match=r"port 8443 .* is in use"):
+            with pytest.raises(AssertionError, match=r"port 8443 .* is in use") as error:
                 appliance.start()
+            assert "firewall" not in str(error.value), "it is not built anew for each try"
         finally:
             appliance.close()
         with Appliance(machine, isolation="container") as elsewhere:
