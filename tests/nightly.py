@@ -88,7 +88,7 @@ LINES = (
             "machine",
             (
                 "tests/integration/examples/test_ros2.py",
-                "tests/system/features/doors/test_roslib.py",
+                "tests/system/features/doors",
                 "tests/system/network/test_adopt_nodes.py",
                 "tests/system/vm",
                 "tests/system/console/test_sign_on.py",
@@ -188,7 +188,8 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
     environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # while the other line computes
     log = FOLDER / f"{stage.name}.log"
-    seconds = _STAGE_SECONDS * (2 if stage.computes else 1)  # the other line may have the processors for an hour
+    # The other line may have the processors for an hour.
+    seconds = _STAGE_SECONDS * (2 if stage.computes else 1)
     status = run_limited(command, log, seconds, environment, low=stage.computes)
     wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"
     wrong = _late(seconds) if status is None else wrong

@@ -289,7 +289,7 @@ def test_a_blocked_host(appliance: Appliance, windows: list[Reader]) -> None:
 def test_a_bad_policy(appliance: Appliance, windows: list[Reader]) -> None:
     appliance.policy_file.write_text("[Nodes]\ndefault = *\n[Nonsense]\n")
     assert appliance.rosrv("policy", "reload", check=False).returncode != 0
-    see(windows, alarms, re.compile("stays in force, .* is refused"))
+    see(windows, alarms, re.compile("stays in force, .* is rejected"))
     appliance.reload(POLICY)
     expect(alarms(windows[0].page).filter(has_text="is refused")).to_have_count(0)
 

@@ -150,7 +150,7 @@ def test_the_command_line_searches(shared: FleetSite) -> None:
     lines = shared.run("search", "--topic", "/cmd_1*", "--limit", "1000", "--json").stdout.splitlines()
     assert len(lines) == 55
     assert shared.run("search", "--since", "soon", status=2).stderr.startswith(
-        "rosrv-fleet: 'soon' is not a valid time"
+        "rosrv-fleet: --since: 'soon' is not a valid time"
     )
 
 

@@ -40,7 +40,7 @@ def _is_closed(connection: socket.socket) -> bool:
 def _is_held(connection: ssl.SSLSocket) -> bool:
     connection.settimeout(LIMIT)
     try:
-        connection.sendall(b"GET /v1/bundles/x HTTP/1.1\r\nHost: x\r\n\r\nGET ")
+        connection.sendall(b"GET /v1/bundles/x HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\nGET ")
         return connection.recv(1) != b""
     except (ConnectionResetError, BrokenPipeError):
         return False
@@ -61,7 +61,7 @@ def test_an_address_has_a_limit_of_connections(narrow: FleetSite) -> None:
         assert sum(map(_is_closed, many)) >= 4
         other = stack.enter_context(_connect(narrow, "127.0.0.2"))
         secure = stack.enter_context(context.wrap_socket(other, server_hostname="127.0.0.1"))
-        secure.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        secure.sendall(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         assert secure.recv(100).startswith(b"HTTP/1.1 200")
         # A handshake that never ends is cut off, long before asyncio's limit of a minute.
         eventually(lambda: all(map(_is_closed, many)), "handshakes without an end are cut off", 30)

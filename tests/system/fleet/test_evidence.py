@@ -265,7 +265,7 @@ def _begin_upload(carrier: Carrier) -> ssl.SSLSocket:
     context = ssl.create_default_context(cafile=carrier.site.server.ca)
     plain = socket.create_connection(("127.0.0.1", carrier.site.port), 30)
     secured = context.wrap_socket(plain, server_hostname="127.0.0.1")
-    head = f"POST /v1/evidence?robot=arm1 HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {carrier.token}\r\n"
+    head = f"POST /v1/evidence?robot=arm1 HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {carrier.token}\r\n"
     secured.sendall(f"{head}Content-Length: 200000\r\n\r\n".encode() + bytes(100_000))
     eventually(lambda: list(carrier.incoming.glob("*/bundle.zip")), "the upload has begun")
     return secured
