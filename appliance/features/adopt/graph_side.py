@@ -112,7 +112,7 @@ class AdoptedGraph:
     ) -> None:
         """Send the subscribers of adopted nodes their lists, with the URIs of the appliance.
 
-        `besides` has more URIs for topics. Those of `CLOCK` are left out unless `clock_too`.
+        `besides` has more URIs for topics. Subscribers of `CLOCK` get none unless `clock_too`.
         """
         for name in names:
             node = self.registry.holder(name)
