@@ -100,7 +100,11 @@ LINES = (
         Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical", computes=True),
         Stage(  # files that each compute for a quarter of an hour or more
             "worlds",
-            ("tests/world", "tests/integration/test_entrance_mutants.py"),
+            (
+                "tests/world",
+                "tests/integration/test_entrance_mutants.py",
+                "tests/unit/features/test_without_a_feature.py",
+            ),
             "logical",
             spread=True,
             computes=True,
