@@ -190,6 +190,7 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     report.unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
     command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
+    command += ["--timeout=1200"] if stage.computes else []  # a test has a part of a processor only
     environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # while the other line computes
     log = FOLDER / f"{stage.name}.log"
     # The other line may have the processors for an hour.

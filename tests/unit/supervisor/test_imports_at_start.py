@@ -12,15 +12,20 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 """Libraries that only help texts, specifications or a namespace need."""
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
-MAY: Final = {"bundles": {"rich", "pygments"}}
-"""httpx imports its own command-line interface, with its libraries, if they are installed."""
+MAY: Final = {
+    "bundles": {
+        "rich",
+        "pygments",
+    },  # httpx imports its own command-line interface, if its libraries are installed
+    "compiler": {"lark", "rosmop.run.engine"},  # it runs only while it compiles
+}
 
 _BARE = {"rosbags", "appliance.configuration.inventory"}
 _LINKED = _BARE | {"appliance.channel.admin"}
 _NO_SETTINGS = _LINKED | {"pydantic", "appliance.configuration.settings"}
 ALSO: Final = {
-    "signer": _NO_SETTINGS, "control": _BARE,
-    "relay": _NO_SETTINGS | {"cryptography", "roswire.definitions"},
+    "signer": _NO_SETTINGS, "control": {"rosbags"},
+    "relay": _NO_SETTINGS | {"cryptography"},
     "charon": _NO_SETTINGS, "compiler": _LINKED | {"pydantic"}, "syslog": _LINKED,
     "fleet": _LINKED,
     "recorder": {"appliance.channel.admin"},

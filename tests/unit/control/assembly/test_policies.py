@@ -254,7 +254,7 @@ async def test_hosts_changed_during_the_tests_are_seen(
 ) -> None:
     appliance = Appliance(tmp_path)
     hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}
-    with appliance.started(hosts=lambda: hosts) as policies:
+    with appliance.started(hosts=lambda: dict(hosts)) as policies:
         slow = Slow(monkeypatch, appliance)
         appliance.file.write_text(OPEN.replace("[Nodes]\ndefault=*", "[Nodes]\ndefault=host:ocu host:new"))
         loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))

@@ -103,7 +103,7 @@ IN_ANSWER = {
     "sends an endless body": (sends_an_endless_body, "more than .* bytes|exceed"),
     "closes midway": (closes_midway, "closed connection|incomplete|EOF|violation"),
     "redirects": (redirects, "307"),
-    "compresses": (compresses, "compresses"),
+    "compresses": (compresses, "the answer is compressed"),
     "is not HTTP": (is_not_http, "illegal|disconnected"),
     "demands a login": (demands_a_login, r"401: \\x1b\[2Jno"),
 }

@@ -61,6 +61,7 @@ def deadman(
                 if place := [*free, *idle][:1]:
                     one = known[place[0]] = Sender(node, at)
             passes = not motion
+            late = one is not None and one.moves and not at - one.at <= silent  # before the tick
             if one:
                 one.since = one.since if at - one.at <= silent else at
                 one.at = at
@@ -69,7 +70,7 @@ def deadman(
             if passes:
                 stopped = False
                 got.append((now, data))
-            elif one is None or not any(other and other.moves for other in known):
+            elif one is None or late or not any(other and other.moves for other in known):
                 stopped = True
                 got.append((now, STILL))
     return got
@@ -223,11 +224,14 @@ def depth(x: float, y: float) -> float:
 
 
 class Base:
-    """A base that accelerates at once, and brakes with `braking` after `reaction` seconds. Steps are 10 ms."""
+    """A base that accelerates at once, and brakes with `braking` after `reaction` seconds. Steps are 10 ms.
+
+    From 1.42 m/s it stops within the way of 0.8 s, the `ahead` of the fences here.
+    """
 
     def __init__(self, guard: Guarded, x: float, y: float, turned: float, reaction: float = 0.2) -> None:
         self.guard, self.x, self.y, self.turned = guard, x, y, turned
-        self.braking, self.reaction = 1.0, round(reaction * 1000)
+        self.braking, self.reaction = 1.2, round(reaction * 1000)
         self.vx = self.vy = 0.0
         self.read = 0
         self.wanted: list[tuple[int, tuple[float, ...]]] = [(-1000, (0.0,) * 6)]

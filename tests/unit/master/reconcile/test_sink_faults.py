@@ -75,7 +75,7 @@ FAULTS = {
     ),
     "a withdrawn topic keeps its list": Fault(Subscribers, "_wanted", "in node.shelf", "in ()"),
     "a subscription has an empty list": Fault(
-        Subscribers, "_wanted", "return self._publishers_for(node, topic)", "return ()"
+        Subscribers, "_wanted", "return self.publishers_for(node, topic)", "return ()"
     ),
     "a list waits for a subscription that ended": Fault(
         Subscribers, "_state", "self.delivery.drop_list(node, resource)", "pass"
