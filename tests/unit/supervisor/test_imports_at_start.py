@@ -12,13 +12,8 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 """Libraries that only help texts, specifications or a namespace need."""
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
-MAY: Final = {
-    "bundles": {
-        "rich",
-        "pygments",
-    },  # httpx imports its own command-line interface, if its libraries are installed
-    "compiler": {"lark", "rosmop.run.engine"},  # it runs only while it compiles
-}
+MAY: Final = {"bundles": {"rich", "pygments"}, "compiler": {"lark", "rosmop.run.engine"}}
+"""httpx imports its own command-line interface if its libraries are installed. The compiler runs while it compiles."""
 
 _BARE = {"rosbags", "appliance.configuration.inventory"}
 _LINKED = _BARE | {"appliance.channel.admin"}
