@@ -105,7 +105,7 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "a reload revokes nothing": (Enforcement, "policy_changed", lambda *_given: 0),
     "a policy is not stored": (StateStore, "save_revision", _nothing),
     "a parameter is not stored": (StateStore, "note_parameter", _nothing),
-    "control restores no node": (control_process, "_restore", _at_once),
+    "control restores no node": (control_process, "restore_nodes", _at_once),
     "a change is not written ahead": (
         Database, "put", _not_ahead,
     ),

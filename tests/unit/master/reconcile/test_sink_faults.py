@@ -200,6 +200,10 @@ def faulty(fault: Fault) -> Any:
     return names[fault.name]
 
 
+def test_each_fault_has_its_place() -> None:
+    assert all(faulty(fault) for fault in FAULTS.values())
+
+
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", sample([*FAULTS], 11))
 def test_each_fault_of_a_sink_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
