@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 import xml.etree.ElementTree
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -285,7 +285,9 @@ def main() -> int:
         signal.signal(end, _end)
     FOLDER.mkdir(parents=True, exist_ok=True)
     results, steps = _earlier(_commit()), steps_of(lane)
-    waiting = [step for step in steps if not is_before(step, first)]
+    resumes = first != STEPS[0]
+    ended = {run["stage"] for run in results["runs"] if run["lane"] == lane and resumes}
+    waiting = [step for step in steps if not is_before(step, first, ended)]
     namespaces = _namespaces()
     with ThreadPoolExecutor(len(LINES)) as lines:
         runs = [lines.submit(run_line, line, waiting, lane, results) for line in LINES]
@@ -307,15 +309,14 @@ def _end(number: int, _frame: object) -> None:
     os._exit(128 + number)
 
 
-def is_before(step: str, first: str) -> bool:
-    """Return whether a run that resumes with `first` has a step behind it: an earlier one of the same line.
-
-    A measurement comes after both lines.
+def is_before(step: str, first: str, ended: Collection[str]) -> bool:
+    """Return whether a run that resumes with `first` leaves out a step: an earlier one of its line, or one of the other
+    line that has `ended`. A measurement comes after both lines.
     """
     if first in MEASUREMENTS:
         return STEPS.index(step) < STEPS.index(first)
     [line] = ([stage.name for stage in line] for line in LINES if first in {stage.name for stage in line})
-    return step in line[: line.index(first)]
+    return step in line[: line.index(first)] or (step in ended and step not in line)
 
 
 def run_line(line: Sequence[Stage], waiting: Sequence[str], lane: str, results: dict[str, Any]) -> None:

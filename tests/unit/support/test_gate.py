@@ -108,9 +108,10 @@ def test_a_computing_stage_leaves_the_processors_to_others() -> None:
 
 
 def test_a_night_resumes_in_the_line_of_its_stage() -> None:
-    assert [step for step in STEPS if is_before(step, "containers")] == ["nodes"]
-    assert [step for step in STEPS if is_before(step, "computing")] == ["machine"]
-    assert [step for step in STEPS if is_before(step, "start")] == [stage.name for stage in STAGES]
+    assert [step for step in STEPS if is_before(step, "containers", ())] == ["nodes"]
+    assert [step for step in STEPS if is_before(step, "containers", {"machine"})] == ["machine", "nodes"]
+    assert [step for step in STEPS if is_before(step, "computing", {"computing"})] == ["machine"]
+    assert [step for step in STEPS if is_before(step, "start", ())] == [stage.name for stage in STAGES]
 
 
 def test_minutes_of_stages_side_by_side_count_once() -> None:

@@ -64,7 +64,7 @@ class RobotNode:
     begun: list[tuple[str, str]] = field(default_factory=list)
     """The connections that it makes later."""
     most: dict[str, int] = field(default_factory=dict)
-    """By topic, the most connections that stood together."""
+    """The most connections that a topic had at once."""
 
     @property
     def connected(self) -> dict[str, list[str]]:
