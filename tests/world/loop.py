@@ -21,6 +21,7 @@ from appliance.base import clock
 T = TypeVar("T")
 _SECOND = 1_000_000_000
 _EPOCH = 1_790_000_000.0  # the system time at the beginning of each world
+_STEPS_OF_A_MOMENT = 10_000  # without an end: a timer that starts itself again now, for example
 _THREAD_SECONDS = (0.0, 0.0, 0.0005, 0.003)  # until the result of a function that runs in a thread
 
 
@@ -109,6 +110,7 @@ class WorldLoop(asyncio.BaseEventLoop):
         self.present = 0.0
         self.random = random
         self.steps = 0
+        self._moment = 0  # the steps before the present moment
         self._waiting: list[Process] = []  # processes with callbacks that are ready
         self.tasks: dict[asyncio.Task[Any], None] = {}
         self.outside = Process("world", Machine("world", self))
@@ -179,7 +181,10 @@ class WorldLoop(asyncio.BaseEventLoop):
                 self._drop_timer()
             if not scheduled:
                 raise BrokenPromiseError("deadlock: every task waits")
-            self.present = max(self.present, scheduled[0].when())
+            if scheduled[0].when() > self.present:
+                self.present, self._moment = scheduled[0].when(), self.steps
+        if self.steps - self._moment > _STEPS_OF_A_MOMENT:
+            raise BrokenPromiseError(f"livelock: {_STEPS_OF_A_MOMENT} steps at {self.present!r} s")
         while scheduled and scheduled[0].when() <= self.present:
             ready.append(self._drop_timer())
         while ready:

@@ -186,15 +186,15 @@ class ReplicationLink(Generic[M]):
 
     async def _header(self, seconds: float) -> bytes:
         """An appliance that takes a large frame cannot answer before it has the whole."""
-        left, loop = seconds, asyncio.get_running_loop()
+        until = asyncio.get_running_loop().time() + seconds
         while True:
             try:
-                async with asyncio.timeout(left):
+                async with asyncio.timeout_at(until):
                     return await self._reader.readexactly(_LENGTH.size)
             except TimeoutError:
-                left = seconds - (loop.time() - self._taken)
-                if left <= 0:
+                if self._taken + seconds <= until:  # times that are compared, not a rest that rounding leaves
                     raise
+                until = self._taken + seconds
 
     async def close(self) -> None:
         self._writer.transport.abort()

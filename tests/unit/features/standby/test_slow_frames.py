@@ -1,5 +1,7 @@
 import asyncio
+import contextlib
 import struct
+from random import Random
 from typing import Any
 
 import msgspec
@@ -14,6 +16,7 @@ from appliance.features.standby.replication_frames import (
     Stored,
 )
 from appliance.store.changes import Put
+from tests.world.loop import Machine, Process, WorldLoop
 
 pytestmark = pytest.mark.anyio
 
@@ -83,3 +86,24 @@ async def test_an_appliance_that_takes_a_large_frame_is_not_silent() -> None:
     with pytest.raises(ReplicationError, match="sent nothing for 10 s"):
         await link.receive(SECONDS)
     assert loop.time() - began <= SECONDS
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_the_wait_for_a_silent_appliance_ends_on_a_clock_of_any_speed(seed: int) -> None:
+    """The sum of two times is rounded, so a timer may ring a little before the end that it was set for."""
+    random = Random(seed)  # noqa: S311  no secret
+    loop = WorldLoop(random)
+    machine = Machine("standby", loop, ahead=random.uniform(0, 1000), speed=random.uniform(0.99, 1.01))
+
+    async def receive() -> float:
+        link = link_to(asyncio.StreamReader(), FromActive)
+        loop.call_later(3.7, lambda: taking.append(asyncio.create_task(link.send("a"))))
+        began = loop.time()
+        with pytest.raises(ReplicationError, match="sent nothing for 10 s"):
+            await link.receive(SECONDS)
+        return loop.time() - began
+
+    taking: list[asyncio.Task[None]] = []
+    with contextlib.closing(loop):
+        waited = loop.run_until_complete(Process("control", machine).start(receive()))
+    assert waited == pytest.approx(3.7 + SECONDS, abs=0.001)
