@@ -3,6 +3,8 @@ import re
 from functools import cache
 from pathlib import Path
 
+from appliance.supervisor.roles import ROLES
+
 TESTS = Path(__file__).parents[1]
 
 
@@ -10,6 +12,13 @@ def test_every_test_that_is_named_exists() -> None:
     text = (TESTS.parent / "docs/reference/threat-model.md").read_text()
     assert len(named(text)) > 100
     assert missing(text, TESTS) == []
+
+
+def test_every_process_has_what_an_attacker_in_it_can_do() -> None:
+    text = (TESTS.parent / "docs/reference/threat-model.md").read_text()
+    rows = re.findall(r"^\| is in ([^|]+) \|", text, re.MULTILINE)
+    named = [name for row in rows for name in re.findall("`([a-z]+)`", row)]
+    assert sorted(named) == sorted(role.name for role in ROLES)
 
 
 def test_a_test_that_was_removed_is_missed(tmp_path: Path) -> None:
