@@ -1,13 +1,15 @@
 """Find the process behind each socket of a node. Only root sees the sockets of all processes."""
 
 import pwd
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from appliance.network.listening_sockets import TcpSocket, tcp_sockets
 from appliance.network.namespaces import Namespace
+
+_LONGEST_LINE = 80  # bytes of a command line that a message shows
 
 
 class SocketOwner(NamedTuple):
@@ -44,9 +46,13 @@ def node_sockets(namespace: Namespace, ports: Iterable[int], master_port: int) -
     return {port: one for one in found.values() for port in sorted(one.listening & wanted)}
 
 
-def is_node(process: NodeSockets) -> bool:
-    """Return whether a process looks like a ROS node: it is connected to a master, or was started for ROS."""
-    if process.master_address:
+def is_node(process: NodeSockets, known: Collection[str] = ()) -> bool:
+    """Return whether a process looks like a ROS node: it is connected to a master, or was started for ROS.
+
+    `known` has the keys of processes that were connected before: once such a connection has ended, rospy opens another
+    one only for its next call.
+    """
+    if process.master_address or process_key(process.pid) in known:
         return True
     place = Path("/proc", str(process.pid))
     with suppress(OSError):
@@ -56,6 +62,24 @@ def is_node(process: NodeSockets) -> bool:
         settings = (place / "environ").read_bytes().split(b"\0")
         return any(setting.startswith((b"ROS_MASTER_URI=", b"ROS_PACKAGE_PATH=")) for setting in settings)
     return False
+
+
+def process_key(pid: int) -> str:
+    """Return what no other process of this boot has: the number and the start time. Empty if it has ended."""
+    try:
+        state = Path("/proc", str(pid), "stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    return f"{pid}:{state.rpartition(')')[2].split()[19]}"
+
+
+def program_of(pid: int) -> str:
+    """Return the beginning of a process's command line; empty if it has ended."""
+    try:
+        line = Path("/proc", str(pid), "cmdline").read_bytes()
+    except OSError:
+        return ""
+    return line[:_LONGEST_LINE].replace(b"\0", b" ").decode("utf-8", "replace").strip()
 
 
 def user_of(pid: int) -> str:

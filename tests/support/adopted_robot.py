@@ -73,6 +73,7 @@ def rosrv(robot: Robot, appliance: Appliance, *arguments: str, check: bool = Tru
     ) as done:
         text, _ = done.communicate(timeout=2 * LIMIT)
     assert not check or done.returncode == 0, f"{text}\n{appliance.story()}"
+    assert "\nnot cut: " not in text, text
     return str(text)
 
 
@@ -85,6 +86,8 @@ def crash(appliance: Appliance) -> None:
 
 def until_taken(robot: Robot, appliance: Appliance) -> None:
     def taken() -> bool:
-        return bool(json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))["phase"] == "taken")
+        found = json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))
+        assert not found["not_cut"], "a node keeps its connections"
+        return bool(found["phase"] == "taken")
 
     eventually(taken, appliance.story)

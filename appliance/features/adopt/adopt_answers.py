@@ -27,6 +27,13 @@ class AdoptState(msgspec.Struct, frozen=True):
     ]
     denied: Annotated[dict[str, str], doc("registrations that were denied, with the reasons")]
     missing: Annotated[dict[str, str], doc("nodes that were left with their own master, with the reasons")]
+    not_cut: Annotated[
+        dict[str, str],
+        doc(
+            "ports whose connections were not cut, because the process does not look like a ROS node; until it is"
+            " restarted, what it publishes bypasses the appliance"
+        ),
+    ] = {}
 
 
 class TakeOverReport(msgspec.Struct, frozen=True):
@@ -37,6 +44,7 @@ class TakeOverReport(msgspec.Struct, frozen=True):
     registrations: int = 0
     denied: dict[str, str] = {}
     missing: dict[str, str] = {}
+    not_cut: dict[str, str] = {}
     cut: int = 0
     readings: int = 0
     left_out: list[str] = []

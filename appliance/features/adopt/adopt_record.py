@@ -42,12 +42,14 @@ class AdoptRecord(msgspec.Struct, frozen=True):
     program: str = ""
     group: str = ""
     stand_in: int = 0
+    nodes: tuple[str, ...] = ()
+    """The keys of processes that were connected to a master at a cut (`process_key`)."""
 
     def now(self, boot: str) -> "AdoptRecord":
         return (
             self
             if boot == self.boot
-            else msgspec.structs.replace(self, phase=Phase.FREE, boot=boot, stand_in=0)
+            else msgspec.structs.replace(self, phase=Phase.FREE, boot=boot, stand_in=0, nodes=())
         )
 
 

@@ -194,7 +194,7 @@ def _show_report(report: TakeOverReport, *, as_json: bool) -> None:
         f" {counted(report.registrations, 'registration')}, {len(report.denied)} denied;"
         f" {counted(report.cut, 'connection')} cut"
     )
-    _show_left(report.denied, report.missing)
+    _show_left(report)
     for left in report.left_out:
         say(printable(f"left out: {left}"))
     say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
@@ -205,15 +205,21 @@ def _show_started(found: AdoptState, *, as_json: bool) -> None:
         say_json(msgspec.to_builtins(found))
         return
     say(f"adopted: {counted(found.nodes, 'node')} of {found.master}")
-    _show_left(found.denied, found.missing)
+    _show_left(found)
     say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
 
 
-def _show_left(denied: dict[str, str], missing: dict[str, str]) -> None:
-    for entry, why in denied.items():
+def _show_left(found: TakeOverReport | AdoptState) -> None:
+    for entry, why in found.denied.items():
         say(printable(f"denied: {entry}: {why}"))
-    for name, why in missing.items():
+    for name, why in found.missing.items():
         say(printable(f"not adopted: {name}: {why}"))
+    for port, process in found.not_cut.items():
+        say(printable(f"not cut: {port}: {process}"))
+    if found.not_cut:
+        say(
+            "Restart these programs, which do not look like ROS nodes: what they publish bypasses the appliance"
+        )
 
 
 def _show_status(appliance: Appliance) -> None:
@@ -234,4 +240,4 @@ def _show_status(appliance: Appliance) -> None:
     say(f"{counted(found.nodes, 'node')}, of which {found.not_started} were never seen to start")
     if found.obstacle:
         say(f"not as wanted: {found.obstacle}")
-    _show_left(found.denied, found.missing)
+    _show_left(found)

@@ -47,6 +47,7 @@ class AdoptMemory(msgspec.Struct):
     denied: list[tuple[Entry, str]] = []
     missing: dict[str, str] = {}
     parameters: set[str] = set()
+    connections: dict[str, str] = {}
 
 
 async def begin(core: Core) -> ControlPart:
@@ -220,6 +221,7 @@ class AdoptPart:
             not_started=sum(node.life is Life.LIVE for node in unasked),
             denied={" ".join(entry): why for entry, why in sorted(self._graph.denied.items())},
             missing=self._operation.left.nodes,
+            not_cut=self._operation.left.connections,
         )
 
     # --- what the operation uses ---
@@ -248,7 +250,7 @@ class AdoptPart:
     def _remember(self) -> None:
         """Restore what an earlier control knew, now that the registry is restored."""
         memory = _memory(self._core.store)
-        self._operation.left = LeftThere(memory.missing, memory.parameters)
+        self._operation.left = LeftThere(memory.missing, memory.parameters, memory.connections)
         self._graph.denied.update(memory.denied)
         registry = self._registrar.registry
         self._graph.subscribers.unasked.update(filter(None, map(registry.by_key, memory.nodes)))
@@ -259,6 +261,7 @@ class AdoptPart:
             list(self._graph.denied.items()),
             self._operation.left.nodes,
             self._operation.left.parameters,
+            self._operation.left.connections,
         )
         self._core.store.save_setting(_SETTING, msgspec.json.encode(memory).decode())
 

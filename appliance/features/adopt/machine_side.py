@@ -36,7 +36,15 @@ from appliance.network.isolation import Isolation
 from appliance.network.listening_sockets import TcpSocket
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.port_holders import port_holder
-from appliance.network.socket_owners import is_node, node_sockets, programs_of_unit, user_of
+from appliance.network.socket_owners import (
+    NodeSockets,
+    is_node,
+    node_sockets,
+    process_key,
+    program_of,
+    programs_of_unit,
+    user_of,
+)
 from appliance.supervisor.machine_work import Found, Terms
 from appliance.supervisor.users import account_of
 
@@ -50,6 +58,7 @@ _LOOKUP_SECONDS = 0.1
 _CALL_SECONDS = 0.25  # of an ordinary service call under way, which is not cut
 _START_SECONDS = 10.0
 _LOOK_SECONDS = 0.05
+_MOST_NODES = 1000  # whose keys are kept, the newest
 _MOST_CUTS = 60  # of one taking, which may begin again after kills of control
 _CUT_AGAIN_SECONDS = 60.0  # of a graph that is taken; until then the ports of the last cut are refused
 
@@ -202,8 +211,7 @@ class AdoptWork:
         return True
 
     def _cut(self, side: Isolation, terms: Terms) -> Found:
-        if not self._may_cut(self._require_taking()):
-            return {"master": 0, "nodes": 0}
+        phase = self._require_taking()
         ports = set(_ports(terms.get("ports", [])))
         remote = {
             RemotePort(str(ipaddress.IPv4Address(address)), port)
@@ -212,12 +220,15 @@ class AdoptWork:
         master, appliance = _master_port(side), side.ends[4].appliance
         if any(port < FIRST_PORT or port == master for port in {*ports, *(one.port for one in remote)}):
             raise ValueError("a port of the machine itself is not a port of a node")
-        others = {port for port, one in node_sockets(side.host, ports, master).items() if not is_node(one)}
+        found = node_sockets(side.host, ports, master)
+        known = self._known_nodes(found.values())
+        others = {port: one.pid for port, one in found.items() if not is_node(one, known)}
+        kept = {f"TCP {port}": f"process {pid}: {program_of(pid)}" for port, pid in sorted(others.items())}
+        if not self._may_cut(phase):
+            return {"master": 0, "nodes": 0, "kept": kept}
         if others:
-            log.warning(
-                "connections of processes that do not look like nodes are not cut", ports=sorted(others)
-            )
-            ports -= others
+            log.warning("connections of processes that do not look like nodes are not cut", ports=kept)
+        ports -= others.keys()
 
         def of_master(one: TcpSocket) -> bool:
             return one.port == master and one.peer_address != appliance
@@ -232,7 +243,17 @@ class AdoptWork:
             _LOOKUP_SECONDS
         )  # a client of a service uses the address that it has looked up
         refuse_ports(side.host, side.settings.link, ports, remote)
-        return {"master": calls, "nodes": end_connections(side.host, of_nodes, lasting=_CALL_SECONDS)}
+        nodes = end_connections(side.host, of_nodes, lasting=_CALL_SECONDS)
+        return {"master": calls, "nodes": nodes, "kept": kept}
+
+    def _known_nodes(self, found: Iterable[NodeSockets]) -> tuple[str, ...]:
+        """Return the keys of processes that are, or were at an earlier cut, connected to a master."""
+        record = load_record(self._state)
+        connected = {process_key(one.pid) for one in found if one.master_address} - {*record.nodes, ""}
+        if connected:
+            record = msgspec.structs.replace(record, nodes=(*record.nodes, *sorted(connected))[-_MOST_NODES:])
+            save_record(self._state, record)
+        return record.nodes
 
     # --- giving back ---
 

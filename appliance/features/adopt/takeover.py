@@ -104,6 +104,14 @@ class MachineOrders(Protocol):
     async def __call__(self, work: str, /, **terms: object) -> Found: ...
 
 
+class CutConnections(msgspec.Struct):
+    """The numbers of ended connections to a master and of nodes, and the processes that kept theirs, by their ports."""
+
+    master: int = 0
+    nodes: int = 0
+    kept: dict[str, str] = {}
+
+
 class ParameterSide(Protocol):
     """RVMaster's parameters."""
 
@@ -134,10 +142,14 @@ class LastWord:
 
 @dataclass
 class LeftThere:
-    """Nodes, by name with the reason, and names of parameters that stay with the robot's own master only."""
+    """Nodes, by name with the reason, and names of parameters that stay with the robot's own master only.
+
+    `connections` has the ports whose connections were not cut, with the process that does not look like a node.
+    """
 
     nodes: dict[str, str] = field(default_factory=dict)
     parameters: set[str] = field(default_factory=set)
+    connections: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -240,6 +252,7 @@ class AdoptOperation:
             await self._register(graph, places, MasterGraph())
             await self.passed("register")
         cuts = await self._cuts(graph, places)
+        self.left.connections.clear()
         await self.machine("forward")
         await self.passed("forward")
         while True:
@@ -247,7 +260,7 @@ class AdoptOperation:
                 await self._connect(graph, places)
             await self._tell(places)
             await self.passed("tell")
-            cut += sum(msgspec.convert(await self.machine("cut", **cuts), dict[str, int]).values())
+            cut += await self._cut(cuts)
             await self._tell(places, clock_too=True)
             await self.passed("cut")
             readings += 1
@@ -356,9 +369,14 @@ class AdoptOperation:
         cuts = await self._cuts(own, late)
         await self._connect(graph, late)
         await self._tell(late)
-        await self.machine("cut", **cuts)
+        await self._cut(cuts)
         await self._tell(late, clock_too=True)
         await self.passed("missing nodes")
+
+    async def _cut(self, cuts: Mapping[str, object]) -> int:
+        done = msgspec.convert(await self.machine("cut", **cuts), CutConnections)
+        self.left.connections.update(done.kept)
+        return done.master + done.nodes
 
     async def _connect(self, graph: MasterGraph, places: Places) -> None:
         """Have the nodes connect through the appliance; until that stands, they keep their earlier connections."""
@@ -433,6 +451,7 @@ class AdoptOperation:
             registrations=sum(len(node.registrations) for node in nodes),
             denied={" ".join(entry): why for entry, why in sorted(self.graph.denied.items())},
             missing=dict(sorted(self.left.nodes.items())),
+            not_cut=dict(sorted(self.left.connections.items())),
             cut=cut,
             readings=readings,
             left_out=left_out,
@@ -446,6 +465,7 @@ class AdoptOperation:
             f" {len(report.denied)} denied; {counted(report.cut, 'connection')} cut",
             nodes=report.nodes, registrations=report.registrations, cut=report.cut,
             denied=len(report.denied), missing=len(report.missing), who=self._who or None,
+            not_cut=len(report.not_cut) or None,
         )  # fmt: skip
 
     # --- giving back ---

@@ -169,6 +169,7 @@ class RobotWorld:
         self.resolved: dict[str, list[str]] = {}
         self.forwarded = self.silent = False
         self.cuts: list[set[int]] = []
+        self.kept: dict[str, str] = {}  # connections that the supervisor does not cut, by their ports
         self.steps: list[str] = []
         self.killed_after = ""
         self.after: dict[str, Callable[[], None]] = {}
@@ -275,7 +276,7 @@ class RobotWorld:
                 self._end(lambda uri: self._port(uri) in self.refused)
                 self.cuts.append(set(terms["ports"]))
                 self.remote = terms["remote"]
-                return {"master": 1, "nodes": len(terms["ports"])}
+                return {"master": 1, "nodes": len(terms["ports"]), "kept": self.kept}
             case "stand in":
                 if not self.operation.forwards:
                     self.refused.clear()

@@ -29,6 +29,7 @@ class Machine:
     state: Path
     done: list[str]
     refused: list[set[int]]
+    connected: set[int]
     time: VirtualClock
     work: AdoptWork
 
@@ -50,9 +51,11 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     (tmp_path / "run").mkdir()
     done: list[str] = []
     refused: list[set[int]] = []
+    connected = {NODE}
 
     def sockets(_host: object, ports: set[int], _master: int) -> dict[int, NodeSockets]:
-        return {port: NodeSockets(port, frozenset({port}), "") for port in ports}
+        masters = dict.fromkeys(connected, "127.0.0.1")
+        return {port: NodeSockets(port, frozenset({port}), masters.get(port, "")) for port in ports}
 
     def end(*_arguments: object, **_named: object) -> int:
         done.append("cut")
@@ -67,11 +70,12 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     )
     monkeypatch.setattr(machine_side, "refuse_no_port", lambda _host: None)
     monkeypatch.setattr(machine_side, "node_sockets", sockets)
-    monkeypatch.setattr(machine_side, "is_node", lambda one: one.pid != DATABASE)
+    monkeypatch.setattr(machine_side, "process_key", lambda pid: f"{pid}:1")
+    monkeypatch.setattr("appliance.network.socket_owners.process_key", lambda pid: f"{pid}:1")
     monkeypatch.setattr(machine_side, "_LOOKUP_SECONDS", 0.0)
     time = VirtualClock()
     with using(time):
-        yield Machine(tmp_path, done, refused, time, AdoptWork(tmp_path))
+        yield Machine(tmp_path, done, refused, connected, time, AdoptWork(tmp_path))
 
 
 def test_an_adoption_and_a_release_need_an_operators_order_each(machine: Machine) -> None:
@@ -157,8 +161,21 @@ def test_no_connection_ends_except_while_a_graph_is_taken(
 
 def test_only_ports_of_processes_that_look_like_nodes_are_cut(machine: Machine) -> None:
     machine.begin(Phase.TAKING)
-    machine.order("cut", ports=[NODE, DATABASE])
+    done = machine.order("cut", ports=[NODE, DATABASE])
     assert machine.refused == [{NODE}]
+    assert done["kept"] == {f"TCP {DATABASE}": f"process {DATABASE}: "}, "the operator reads what bypasses it"
+
+
+def test_a_node_whose_connection_to_the_master_was_cut_is_a_node_at_the_next_cut(machine: Machine) -> None:
+    """rospy opens another connection only for its next call, which may never come."""
+    machine.begin(Phase.TAKING)
+    machine.order("cut", ports=[NODE])
+    machine.connected.clear()
+    for work in (machine.work, AdoptWork(machine.state)):
+        machine.work = work
+        assert machine.order("cut", ports=[NODE])["kept"] == {}
+    save_record(machine.state, msgspec.structs.replace(machine.record, boot="another"))
+    assert machine.record.nodes == (), "another process may have the number"
 
 
 def test_the_cuts_of_a_taking_and_of_a_taken_graph_are_bounded(machine: Machine) -> None:
@@ -169,9 +186,11 @@ def test_the_cuts_of_a_taking_and_of_a_taken_graph_are_bounded(machine: Machine)
         machine.order("cut", ports=[NODE])
     machine.order("phase", phase=Phase.TAKEN)
     before = len(machine.refused)
-    assert machine.order("cut", ports=[NODE]) == {"master": 0, "nodes": 0}, "the last cut still refuses"
+    assert machine.order("cut", ports=[NODE]) == {"master": 0, "nodes": 0, "kept": {}}, (
+        "the last cut still refuses"
+    )
     machine.time.advance(60.0)
-    assert machine.order("cut", ports=[NODE]) == {"master": 1, "nodes": 1}
+    assert machine.order("cut", ports=[NODE]) == {"master": 1, "nodes": 1, "kept": {}}
     assert len(machine.refused) == before + 1
 
 

@@ -546,6 +546,18 @@ def test_only_ports_of_the_nodes_own_processes_are_cut() -> None:
     assert run(story).cuts[0] == {5001, 5002, 5003}
 
 
+def test_connections_that_are_not_cut_are_reported_until_the_next_adoption() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.kept = {"TCP 5001": "process 7: /opt/own/robot"}
+        assert (await world.operation.take()).not_cut == world.kept
+        await world.until_settled()
+        assert world.operation.left.connections == world.kept
+        world.kept = {}
+        assert (await world.operation.take()).not_cut == {}
+
+    run(story)
+
+
 def test_no_port_of_the_machine_itself_is_cut_whatever_a_node_says() -> None:
     async def story(world: RobotWorld) -> None:
         world.resolved["nuc"] = ["192.168.50.2"]
