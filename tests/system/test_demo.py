@@ -16,6 +16,7 @@ import pytest
 from appliance.network.namespaces import namespaces
 from tests.support.command import ROSRV
 from tests.support.nodes import has_ros
+from tests.support.own_namespace import own_namespace
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
 
@@ -124,10 +125,11 @@ def test_demo_without_root() -> None:
 def test_demo_of_an_adoption(temporary: Path) -> None:
     environment = os.environ | {"TMPDIR": str(temporary)}
     command = [ROSRV, "demo", "--adopt", "--json"]
-    done = subprocess.run(
-        command,
-        env=environment, capture_output=True, text=True, timeout=LIMIT, check=False,
-    )  # fmt: skip
+    with own_namespace():
+        done = subprocess.run(
+            command,
+            env=environment, capture_output=True, text=True, timeout=LIMIT, check=False,
+        )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     results = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(results) == 5
