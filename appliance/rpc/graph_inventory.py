@@ -21,6 +21,7 @@ _TELLING = ("password", "passwd", "passphrase", "secret", "token", "apikey", "cr
 
 
 _SHARED = "/rosout"  # each node publishes it
+_LOOPBACK = ("http://localhost:", "http://127.")  # a name may be in /etc/hosts of the surveying machine only
 
 
 class NodeConnection(msgspec.Struct, frozen=True):
@@ -86,6 +87,8 @@ class GraphInventory(msgspec.Struct, frozen=True):
     seconds: float = 0
     left_out: tuple[str, ...] = ()
     """The parts that a limit of the survey left out, in words."""
+    own: tuple[str, ...] = ()
+    """All addresses of nodes on the machine of the master, if the survey ran on that machine."""
 
     def host_of(self, node: str) -> str:
         return self.hosts.get(node, "")
@@ -96,8 +99,10 @@ class GraphInventory(msgspec.Struct, frozen=True):
         return {node.name: node.host for node in self.nodes}
 
     def hosts_of(self, nodes: tuple[str, ...]) -> frozenset[str]:
+        """Return an address of each machine of these nodes."""
         known = self.hosts
-        return frozenset(filter(None, (known.get(node, "") for node in nodes)))
+        found = {self.master_host if known.get(node) in self.own else known.get(node, "") for node in nodes}
+        return frozenset(filter(None, found))
 
 
 def _words(name: str) -> set[str]:
@@ -127,7 +132,7 @@ def problems(inventory: GraphInventory) -> Iterator[str]:
     for node in inventory.nodes:
         if node.problem:
             yield f"{node.name} cannot be asked: {node.problem}"
-        elif node.host.startswith("127.") and not inventory.master_host.startswith("127."):
+        elif node.uri.startswith(_LOOPBACK) and not inventory.master_host.startswith("127."):
             yield f"{node.name} announces {node.uri}, which no other host reaches: set ROS_IP or ROS_HOSTNAME for it"
     for topic in inventory.topics:
         if topic.name != _SHARED and len(hosts := inventory.hosts_of(topic.publishers)) > 1:

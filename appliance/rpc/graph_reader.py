@@ -109,10 +109,12 @@ class _Survey:
             for name in self._cut("topics", sorted({*publishers, *subscribers}))
         )
         host = await self._address(self._master.host)
+        hosts = {node.host for node in nodes}
         return GraphInventory(
             self._uri, host, nodes, topics, found, tuple(self._cut("parameters", sorted(parameters))),
-            await self._listeners({host, *(node.host for node in nodes)}), self._calls,
+            await self._listeners({host, *hosts}), self._calls,
             round(clock.now() - self._began, 2), tuple(self._left_out),
+            tuple(sorted(filter(_is_here, hosts))) if _is_here(host) else (),
         )  # fmt: skip
 
     def _cut(self, what: str, names: Sequence[str]) -> Sequence[str]:
@@ -224,6 +226,17 @@ class _Survey:
         pairs = itertools.product(sorted(filter(None, hosts)), LISTENERS)
         found = await asyncio.gather(*(one(host, port) for host, port in pairs))
         return tuple(dict.fromkeys([master, *filter(None, found)]))
+
+
+def _is_here(address: str) -> bool:
+    """Return whether an address belongs to this machine: packets to it would also have it as source."""
+    with suppress(OSError, ValueError):
+        if ipaddress.ip_address(address).is_loopback:
+            return True
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((address, MASTER_PORT))  # sends nothing
+            return str(probe.getsockname()[0]) == address
+    return False
 
 
 def _text(value: object) -> str:

@@ -63,7 +63,7 @@ def draft(inventory: GraphInventory, names: Mapping[str, str]) -> PolicyDraft:
 
 def _groups(inventory: GraphInventory, names: Mapping[str, str]) -> dict[str, str]:
     """Return the group of each address."""
-    groups = {inventory.master_host: ROBOT, "127.0.0.1": ROBOT, "::1": ROBOT}
+    groups = dict.fromkeys((inventory.master_host, *inventory.own, "127.0.0.1", "::1"), ROBOT)
     addresses = {node.host for node in inventory.nodes if node.host} - groups.keys()
     for address in sorted(addresses, key=lambda one: (":" in one, ipaddress.ip_address(one).packed)):
         if ipaddress.ip_address(address).is_loopback:

@@ -64,7 +64,7 @@ def page(inventory: GraphInventory, draft: PolicyDraft | None) -> str:
 
 
 def summary(inventory: GraphInventory) -> str:
-    hosts = {node.host for node in inventory.nodes if node.host}
+    hosts = inventory.hosts_of(tuple(inventory.hosts))
     return (
         f"{counted(len(inventory.nodes), 'node')} on {counted(len(hosts), 'host')},"
         f" {counted(len(inventory.topics), 'topic')}, {counted(len(inventory.services), 'service')},"

@@ -4,8 +4,9 @@ import pytest
 
 from appliance.features.survey.draft import draft, keys_of
 from appliance.policy.cases import run_cases
+from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
-from appliance.rpc.graph_inventory import SurveyedNode, SurveyedTopic
+from appliance.rpc.graph_inventory import SurveyedNode, SurveyedTopic, problems
 from tests.unit.features.survey.surveyed import ARM, BASE, NODES, TABLET, inventory, node
 
 NAMES = {BASE: "base", ARM: "arm.lan", TABLET: "tablet"}
@@ -99,3 +100,16 @@ def test_a_robot_that_names_itself_by_the_loopback_is_one_host() -> None:
     text = draft(inventory(master_host="127.0.0.1", nodes=nodes, topics=(), services=()), {}).text
     assert "[Groups]" not in text
     assert "\n[Nodes]\ndefault = robot\n" in text
+
+
+def test_all_addresses_of_the_machine_of_the_master_are_the_robot() -> None:
+    nodes = (node("/base", BASE), node("/odometry", "127.0.1.1"), node("/teleop", TABLET))
+    topics = (SurveyedTopic("/tf", "tf2_msgs/TFMessage", ("/base", "/odometry"), ("/teleop",)),)
+    found = inventory(
+        master_host="127.0.0.1", own=(BASE, "127.0.1.1"), nodes=nodes, topics=topics, services=()
+    )
+    text, robot = draft(found, NAMES).text, ipaddress.ip_address("10.111.0.1")
+    assert BASE not in text
+    policy = compile_policy(text, file="draft.ini", robot=[robot])
+    assert policy.decide(Request(robot, "/base", Category.PUBLISH, "/tf")).allowed
+    assert not list(problems(found))

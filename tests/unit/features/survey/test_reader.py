@@ -134,3 +134,18 @@ def test_a_limit_is_named_in_the_inventory(run: Any) -> None:
 def test_an_address_that_is_not_a_uri_is_an_error_with_an_example() -> None:
     with pytest.raises(SurveyError, match="--master http://robot:11311"):
         autojump.run(survey("robot:11311", SurveyLimits()))
+
+
+@pytest.mark.parametrize(("here", "own"), [(True, ("10.0.0.1",)), (False, ())])
+def test_the_addresses_of_the_machine_of_the_master_are_known_only_on_that_machine(
+    run: Any, monkeypatch: pytest.MonkeyPatch, here: bool, own: tuple[str, ...]
+) -> None:
+    mine = {"10.0.0.1", "127.0.0.1"} if here else {"10.0.0.1"}  # by chance, a node has an own address
+    monkeypatch.setattr(reader, "_is_here", mine.__contains__)
+    assert run(lookupNode="http://10.0.0.1:4000/").own == own
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("address", "here"), [("127.0.1.1", True), ("::1", True), ("192.0.2.99", False)])
+def test_an_address_of_another_machine_is_not_an_own_one(address: str, here: bool) -> None:
+    assert reader._is_here(address) is here
