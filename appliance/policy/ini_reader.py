@@ -14,6 +14,7 @@ MAXIMUM_CHARACTERS = 2 * 1024 * 1024
 
 _WORD = re.compile(r"[^\s,]++", re.ASCII)
 _COMMENT = re.compile(r"[#;]")
+_NOT_IN_KEYS = re.compile(r"[#;=]")
 _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 
 
@@ -36,6 +37,11 @@ class SectionText:
 
     name: Word
     entries: list[Entry] = field(default_factory=list)
+
+
+def is_key(text: str) -> bool:
+    """Return whether a line can have this text as its key; parameters may have names that none can."""
+    return _NOT_IN_KEYS.search(text) is None
 
 
 def is_repeated(

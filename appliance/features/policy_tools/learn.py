@@ -24,6 +24,7 @@ from appliance.features.policy_tools.stock_tools import key_of
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.commands import ALIASES
 from appliance.policy.host_sets import Network, canonical_address
+from appliance.policy.ini_reader import is_key
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import COMMAND_FOR, rights_of_call
 from appliance.policy.sections import ASK, ASKING, DECIDERS, PARAMETERS
@@ -104,6 +105,8 @@ def learn(
         try:
             needed = list(needed_rights(observation))
         except BadWordError:
+            needed = []
+        if not needed or not all(is_key(request.resource) for request in needed):
             left_out += 1
             continue
         requests += 1
@@ -324,7 +327,8 @@ def _action(category: Category, key: str) -> str:
     """Return the action on a name that the key matches."""
     verb = "use-node" if category is Category.NODE else category.value
     name = key.removesuffix("/**") or "/" if category in PARAMETERS else key
-    return f"{verb} {name.replace('*', '1')}"
+    action = f"{verb} {name.replace('*', '1')}"
+    return json.dumps(action) if ":" in action else action  # YAML would read a mapping
 
 
 def _within(host: Address, place: Address | Network) -> bool:

@@ -1,4 +1,5 @@
 import ipaddress
+import string
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from appliance.features.policy_tools.learn import LearnedPolicy, Observation, co
 from appliance.master.calls.call import RosCall
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
+from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -158,6 +160,26 @@ def test_text_of_unknown_hosts_never_becomes_a_rule(category: Category, resource
     assert resource not in learned.text
     evil = learn([seen("10.0.0.1", Category.COMMAND, "getPid", node="/x\ndefault = *")])
     assert "default" not in evil.text
+
+
+_PARAMETERS = [
+    name
+    for character in string.printable.replace("/", "")
+    for name in (f"/arm/a{character}b", f"/arm/a{character} b", f"/arm/a{character}")
+    if is_parameter_key(name)
+]
+
+
+@pytest.mark.parametrize("name", [*_PARAMETERS, "/arm/a = 10.9.9.9 #y", "/arm/a = 0.0.0.0/0 ;"])
+def test_a_name_of_a_parameter_is_a_key_as_it_is_or_left_out(name: str) -> None:
+    learned = learn([
+        seen("10.0.0.1", Category.COMMAND, "setParam", call="setParam", key=key) for key in ("/arm/a", name)
+    ])  # fmt: skip
+    policy = compiled(learned)
+    keys = {rule.rule.key for rule in policy.rules(Category.WRITE)}
+    assert keys == {"write /arm/a/**"} | ({f"write {name}/**"} if not learned.left_out else set())
+    assert learned.left_out == any(character in name for character in "#;=")
+    assert all(result.passed for result in run_cases(policy, learned.tests, "tests"))
 
 
 _observations = st.builds(
