@@ -46,3 +46,12 @@ def names_in(tree: Tree, above: str = "/") -> Iterator[str]:
             yield from names_in(value, name if name == "~" or name.endswith("/") else f"{name}/")
         else:
             yield name
+
+
+def same_value(one: Value, other: Value) -> bool:
+    """Return whether two values are equal for a node, to which 1, 1.0 and True are not."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same_value(part, other[name]) for name, part in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same_value, one, other))
+    return type(one) is type(other) and one == other

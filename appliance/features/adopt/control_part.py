@@ -19,7 +19,7 @@ from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus, ReleaseOrder
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation, LeftThere
-from appliance.master.calls.call import Caller
+from appliance.master.calls.call import VALUE, Caller
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.graph.registry import Life
 from appliance.policy.model import Address, address_of
@@ -27,6 +27,7 @@ from appliance.rpc.master_reader import Entry, MasterReader
 from appliance.rpc.server import Peer
 from appliance.store.state_file import StateStore
 from appliance.supervisor.machine_work import Found
+from roswire.errors import PeerError
 from roswire.names import ROSOUT
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
@@ -276,15 +277,27 @@ class ParameterOrders:
         return self._calls.mirror.tree
 
     async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
+        """Set them; any host may have written at the other master, whose `{"": …}` would become the whole tree here."""
         host = address_of(self._link())
         caller = Caller(Peer(host, str(host), str(host)), "/rosrv", clock.now_ns())
-        writes = [ParameterWrite(caller, f"/{name}", value) for name, value in values.items()]
-        outcomes = await self._calls.write(writes)
-        return {
+        left, writes = dict[str, str](), dict[str, ParameterWrite]()
+        for name, value in values.items():
+            try:
+                VALUE.canonicalise({name: value}, "")
+            except PeerError as error:
+                left[name] = str(error)
+            else:
+                if "/" in name:
+                    left[name] = "a plain master finds no parameter of this name"
+                else:
+                    writes[name] = ParameterWrite(caller, f"/{name}", value)
+        outcomes = await self._calls.write([*writes.values()])
+        failed = {
             name: str(outcome)
-            for name, outcome in zip(values, outcomes, strict=True)
+            for name, outcome in zip(writes, outcomes, strict=True)
             if isinstance(outcome, Exception)
         }
+        return left | failed
 
 
 def _memory(store: StateStore) -> AdoptMemory:

@@ -72,6 +72,7 @@ from appliance.rpc.master_reader import (
 )
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.supervisor.machine_work import Found
+from roswire.parameter_tree import same_value
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 
@@ -650,7 +651,7 @@ class AdoptOperation:
         calls: list[MasterCall] = [
             ("setParam", MASTER_NAME, (f"/{name}", value))
             for name, value in mine.items()
-            if name not in _OWN_PARAMETERS and (name not in there or there[name] != value)
+            if name not in _OWN_PARAMETERS and not (name in there and same_value(there[name], value))
         ]
         calls += [
             ("deleteParam", MASTER_NAME, (f"/{name}",))

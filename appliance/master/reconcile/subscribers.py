@@ -22,7 +22,7 @@ from appliance.master.graph.registry import ENDED, Change, Incarnation, Kind, Li
 from appliance.rpc.fair_queue import weigh
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state_file import PermissionRow
-from roswire.parameter_tree import Tree, standing_at
+from roswire.parameter_tree import Tree, same_value, standing_at
 from roswire.xmlrpc import Value
 
 _MOST_PARTS = 1000  # of a change, for a node whose subscriptions are unknown
@@ -241,21 +241,12 @@ def settled(value: Value) -> Value:
 
 def _changes_of(key: str, value: Value, before: Value) -> Iterator[tuple[str, Value]]:
     """Yield the keys whose values differ, from the top; `{}` for a key that is gone."""
-    if _same(value, before):
+    if same_value(value, before):
         return
     yield key, value
     now, then = (part if isinstance(part, dict) else {} for part in (value, before))
     for name in {**then, **now}:
         yield from _changes_of(f"{key.rstrip('/')}/{name}", now.get(name, {}), then.get(name))
-
-
-def _same(one: Value, other: Value) -> bool:
-    """Return whether two values are equal for a node, to which 1, 1.0 and True are not."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_same(part, other[name]) for name, part in one.items())
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_same, one, other))
-    return type(one) is type(other) and one == other
 
 
 def _upwards(key: str) -> Iterator[str]:

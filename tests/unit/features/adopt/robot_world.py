@@ -16,9 +16,11 @@ from typing import Any
 import msgspec
 
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase
+from appliance.features.adopt.control_part import ParameterOrders
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation, LeftThere
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterRights
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
 from appliance.rpc.master_reader import Entry, MasterCall, MasterGraph, MasterReadError
@@ -245,10 +247,14 @@ class RobotWorld:
         return self.parts.parameters.tree
 
     async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
-        for name, value in values.items():
-            if name != self.limit:
-                await self.parts.ask("setParam", "/rosrv", f"/{name}", value, host=LINK)
-        return {self.limit: "too large"} if self.limit in values else {}
+        parts = self.parts
+        rights = ParameterRights(lambda: parts.current, parts.records)
+        calls = ParameterCalls(
+            parts.rosmaster, parts.parameters, parts.subscribers.parameter_set, rights, 1 << 20
+        )
+        left = {self.limit: "too large"} if self.limit and self.limit in values else {}
+        wanted = {name: value for name, value in values.items() if name not in left}
+        return left | await ParameterOrders(calls, lambda: LINK).take(wanted)
 
     async def _order(self, host: Address, method: str, /, *params: Value) -> list[Value]:
         self.began.append(method)

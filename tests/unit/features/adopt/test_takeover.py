@@ -9,6 +9,8 @@ from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.machine_facts import RobotMaster
 from appliance.features.adopt.takeover import AdoptError
 from appliance.master.graph.registry import Kind
+from roswire.parameter_tree import same_value
+from roswire.xmlrpc import Value
 from tests.support import autojump
 from tests.support.control_parts import ControlParts
 from tests.unit.features.adopt.robot_world import LINK, KilledError, RobotWorld
@@ -227,6 +229,41 @@ def test_a_release_ends_nothing_that_was_not_adopted(killed: bool) -> None:
         await world.until_settled()
         assert ("publication", "/scan", "/far") in world.master.entries
         assert world.master.tree["speed"] == 1.5
+
+    run(story)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("", {"x": 1}), ("", 5), ("/speed", 2), ("speed/max", 2), ("~a", 1), ("ns", {"/speed": 2})],
+)
+def test_a_name_that_a_plain_master_cannot_find_changes_no_other_parameter(name: str, value: Value) -> None:
+    """Any host may have written it there, before the appliance came."""
+
+    async def story(world: RobotWorld) -> None:
+        world.master.tree[name] = value
+        before = dict(world.master.tree)
+        report = await world.operation.take()
+        assert len(report.left_out) == 1
+        assert world.tree() == {"run_id": "robot", "speed": 1.5}
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert world.master.tree == before
+
+    run(story)
+
+
+@pytest.mark.parametrize(
+    ("before", "now"), [(1, True), (0, False), (1, 1.0), ([1], [1.0]), ({"a": 1}, {"a": True})]
+)
+def test_a_parameter_that_only_changed_its_type_is_given_back(before: Value, now: Value) -> None:
+    async def story(world: RobotWorld) -> None:
+        world.master.tree["speed"] = before
+        await world.operation.take()
+        await world.parts.ask("setParam", "/tool", "/speed", now, host=LINK)
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert same_value(world.master.tree["speed"], now)
 
     run(story)
 
