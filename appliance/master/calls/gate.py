@@ -59,14 +59,13 @@ class CallGate:
         if not decision.allowed or call.row.wire or not caller.caller_id:
             return decision
         denial = None
-        if attempt.api is not None:
-            denial = self._late(caller, attempt.api)
-            if denial is None and call.verb is not CallVerb.UNREGISTER:
-                denial = (
-                    self._taken(attempt)
-                    or _unreachable(caller, attempt.api)
-                    or self._over_limit(caller, attempt.api)
-                )
+        if attempt.api is not None and call.verb is not CallVerb.UNREGISTER:
+            denial = (
+                self._late(caller, attempt.api)
+                or self._taken(attempt)
+                or _unreachable(caller, attempt.api)
+                or self._over_limit(caller, attempt.api)
+            )
         return denial or self._bound(attempt, decision)
 
     # --- the binding of claims ---
