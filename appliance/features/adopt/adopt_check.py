@@ -1,5 +1,6 @@
 """Look at a robot before its graph is taken over: what would change, and what would stop it. Nothing is changed."""
 
+import os
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
@@ -13,10 +14,12 @@ from urllib.parse import urlsplit
 from appliance.base.counted import counted
 from appliance.features.adopt.adopt_record import AdoptRecord
 from appliance.features.adopt.machine_facts import RobotMaster
+from appliance.features.adopt.machine_side import of_roscore
 from appliance.network.cut import can_end_connections
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.listening_sockets import TcpSocket, tcp_sockets
 from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.socket_owners import programs_of_unit
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_of_call
@@ -26,6 +29,7 @@ Level = Literal["ok", "warn", "stop"]
 _CGROUPS = Path("/sys/fs/cgroup/cgroup.controllers")
 _SHOWN = 5
 _SYSTEMCTL_SECONDS = 5.0
+_SHELLS = {"sh", "dash", "bash", "zsh"}
 _DEPENDS = ("RequiredBy", "BoundBy", "ConsistsOf")
 
 
@@ -228,6 +232,10 @@ def _units(state: CheckedRobot) -> Iterator[CheckLine]:
     master = state.master
     if master is None or not master.unit:
         return
+    if not master.group and (why := _why_no_drop_in(master.unit)):
+        text = f"{master.unit} {why}, so no drop-in keeps it working: it must not restart while the graph is adopted"
+        yield CheckLine("warn", "units", text)
+        return
     if not master.group:
         text = f"{master.unit} has its own master and other programs; if it restarts, a release starts another master"
         yield CheckLine("ok", "units", text)
@@ -239,6 +247,17 @@ def _units(state: CheckedRobot) -> Iterator[CheckLine]:
     else:
         text = f"{who}without control groups v2, {master.unit} must not restart while the graph is adopted"
         yield CheckLine("warn", "units", text)
+
+
+def _why_no_drop_in(unit: str) -> str:
+    """Return why a unit without other programs than `roscore` gets no drop-in; empty for a unit with others."""
+    if not unit.endswith(".service"):
+        return ""
+    programs = programs_of_unit(unit)
+    others = [line.split()[0] for line in programs if not of_roscore(line)]
+    if any(os.path.basename(program) not in _SHELLS for program in others):  # noqa: PTH119  words, not paths
+        return ""
+    return "starts roscore by a script, and not by `exec`" if programs else "is not directly in system.slice"
 
 
 def depending_units(unit: str) -> list[str]:

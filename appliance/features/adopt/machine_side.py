@@ -311,11 +311,11 @@ def master_of(host: Namespace, port: int) -> RobotMaster | None:
     if holder is None:
         return None
     lines = programs_of_unit(holder.unit) if holder.unit else []
-    group = f"system.slice/{holder.unit}" if lines and all(map(_of_roscore, lines)) else ""
+    group = f"system.slice/{holder.unit}" if lines and all(map(of_roscore, lines)) else ""
     return RobotMaster(holder.pid, holder.program, user_of(holder.pid), holder.unit, group)
 
 
-def _of_roscore(line: str) -> bool:
+def of_roscore(line: str) -> bool:
     """Return whether a process belongs to roscore: roslaunch in its role, rosmaster, rosout."""
     words = [os.path.basename(word) for word in line.split()]  # noqa: PTH119  words, not paths
     return not words or any(word in {"roscore", "rosmaster", "rosout"} for word in words[:3])

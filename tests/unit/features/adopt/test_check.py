@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base.shipped import SHIPPED
+from appliance.features.adopt import adopt_check
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import RobotMaster
@@ -53,6 +54,36 @@ def test_a_robot_that_can_be_adopted_has_no_stop() -> None:
 def test_a_robot_without_a_master_or_with_another_program_stops() -> None:
     assert lines(replace(robot(), master=None))["master"].level == "stop"
     assert lines(replace(robot(), inventory=None))["master"].level == "stop"
+
+
+@pytest.mark.parametrize(
+    ("unit", "programs", "level", "text"),
+    [
+        ("roscore@pi.service", [], "warn", "not directly in system.slice"),  # in system-roscore.slice
+        (
+            "core.service",
+            ["/bin/bash /root/start.sh", "python3 /opt/ros/noetic/bin/roscore"],
+            "warn",
+            "by a script",
+        ),
+        (
+            "robot.service",
+            ["/bin/bash /root/start.sh", "python3 /opt/ros/noetic/bin/roslaunch a b"],
+            "ok",
+            "other",
+        ),
+        ("robot.service", ["roslaunch robot.launch", "rosmaster --core"], "ok", "and other programs"),
+        ("session-3.scope", [], "ok", "and other programs"),
+    ],
+)
+def test_a_roscore_that_no_drop_in_can_help_must_not_restart(
+    monkeypatch: pytest.MonkeyPatch, unit: str, programs: list[str], level: str, text: str
+) -> None:
+    monkeypatch.setattr(adopt_check, "programs_of_unit", {unit: programs}.__getitem__)
+    found = list(
+        adopt_check._units(replace(robot(), master=RobotMaster(1, "/usr/bin/rosmaster", "robot", unit)))
+    )
+    assert [(line.level, text in line.text) for line in found] == [(level, True)]
 
 
 @pytest.mark.parametrize(
