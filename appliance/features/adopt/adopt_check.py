@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from urllib.parse import urlsplit
 
 from appliance.base.counted import counted
-from appliance.features.adopt.adopt_record import AdoptRecord
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase
 from appliance.features.adopt.machine_facts import RobotMaster
 from appliance.features.adopt.machine_side import of_roscore
 from appliance.network.cut import can_end_connections
@@ -65,6 +65,11 @@ def check_lines(state: CheckedRobot, host: Namespace) -> list[CheckLine]:
 
 
 def graph_lines(state: CheckedRobot) -> Iterator[CheckLine]:
+    if (
+        state.record.phase is Phase.TAKEN
+    ):  # this machine's own port leads to RVMaster, which hides the nodes' hosts
+        yield _adopted(state)
+        return
     yield from _master(state)
     if state.master is None or state.inventory is None:
         return
@@ -76,9 +81,14 @@ def graph_lines(state: CheckedRobot) -> Iterator[CheckLine]:
             yield CheckLine("warn", "graph", problem)
 
 
+def _adopted(state: CheckedRobot) -> CheckLine:
+    text = f"since {state.record.since_utc}, from {state.record.program}; nodes: rosrv adopt --status"
+    return CheckLine("ok", "adopted", text)
+
+
 def _master(state: CheckedRobot) -> Iterator[CheckLine]:
     if state.record.wanted:
-        yield CheckLine("ok", "adopted", f"since {state.record.since_utc}, from {state.record.program}")
+        yield _adopted(state)
     if state.master is None:
         level: Level = "ok" if state.record.wanted else "stop"
         yield CheckLine(level, "master", f"no program listens on TCP {state.port}: start the robot first")

@@ -19,7 +19,7 @@ from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.machine_side import master_of, start_stand_in
 from appliance.features.adopt.places import call_node
-from appliance.features.adopt.robot_side import MASTER_PORT
+from appliance.features.adopt.robot_side import MASTER_PORT, running_settings
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry
@@ -66,7 +66,8 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
     record, registry = _record(state), Registry()
     restore(registry, store)
     trail = cast(AuditTrail, _Log())
-    machine = _DeadMachine(state, record)
+    port = _port(state)
+    machine = _DeadMachine(state, record, port)
     graph = AdoptedGraph(
         registry, RosGraph(registry, Grants(lambda _row: None, set), trail), cast(Subscribers, _NoSubscribers()), trail,
         _no_order, flush=lambda: None,
@@ -76,7 +77,7 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
         save_record(state, msgspec.structs.replace(record, wanted=False))
         return GiveBackReport()
     operation = AdoptOperation(
-        machine, lambda _facts: MasterReader(NodeUri("http", _HERE, MASTER_PORT, "/")), graph,
+        machine, lambda _facts: MasterReader(NodeUri("http", _HERE, port, "/")), graph,
         _StoredParameters(store.load_parameters()), waiting=lambda: 0, silence=lambda: None, speak=lambda: None,
         call=_call, forwards=False,
     )  # fmt: skip
@@ -86,6 +87,12 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
             store.forget_incarnation(key)
     await store.settled()
     return report
+
+
+def _port(state: Path) -> int:
+    """Return the port of RVMaster, and so of the robot's own master."""
+    settings = running_settings(state)
+    return MASTER_PORT if settings is None else settings.listen_address[1]
 
 
 @contextlib.contextmanager
@@ -115,20 +122,20 @@ def _opened(state: Path) -> Iterator[StateStore]:
 class _DeadMachine:
     """Does the supervisor's work in its absence: see `machine_side.py`."""
 
-    def __init__(self, state: Path, record: AdoptRecord) -> None:
-        self._state, self._record = state, record
+    def __init__(self, state: Path, record: AdoptRecord, port: int) -> None:
+        self._state, self._record, self._port = state, record, port
         self._host = Namespace.own()
 
     async def __call__(self, work: str, /, **terms: object) -> Found:
         if work == "look":
             facts = MachineFacts(
-                self._record, _HERE, _HERE, own=[_HERE], master=master_of(self._host, MASTER_PORT)
+                self._record, _HERE, _HERE, own=[_HERE], master=master_of(self._host, self._port)
             )
             return dict(msgspec.to_builtins(facts))
         if work == "stand in":
-            Isolation(self._host, IsolationSettings(ports=(PortRange.one(MASTER_PORT),))).clear()
-            if master_of(self._host, MASTER_PORT) is None:
-                start_stand_in(self._host, MASTER_PORT, self._record)
+            Isolation(self._host, IsolationSettings(ports=(PortRange.one(self._port),))).clear()
+            if master_of(self._host, self._port) is None:
+                start_stand_in(self._host, self._port, self._record)
                 return {"started": True}
         if work == "phase" and terms["phase"] is Phase.FREE:
             save_record(self._state, msgspec.structs.replace(self._record, wanted=False, phase=Phase.FREE))

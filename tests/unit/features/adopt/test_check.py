@@ -1,11 +1,13 @@
+import asyncio
 import ipaddress
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from appliance.base.shipped import SHIPPED
-from appliance.features.adopt import adopt_check
+from appliance.features.adopt import adopt_check, dead_release
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import RobotMaster
@@ -115,6 +117,28 @@ def test_denied_registrations_are_counted_and_named() -> None:
     assert lines(robot(denying))["policy"].level == "warn"
     audit_only = lines(robot(denying + AUDIT_ONLY))["policy"]
     assert audit_only == ("ok", "policy", "audit-only: 1 of 2 registrations would be denied")
+
+
+def test_an_adopted_graph_is_not_judged_by_the_appliances_own_addresses() -> None:
+    """There the port of the master leads to RVMaster, by which each node is at the appliance."""
+    seen = robot(DEFAULT, SurveyedNode("/base", "http://10.111.0.2:19001/", "10.111.0.2"))
+    taken = AdoptRecord(wanted=True, phase=Phase.TAKEN, program=MASTER.program)
+    assert [(line.level, line.about) for line in graph_lines(replace(seen, record=taken))] == [
+        ("ok", "adopted")
+    ]
+
+
+@pytest.mark.parametrize("listen", ["0.0.0.0:11311", "0.0.0.0:11411"])
+def test_a_release_without_the_appliance_looks_for_the_master_on_its_port(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, listen: str
+) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text(json.dumps({"listen": listen}))
+    asked: list[int] = []
+    monkeypatch.setattr(dead_release, "master_of", lambda _host, port: asked.append(port))
+    machine = dead_release._DeadMachine(tmp_path, AdoptRecord(), dead_release._port(tmp_path))
+    asyncio.run(machine("look"))
+    assert asked == [int(listen[-5:])]
 
 
 def test_connections_that_would_be_cut_are_counted() -> None:
