@@ -11,6 +11,7 @@
 """
 
 import ipaddress
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -71,8 +72,8 @@ def _groups(inventory: GraphInventory, names: Mapping[str, str]) -> dict[str, st
             continue
         name = names.get(address, "").partition(".")[0]
         good = _GROUP.fullmatch(name) and name not in {*_RESERVED, *groups.values()}
-        number = len(set(groups.values()))
-        groups[address] = name if good else f"host-{number}"
+        numbered = (f"host-{number}" for number in itertools.count(len(set(groups.values()))))
+        groups[address] = name if good else next(one for one in numbered if one not in groups.values())
     return groups
 
 

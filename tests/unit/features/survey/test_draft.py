@@ -113,3 +113,10 @@ def test_all_addresses_of_the_machine_of_the_master_are_the_robot() -> None:
     policy = compile_policy(text, file="draft.ini", robot=[robot])
     assert policy.decide(Request(robot, "/base", Category.PUBLISH, "/tf")).allowed
     assert not list(problems(found))
+
+
+def test_hosts_without_a_name_get_names_that_no_other_host_has() -> None:
+    nodes = (node("/base", BASE), node("/arm", ARM), node("/tablet", TABLET), node("/nuc", "10.0.0.8"))
+    found = inventory(nodes=nodes, topics=(), services=())
+    text = draft(found, {ARM: "host-2", "10.0.0.8": "host-3"}).text
+    assert "host-2 = 10.0.0.2\nhost-3 = 10.0.0.7\nhost-4 = 10.0.0.8\n" in text
