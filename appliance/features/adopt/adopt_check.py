@@ -65,9 +65,7 @@ def check_lines(state: CheckedRobot, host: Namespace) -> list[CheckLine]:
 
 
 def graph_lines(state: CheckedRobot) -> Iterator[CheckLine]:
-    if (
-        state.record.phase is Phase.TAKEN
-    ):  # this machine's own port leads to RVMaster, which hides the nodes' hosts
+    if state.record.phase is Phase.TAKEN:  # the master's port leads to RVMaster, which hides the nodes' hosts
         yield _adopted(state)
         return
     yield from _master(state)
