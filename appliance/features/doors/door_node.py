@@ -6,7 +6,7 @@ left, unless a new topic needs its slot. The master and the relay decide about a
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sized
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 from weakref import WeakValueDictionary
@@ -227,14 +227,19 @@ class DoorNode:
         refused = self._refused.get(request.topic) if request.repeated else None
         if refused is not None and clock.now() - refused[0] < _ASK_SECONDS and refused[1] == request.type:
             raise ProtocolError(refused[2])
+        await self._register(request, client)
+        self._refused.pop(request.topic, None)
+
+    @contextlib.contextmanager
+    def _refusing_all(self, request: AdvertiseTopic) -> Iterator[None]:
+        """Remember a refusal that every client of the door would get, unlike one of a will or of a host's share."""
         try:
-            await self._register(request, client)
+            yield
         except RosError as error:
             if len(self._refused) >= self._topics.whole:
                 self._refused.clear()
             self._refused[request.topic] = clock.now(), request.type, str(error)
             raise
-        self._refused.pop(request.topic, None)
 
     async def _register(self, request: AdvertiseTopic, client: DoorClient) -> None:
         async with self._lock(f"publisher {request.topic}"):
@@ -249,22 +254,25 @@ class DoorNode:
                 await self._make_room(
                     self._publications, users, client, self._published, self._end_publication
                 )
-                kind = await self._published_type(request)
-                publication = await self.node.advertise(
-                    request.topic,
-                    MessageType.defined(kind.definitions, kind.name),
-                    latched=request.latched,
-                    queue=request.queue,
-                    replay=_REPLAY_SECONDS,
-                )
+                with self._refusing_all(request):
+                    kind = await self._published_type(request)
+                _check_will(request, kind, client.memory)
+                with self._refusing_all(request):
+                    publication = await self.node.advertise(
+                        request.topic,
+                        MessageType.defined(kind.definitions, kind.name),
+                        latched=request.latched,
+                        queue=request.queue,
+                        replay=_REPLAY_SECONDS,
+                    )
                 known = self._publications[request.topic] = _Publication(publication, kind, clock.now())
-                self._published.left(request.topic)  # until the client is added
             elif request.type not in (None, known.publication.type.name):
                 raise ProtocolError(
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
                 )
+            else:
+                _check_will(request, known.type, client.memory)
             if request.will is not None:
-                _written(known.type.codec.writer, request.will, client.memory)  # raises if it does not fit
                 known.wills[client] = request.will
             known.clients.add(client)
             self._published.used(request.topic)
@@ -565,6 +573,11 @@ def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -
     cost = writer.cost(values)
     with memory.holding(cost) if cost > _SMALL_BYTES else contextlib.nullcontext():
         return writer.from_json(values, present_time())
+
+
+def _check_will(request: AdvertiseTopic, kind: KnownType, memory: ClientMemory) -> None:
+    if request.will is not None:
+        _written(kind.codec.writer, request.will, memory)  # raises if it does not fit
 
 
 def _named(values: Raw, names: list[str]) -> bytes:
