@@ -1,11 +1,13 @@
 """Encode texts as PNG images, for rosbridge's compression `png`.
 
 Compressing a large text takes a long time, so it is divided into steps, between which a door serves its other
-clients.
+clients. The text is JSON, and becomes ASCII first: in a browser, roslib takes each byte of the pixels for a character.
 """
 
 import base64
+import json
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -14,13 +16,16 @@ from typing import TypeAlias
 from appliance.features.doors.client_frames import ClientFrame, text_frame
 
 _STEP_BYTES = 3 << 14  # of the text, or of the image: about a millisecond
+_NOT_ASCII = bytes(range(128, 256))
+_OTHERS = re.compile(rb"[\x80-\xff]+")
 
 
 class PngFrame:
     """A frame that is made in steps; `frame` is None until it is complete. `size` is the most memory that it takes."""
 
     def __init__(self, text: bytes) -> None:
-        self.size = 2 * len(text)
+        escapes = 0 if text.isascii() else len(text) - len(text.translate(None, _NOT_ASCII))
+        self.size = 2 * (len(text) + 2 * escapes)
         self.frame: ClientFrame | None = None
         self._steps = self._make(text)
 
@@ -28,8 +33,15 @@ class PngFrame:
         """Do a part of the work; clients that share the frame also share its steps."""
         next(self._steps, None)
 
-    def _make(self, text: bytes) -> Iterator[None]:
+    def _make(self, text: bytes | bytearray) -> Iterator[None]:
         image, encoded = bytearray(), bytearray(b'{"op":"png","data":"')
+        if not text.isascii():
+            escaped = bytearray()
+            for part in _in_ascii(text):
+                escaped += part
+                yield
+            text = escaped
+            del escaped
         parts = _image(text)
         del text  # each part of the memory ends with its use
         for part in parts:
@@ -46,7 +58,18 @@ class PngFrame:
 DoorFrame: TypeAlias = ClientFrame | PngFrame
 
 
-def _image(data: bytes) -> Iterator[bytes]:
+def _in_ascii(text: bytes | bytearray) -> Iterator[bytes]:
+    """Yield the parts of a JSON text in ASCII. At most three bytes become of each that is not."""
+    start = 0
+    while start < len(text):
+        end = min(start + _STEP_BYTES, len(text))
+        while end < len(text) and text[end] & 0xC0 == 0x80:  # inside a character
+            end += 1
+        yield _OTHERS.sub(lambda found: json.dumps(found[0].decode())[1:-1].encode(), text[start:end])
+        start = end
+
+
+def _image(data: bytes | bytearray) -> Iterator[bytes]:
     """Yield the parts of an image whose pixels (8-bit RGB) are these bytes, filled up with line feeds."""
     width = max(math.isqrt(len(data) // 3), 1)
     height = -(-len(data) // (3 * width))

@@ -63,7 +63,8 @@ class Client:
         return frames
 
     def hears(self, text: str, topic: str = "/chatter") -> None:
-        body = struct.pack("<I", len(text)) + text.encode()
+        data = text.encode()
+        body = struct.pack("<I", len(data)) + data
         self.rosbridge.message(DoorMessage(topic, body, {}, 7_000_000_005, lambda _header: STRING), self.now)
 
 
@@ -212,10 +213,12 @@ def test_messages_have_the_spelling_and_the_compression_of_the_client(client: Cl
     assert client.gets() == []
 
 
-@pytest.mark.parametrize("length", [*range(1, 12), 5000])
-def test_png_holds_the_frame_in_its_pixels(client: Client, length: int) -> None:
+@pytest.mark.parametrize(
+    "text", [*("x" * length for length in range(1, 12)), "x" * 5000, "grüße, 机器人 😀" * 3000]
+)
+def test_png_holds_the_frame_in_its_pixels(client: Client, text: str) -> None:
     client.sends({"op": "subscribe", "topic": "/chatter", "compression": "png"})
-    client.hears("x" * length)
+    client.hears(text)
     (frame,) = client.gets()
     png = base64.b64decode(frame["data"])
     chunks, position = dict[bytes, bytes](), 8
@@ -230,8 +233,9 @@ def test_png_holds_the_frame_in_its_pixels(client: Client, length: int) -> None:
     rows = zlib.decompress(chunks[b"IDAT"])
     assert len(rows) == height * (3 * width + 1)
     pixels = b"".join(rows[start + 1 : start + 3 * width + 1] for start in range(0, len(rows), 3 * width + 1))
-    expected = {"op": "publish", "topic": "/chatter", "msg": {"data": "x" * length}}
-    assert json.loads(pixels) == expected  # the line feeds at the end are white space
+    expected = {"op": "publish", "topic": "/chatter", "msg": {"data": text}}
+    read = pixels.decode("latin-1")  # as roslib reads them in a browser: each byte is a character
+    assert json.loads(read) == expected  # the line feeds at the end are white space
 
 
 def test_two_spellings_of_a_topic_both_get_its_messages(client: Client) -> None:
