@@ -4,6 +4,8 @@ A schema of msgspec checks a whole message before anything is written, and names
 rosbridge, missing fields are zero; a header without a stamp, and a time that is `now`, get the present time.
 """
 
+import binascii
+import contextlib
 import struct
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, Self
@@ -158,7 +160,7 @@ class _Writers:
         if not field.is_array:
             return self._element(field.type)
         if field.type in BYTE_TYPES:
-            return bytes | list[_Uint8], self._counted(field, bytes, 1)
+            return str | list[_Uint8], self._bytes(field)
         kind, write = self._element(field.type)
         if field.type in PRIMITIVES and field.type not in TIME_TYPES:
             code, size = PRIMITIVES[field.type]
@@ -182,6 +184,14 @@ class _Writers:
         self._check_room(out, len(data))
         out += _LENGTH.pack(len(data))
         out += data
+
+    def _bytes(self, field: Field) -> _Write:
+        write_bytes = self._counted(field, bytes, 1)
+
+        def write(value: Any, out: bytearray, now: Now) -> None:
+            write_bytes(_of_base64(value) if isinstance(value, str) else value, out, now)
+
+        return write
 
     def _counted(self, field: Field, pack: Callable[[Any], bytes], size: int) -> _Write:
         def write(values: Sequence[Any], out: bytearray, _now: Now) -> None:
@@ -232,6 +242,14 @@ def _time(kind: str) -> tuple[Any, _Write]:
         out += whole.pack((0 if secs is UNSET else secs) + whole_seconds, rest)
 
     return (_Time | Literal["now"] if kind == "time" else _Duration), write
+
+
+def _of_base64(text: str) -> bytes:
+    """Return the bytes of a text, which may have lines, as from MIME and from Android."""
+    with contextlib.suppress(ValueError):
+        if text.isascii():  # otherwise, each copy could take four bytes for a character
+            return binascii.a2b_base64(text.replace("\n", "").replace("\r", ""), strict_mode=True)
+    raise _FieldError("Invalid base64 encoded string")
 
 
 def _write_count(field: Field, count: int, out: bytearray) -> None:

@@ -105,7 +105,7 @@ def test_every_standard_message_survives_json_and_cbor_and_is_what_rosbags_reads
 
 
 def test_bytes_are_accepted_as_base64_as_numbers_and_as_cbor_bytes() -> None:
-    for spelling in ('{"data":"AAEC"}', '{"data":[0,1,2]}'):
+    for spelling in ('{"data":"AAEC"}', r'{"data":"AA\nEC\r\n"}', '{"data":[0,1,2]}'):
         assert written("uint8[] data", spelling) == b"\x03\x00\x00\x00\x00\x01\x02"
     for given in (b"\0\1\2", "AAEC", [0, 1, 2], cbor2.CBORTag(64, b"\0\1\2"), cbor2.CBORTag(68, b"\0\1\2")):
         frame = json_of_cbor(cbor2.dumps({"data": given}))
@@ -162,6 +162,7 @@ def test_a_header_without_a_stamp_gets_the_present_time(given: str, stamp: tuple
         ("float64[3] a", '{"a":[1,2]}', "Expected float64[3], got 2 elements - at `$.a`"),
         ("uint8[2] a", '{"a":"AAEC"}', "Expected uint8[2], got 3 elements - at `$.a`"),
         ("uint8[] a", '{"a":"*"}', "Invalid base64 encoded string - at `$.a`"),
+        ("uint8[] a", '{"a":"AAECü"}', "Invalid base64 encoded string - at `$.a`"),
         ("t/Row[] r", '{"r":[{"f":[1]},{"f":[1,2]}]}', "Expected float32[1], got 2 elements - at `$.r[1].f`"),
         ("string a", '{"a":"' + "x" * 10_001 + '"}', "The message has more than 10000 bytes - at `$.a`"),
         ("uint8[1000] a", '{"a":"' + "A" * 10 + '"}', "Invalid base64 encoded string"),
