@@ -213,7 +213,7 @@ class DoorSession:
                     break
             rejected = ""
             if events and isinstance(events[0], Request):
-                rejected = rejection(events[0].headers, self._options.origins)
+                rejected = self.end or rejection(events[0].headers, self._options.origins)
                 self._socket.send_response(
                     self._socket.reject(HTTPStatus.FORBIDDEN, f"{rejected}\n")
                     if rejected

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from websockets.datastructures import Headers
+from websockets.typing import Subprotocol
 
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.png_frames import PngFrame
@@ -98,6 +99,21 @@ async def test_a_will_is_published_within_seconds_after_the_network_is_cut() -> 
         client.stop_reading()
         await asyncio.sleep(4)
         assert heard == [string("stop")]
+
+
+@pytest.mark.parametrize("subprotocols", [[], [Subprotocol("foxglove.websocket.v1")]])
+async def test_a_client_whose_right_ends_before_its_handshake_gets_nothing(
+    subprotocols: list[Subprotocol],
+) -> None:
+    async with door_world() as world:
+        streams = world.network.connect("10.0.0.9", DOOR)
+        await asyncio.sleep(1)
+        world.sessions[0].revoke("this host is blocked by an operator")
+        client = WebSocketClient(*streams, subprotocols=subprotocols)
+        await asyncio.sleep(5)
+        assert client.response is not None and client.response.status_code == 403
+        assert client.response.body == b"this host is blocked by an operator\n" and client.frames.empty()
+        assert not world.sessions[0].began and "blocked" in world.sessions[0].end
 
 
 async def test_a_publication_without_a_grant_is_refused_until_it_is_granted_again() -> None:
