@@ -81,10 +81,21 @@ class Bridge(Node):
         self._refusals.publish(String(data=text))
 
 
+def _both_ways(settings: dict[str, Any]) -> list[str]:
+    """Return the topics in both directions. Their messages would circle: ROS 2 and a door hear their own."""
+    there, back = (
+        {row["topic"].strip("/") for row in settings.get(way) or ()} for way in ("to_ros1", "to_ros2")
+    )
+    return sorted(f"/{topic}" for topic in there & back)
+
+
 def main() -> int:
     """Run until the door closes the connection."""
+    settings = yaml.safe_load(Path(sys.argv[1]).read_text())
+    if both := _both_ways(settings):
+        sys.exit(f"{', '.join(both)}: carry a topic in one direction only, or its messages circle for ever")
     rclpy.init()
-    node = Bridge(yaml.safe_load(Path(sys.argv[1]).read_text()))
+    node = Bridge(settings)
     executor = MultiThreadedExecutor()
     executor.add_node(node)
     while rclpy.ok() and not node.ended.is_set():
