@@ -75,6 +75,8 @@ class TicketEnded(Message, frozen=True):
     """The ticket has ended, and its connections end with it."""
 
     ticket: str
+    replaced: bool = False
+    """Whether a newer visit of the same person took its place, so that the right has not ended."""
 
 
 class SocketWanted(Message, frozen=True):

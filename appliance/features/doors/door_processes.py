@@ -145,8 +145,8 @@ class DoorProcesses:
                 self._core.links.kill(ROLE, number)
                 self.start()
 
-    def end_ticket(self, row: DoorRow, ticket: str) -> None:
-        self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
+    def end_ticket(self, row: DoorRow, ticket: str, *, replaced: bool) -> None:
+        self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket, replaced))
 
     def pass_on(self, row: DoorRow, descriptor: int, peer: str, ticket: str) -> bool:
         slot = self._slots[row.slot or 0]

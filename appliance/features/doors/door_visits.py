@@ -1,7 +1,7 @@
 """The visits of signed-in people: the console opens the caller's own door, with a ticket for one connection.
 
 Nothing is stored. A visit ends with control's process, and with the last of the tokens and sessions that its person
-had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit ends the oldest.
+had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit replaces the oldest.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ class _Visit:
     row: TicketRow
     credentials: frozenset[str]
     used: bool = False
-    over: bool = False
+    replaced: bool = False
 
 
 class DoorVisits:
@@ -34,9 +34,9 @@ class DoorVisits:
         self._visits: dict[str, _Visit] = {}
 
     def make(self, door: str, who: str, seconds: float = _OPEN_SECONDS) -> tuple[TicketRow, str]:
-        own = [one for one in self._visits.values() if one.row.who == who and not one.over]
+        own = [one for one in self._visits.values() if one.row.who == who and not one.replaced]
         for visit in own[: max(0, len(own) + 1 - _MOST_OF_PERSON)]:
-            visit.over = True
+            visit.replaced = True
         row, text = new_ticket(door, seconds, who)
         credentials = frozenset(number for number, name in self._bearers().items() if name == who)
         self._visits[row.id] = _Visit(row, credentials)
@@ -60,27 +60,29 @@ class DoorVisits:
         self._visits = {ticket: one for ticket, one in self._visits.items() if one.row.door != door}
 
     def present(self, door: str) -> list[TicketRow]:
-        return [one.row for one in self._visits.values() if one.row.door == door and not one.over]
+        return [one.row for one in self._visits.values() if one.row.door == door and not one.replaced]
 
-    def ended(self) -> list[TicketRow]:
-        """Remove and return the visits that have ended."""
+    def ended(self) -> list[tuple[TicketRow, bool]]:
+        """Remove and return the visits that have ended, and whether a newer one replaced them."""
         if not self._visits:
             return []
         bearers = self._bearers()
         ended = [
             one
             for one in self._visits.values()
-            if one.over or one.credentials.isdisjoint(bearers) or (not one.used and not self._may_open(one))
+            if one.replaced
+            or one.credentials.isdisjoint(bearers)
+            or (not one.used and not self._may_open(one))
         ]
         for visit in ended:
             del self._visits[visit.row.id]
             self._ends.forget(VISITS, visit.row.id)
-        return [visit.row for visit in ended]
+        return [(visit.row, visit.replaced) for visit in ended]
 
     def _may_open(self, visit: _Visit) -> bool:
         return (
             not visit.used
-            and not visit.over
+            and not visit.replaced
             and not self._ends.passed(VISITS, visit.row.id)
             and not visit.credentials.isdisjoint(self._bearers())
         )

@@ -190,14 +190,17 @@ class DoorOrders:
             self._viewers.tell(
                 (row.name, self._processes.health(row).connections) for row in self._table.live()
             )
-            ended = {row.id: row.door for row in self._visits.ended()}
-            ended |= {one: self._used.pop(one) for one in [*self._used] if self._tickets.ended(one)}
-            for ticket, name in ended.items():
-                for row in [one for one in self._table.live() if one.name == name]:
-                    self._processes.end_ticket(row, ticket)
+            for visit, replaced in self._visits.ended():
+                self._end_ticket(visit.door, visit.id, replaced=replaced)
+            for ticket in [one for one in self._used if self._tickets.ended(one)]:
+                self._end_ticket(self._used.pop(ticket), ticket)
             if number % _RETRY_SECONDS == 0:
                 with contextlib.suppress(OSError):
                     self._processes.retry()
+
+    def _end_ticket(self, door: str, ticket: str, *, replaced: bool = False) -> None:
+        for row in [one for one in self._table.live() if one.name == door]:
+            self._processes.end_ticket(row, ticket, replaced=replaced)
 
     def state(self) -> dict[str, object]:
         rows = self._table.live()

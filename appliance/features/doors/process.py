@@ -47,6 +47,7 @@ _AGAIN_SECONDS = 1.0
 _REPORT_SECONDS = 1.0
 _MOST_PEERS = 256  # in one report
 _BLOCKED = "this host is blocked by an operator"
+_REPLACED = "this person opened the door again and again, which ended the oldest connection"
 _log = structlog.get_logger()
 
 
@@ -165,8 +166,8 @@ class DoorProcess:
                 self._block(hosts)
             case door_link.DoorEnded():
                 self._end_door()
-            case door_link.TicketEnded(ticket):
-                self._end_tickets(lambda one: one == ticket)
+            case door_link.TicketEnded(ticket, replaced):
+                self._end_tickets(lambda one: one == ticket, replaced=replaced)
             case _:
                 self._answered(message)
 
@@ -190,10 +191,13 @@ class DoorProcess:
         for client in [one for one in self._clients if one.peer in self._blocked]:
             client.session.revoke(_BLOCKED)
 
-    def _end_tickets(self, ended: Callable[[str], bool]) -> None:
+    def _end_tickets(self, ended: Callable[[str], bool], *, replaced: bool = False) -> None:
         self._tickets = Counter({one: count for one, count in self._tickets.items() if not ended(one)})
         for client in [one for one in self._clients if one.ticket and ended(one.ticket)]:
-            client.session.revoke("the ticket is over; ask the operator for a new one")
+            if replaced:  # the person still has the right, so the wills are published
+                client.session.disconnect(_REPLACED)
+            else:
+                client.session.revoke("the ticket is over; ask the operator for a new one")
 
     def _took(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:

@@ -7,6 +7,7 @@ import pytest
 
 from appliance.features.doors import door_link, process
 from appliance.features.doors.connections import DoorConnections
+from appliance.features.doors.door_node import DoorNode
 from tests.support.features.doors.door_world import DOOR, WebSocketClient
 from tests.support.memory_network import MemoryNetwork
 
@@ -106,4 +107,26 @@ async def test_a_blocked_host_is_not_served(monkeypatch: pytest.MonkeyPatch, whe
     await asyncio.sleep(3)
     ends = {one.peer: one.reason for one in control.reports if isinstance(one, door_link.ConnectionsChanged)}
     assert ends.get("10.0.0.7") == "this host is blocked by an operator"
+    await control.end()
+
+
+@pytest.mark.parametrize("replaced", [True, False])
+async def test_a_visit_that_a_newer_one_replaces_leaves_its_wills(
+    monkeypatch: pytest.MonkeyPatch, replaced: bool
+) -> None:
+    """Its person may drive, and the door stops the robot. After the end of a ticket, no one has the right."""
+    control, published = Control(monkeypatch), list[bool]()
+
+    async def forget(_door: DoorNode, _client: object, *, wills: bool) -> None:
+        published.append(wills)
+
+    monkeypatch.setattr(DoorNode, "forget", forget)
+    control.say(GIVEN)
+    client = await control.pass_on("10.0.0.7")
+    control.starts.set()
+    await asyncio.sleep(3)
+    control.say(door_link.TicketEnded("ticket", replaced))
+    assert ("the ticket is over" in await client.closed()) is not replaced
+    await asyncio.sleep(3)
+    assert published == [replaced]
     await control.end()
