@@ -345,7 +345,11 @@ class DoorNode:
         topic = request.topic
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
-                await self._check_subscribed(topic)
+                try:
+                    await self._check_subscribed(topic)
+                except RosError:
+                    self._unsubscribe(topic, client)  # its protocol forgets the topic
+                    raise
                 self._heard[topic].clients[client] = request
                 self._subscribed.used(topic)
                 self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))

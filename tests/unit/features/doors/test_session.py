@@ -1011,6 +1011,20 @@ async def test_a_revoked_right_is_refused_in_words_beside_a_client_that_stays(
             assert world.master.calls.count(method) == calls + 1  # it is asked once after a change
 
 
+async def test_a_topic_ends_with_the_refusal_of_its_only_client() -> None:
+    """The client already subscribes to the topic, and a new policy denies its second subscription."""
+    async with door_world() as world:
+        client = await world.client()
+        client.send({"op": "subscribe", "topic": "/state", "id": "first"})
+        await asyncio.sleep(1)
+        world.master.denials["registerSubscriber"] = "denied by the new policy (site.ini:7)"
+        world.door.policy_changed()
+        client.send({"op": "subscribe", "topic": "/state", "id": "second"})
+        assert (await client.next())["msg"] == "denied by the new policy (site.ini:7)"
+        await asyncio.sleep(15)
+        assert world.master.subscribers["/state"] == []
+
+
 async def test_a_held_publisher_gets_through_after_the_operators_yes() -> None:
     """The client advertises once, as roslib does, and is asked about at most once a second."""
     async with door_world() as world:
