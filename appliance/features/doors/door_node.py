@@ -244,8 +244,7 @@ class DoorNode:
     async def _register(self, request: AdvertiseTopic, client: DoorClient) -> None:
         async with self._lock(f"publisher {request.topic}"):
             known = self._publications.get(request.topic)
-            if known is not None and not known.clients and not known.type.defined:
-                # The publisher that defined the type may be gone.
+            if known is not None and not known.clients and not self._fits(known, request):
                 del self._publications[request.topic]
                 await self.node.unadvertise(request.topic)
                 known = None
@@ -276,6 +275,15 @@ class DoorNode:
                 known.wills[client] = request.will
             known.clients.add(client)
             self._published.used(request.topic)
+
+    def _fits(self, known: _Publication, request: AdvertiseTopic) -> bool:
+        """Return whether a publication that no client uses serves this advertisement.
+
+        The publisher that defined its type may be gone, or the operator's file has changed.
+        """
+        defined = known.type.defined and self._types.defines(TypeKey(known.type.name, known.type.md5sum))
+        given = known.type.name, known.publication.latched
+        return defined and (request.type is None or (request.type, request.latched) == given)
 
     async def _published_type(self, request: AdvertiseTopic) -> KnownType:
         """Return the type as ROS or the operator define it, or else as the publishers of this topic do."""

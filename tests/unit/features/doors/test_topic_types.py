@@ -234,6 +234,40 @@ async def test_a_type_of_a_topic_is_gone_with_its_publisher() -> None:
         assert "unknown field `forged`" in (await client.next())["msg"]
 
 
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({}, "float32 b"),
+        ({"latch": True}, "float32 a"),
+        ({"type": "own/Other"}, "float32 a"),
+        ({}, "float32 a"),
+    ],
+)
+async def test_the_next_client_gets_the_publication_that_it_advertises(
+    changed: dict[str, Any], text: str
+) -> None:
+    """A topic stays registered for some seconds after its last client, and is not that of another type or latch."""
+    async with door_world() as world:
+        first, second = await world.client(), await world.client()
+        advertise = {"op": "advertise", "topic": "/t", "type": "own/Load"}
+        files = {"own/Load.msg": "float32 a", "own/Other.msg": "float32 c"}
+        world.types.define(Definitions.from_files(files))
+        first.send(advertise)
+        await asyncio.sleep(1)
+        first.writer.close()
+        await asyncio.sleep(2)
+        registered = world.node.publishers["/t"]
+        world.types.define(Definitions.from_files(files | {"own/Load.msg": text}))
+        second.send(advertise | changed)
+        await asyncio.sleep(1)
+        publication = world.node.publishers["/t"]
+        assert second.frames.empty() and (publication is registered) is (not changed and text == "float32 a")
+        assert publication.latched is ("latch" in changed)
+        assert publication.type.name == changed.get("type", "own/Load")
+        if publication.type.name == "own/Load":
+            assert publication.type.definition.strip() == text
+
+
 async def test_a_publication_on_a_topic_of_two_types_is_refused_in_words() -> None:
     async with door_world() as world:
         for address, text in {"10.0.0.66": FORGED, "10.0.0.3": "int8 x"}.items():
