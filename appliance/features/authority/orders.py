@@ -111,10 +111,12 @@ class DriveOrders:
                 async with self._turn(group):
                     if claim is Claim.ASK:
                         await self._asked(group, host, call.caller_id)
-                        refused.append(f"{group.name}: asked for it")
                     else:
                         await self._taken(group, host, call.caller_id)
+                    if self._holds(group, host):
                         done.append(group.name)
+                    else:
+                        refused.append(f"{group.name}: asked for it")
             except (SenselessError, UnavailableError) as error:
                 refused.append(str(error))
         if not done and not refused:
@@ -173,7 +175,7 @@ class DriveOrders:
         holding = self._groups.holder(group.name)
         if not self._groups.may_take(group, host):
             raise SenselessError(self._refusal(group, host, holding, who))
-        if holding is not None and holding.host == host and not holding.lost:
+        if self._holds(group, host):
             self._groups.hold(group.name, host, clock.now())
             return
         reason = "taken" if holding is None else f"{host} may override its holder"
@@ -182,6 +184,9 @@ class DriveOrders:
     async def _asked(self, group: AuthorityGroup, host: Address, who: str) -> None:
         if self._claim(group, host) is None:
             raise SenselessError(self._refusal(group, host, None, who))
+        if self._holds(group, host):  # else the end of its own holding would give it the group again
+            self._groups.hold(group.name, host, clock.now())
+            return
         if self._groups.holder(group.name) is None and self._groups.may_take(group, host):
             await self._hand_over(group, host, "asked while no host held it", who)
             return
@@ -256,6 +261,10 @@ class DriveOrders:
             "authority refused", reason, host=str(host), resource=group.name, decision="deny", who=who
         )
         return reason
+
+    def _holds(self, group: AuthorityGroup, host: Address) -> bool:
+        holding = self._groups.holder(group.name)
+        return holding is not None and holding.host == host and not holding.lost
 
     def _next(self, group: AuthorityGroup) -> Address | None:
         return self._groups.successor(group, clock.now())

@@ -217,6 +217,26 @@ async def test_a_host_that_loses_its_claim_for_an_instant_loses_the_group(site: 
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("host", [PILOT, BOSS, AGENT])
+@pytest.mark.parametrize("by", ["node", "operator"])
+async def test_a_holder_that_asks_again_keeps_the_group_and_waits_for_nothing(
+    site: Site, host: str, by: str
+) -> None:
+    """Also one that may only ask, and so cannot take the group again."""
+    orders = site.orders
+    await orders.give(DriveGive("base", host), "op")
+    for _ in range(3):
+        await site.pass_time(RELEASE_AFTER - 1)
+        if by == "node":
+            answer = await orders.take_called(OwnServiceCalled(1, "/rosrv/drive/take", host, "/pad"))
+            assert (answer.success, answer.text) == (True, f"{host} holds base")
+        else:
+            await orders.ask(DriveAsk("base", host), "op")
+    assert ((await site.state()).holder, (await site.state()).waiting) == (host, [])
+    await orders.give(DriveGive("base"), "op")
+    assert (await site.state()).holder == ""
+
+
 async def test_a_relay_that_hangs_delays_the_end_of_no_other_group(site: Site) -> None:
     arm = TEXT.replace("[Authority]", "").replace("base", "arm").replace("/cmd_vel", "/arm")
     site.policy = compile_policy(TEXT + arm, file="site.ini")
