@@ -10,6 +10,7 @@
 5. Every answer names the other logs that were signed: a log that took the place of another one cannot hide it.
 """
 
+import errno
 import hashlib
 import os
 from collections.abc import Callable
@@ -69,8 +70,7 @@ class CheckpointMemory:
             if not _is_known(descriptor, wanted, first, count):
                 self._may_be_removed(wanted)
                 self._note_time(wanted, first)
-                os.pwrite(descriptor, _digest(wanted), _NUMBER + count * _HASH)
-                os.fsync(descriptor)
+                _keep(path, descriptor, _digest(wanted), _NUMBER + count * _HASH)
         finally:
             os.close(descriptor)
 
@@ -129,8 +129,7 @@ class CheckpointMemory:
                 raise CheckpointRefusedError(
                     f"{path} does not match {path.stem}.signed; restore both from one backup, or remove it"
                 )
-            os.pwrite(descriptor, self._clock().to_bytes(_NUMBER, "big"), place)
-            os.fsync(descriptor)
+            _keep(path, descriptor, self._clock().to_bytes(_NUMBER, "big"), place)
         finally:
             os.close(descriptor)
 
@@ -147,6 +146,17 @@ class CheckpointMemory:
 
 def _digest(checkpoint: Checkpoint) -> bytes:
     return hashlib.sha256(checkpoint.text()).digest()
+
+
+def _keep(path: Path, descriptor: int, data: bytes, place: int) -> None:
+    """Write data durably and whole, or raise `OSError`: at a block's end, a full disk takes the first bytes only."""
+    try:
+        written = os.pwrite(descriptor, data, place)
+        os.fsync(descriptor)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    if written < len(data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def _extent(descriptor: int) -> tuple[int, int]:

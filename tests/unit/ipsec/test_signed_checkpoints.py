@@ -1,4 +1,7 @@
 import hashlib
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -7,6 +10,7 @@ from appliance.base.clock import wall_ns
 from appliance.ipsec.signed_checkpoints import MOST_LOGS, CheckpointMemory, CheckpointRefusedError
 
 _NONE = "0" * 64
+_BLOCK = 4096
 
 
 def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: str = "b" * 64) -> bytes:
@@ -81,3 +85,32 @@ def test_cut_by_a_crash(tmp_path: Path) -> None:
     memory.write_bytes(memory.read_bytes()[:-5])
     signed.accept(second)
     assert len(memory.read_bytes()) == 8 + 2 * 32
+
+
+@contextmanager
+def full_after(size: int) -> Iterator[None]:
+    """Let the kernel cut each write at this size of its file, as a full disk does at the end of a block."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_signs_nothing_that_is_not_remembered(tmp_path: Path) -> None:
+    """Otherwise the next checkpoint would not follow, and no later one could ever be signed."""
+    signed, previous, refused = CheckpointMemory(tmp_path, wall_ns), _NONE, 0
+    memory = tmp_path / f"{'a' * 32}.signed"
+    for number in range(1, 135):
+        text = checkpoint(number, previous)
+        try:
+            with full_after(_BLOCK if number < 130 else 2 * _BLOCK):
+                signed.accept(text)
+        except OSError as error:
+            assert error.filename == str(memory)
+            refused += 1
+            signed.accept(text)
+        previous = digest(text)
+    assert refused == 2
+    assert memory.stat().st_size == 8 + 134 * 32
