@@ -107,6 +107,7 @@ class Recorder:
                     recorder_link.RecordingRemoved(0, *removed) for removed in self._store.removed()
                 ]
                 self._answers.append(recorder_link.RevisionsWanted())
+                self._report_unmade()
             case recorder_link.RevisionsStated():
                 self._revisions = message
             case recorder_link.RecordingNoted(recording_id):
@@ -201,6 +202,25 @@ class Recorder:
         first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
         return self._follower
+
+    def _report_unmade(self) -> None:
+        """Report the recordings that the end of the appliance prevented: their messages went with its memory."""
+        begun = Filter(since=self._memory - int(self._rules.before * _SECOND), until=self._memory)
+        unmade: dict[str, Trigger] = {}
+        try:
+            for entry in islice(export(self._log, begun), _MOST_RECORDS):
+                trigger = trigger_of(entry.record, self._rules.triggers)
+                planned = str(entry.record.detail.get("recording", ""))
+                if trigger is not None and planned and not self._store.has(planned):
+                    unmade.setdefault(planned, trigger)
+            for event in ("recording closed", "recording missed") if unmade else ():
+                for entry in export(self._log, Filter(since=begun.since, event=event)):
+                    unmade.pop(str(entry.record.detail.get("recording", "")), None)
+        except LogUnreadableError as error:
+            _log.error("cannot read which recordings were promised", reason=str(error))
+            return
+        for planned, trigger in unmade.items():
+            self._missed(trigger, "the appliance stopped before it was written", planned)
 
     def _triggered(self, trigger: Trigger, planned: str) -> None:
         if planned and self._store.knows(planned):

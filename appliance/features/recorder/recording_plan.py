@@ -35,6 +35,7 @@ _OURS = KEPT | {APPLIANCE}
 _MOST_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
+_OBSTACLE_LASTS = 60 * _SECOND
 _MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
@@ -158,7 +159,7 @@ class RecordingPlan:
         self._limit = HourlyLimit(rules.per_hour, ())
         self._open: dict[str, tuple[str, RecordingSpan]] = {}
         self._ended: dict[str, int] = {}
-        self._obstacle = ("", 0)
+        self._obstacle = ("", -_OBSTACLE_LASTS)
 
     def detail(
         self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
@@ -183,8 +184,8 @@ class RecordingPlan:
             recording_id, open_span = found
             self._open[own] = recording_id, replace(open_span, ends=open_span.prolonged(now))
             return recording_id, ""
-        why_not, until = self._obstacle
-        if now < until:
+        why_not, since = self._obstacle
+        if since <= now < since + _OBSTACLE_LASTS:  # not after the clock was set back
             return "", why_not
         others = [name for name, (_id, other) in self._open.items() if name != ROBOT and now <= other.ends]
         if own != ROBOT and len(others) >= _MOST_AT_ONCE:
@@ -226,7 +227,7 @@ class RecordingPlan:
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
         """End a recording that the recorder could not make. For a minute, no recording is made for this reason."""
         self._close(recording_owner(charged_to), recording_id)
-        self._obstacle = why, now + 60 * _SECOND
+        self._obstacle = why, now
 
     def _close(self, own: str, recording_id: str) -> None:
         if own in self._open and self._open[own][0] == recording_id:

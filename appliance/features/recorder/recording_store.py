@@ -170,6 +170,10 @@ class RecordingStore:
     def knows(self, recording_id: str) -> bool:
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
+    def has(self, recording_id: str) -> bool:
+        """Whether a recording is kept, was removed, or is unfinished."""
+        return self.knows(recording_id) or self.part(recording_id).exists()
+
     def remove(self, recording: Recording, who: str, reason: str) -> None:
         kept, gone = self._folder / recording.id, self._gone(recording.id)
         with suppress(OSError):  # the disk may be full, since recordings are then removed

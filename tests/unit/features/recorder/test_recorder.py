@@ -372,6 +372,28 @@ def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
     assert [path.name for path in scene.folder.iterdir()] == [recording.id]
 
 
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_recording_that_the_end_of_the_appliance_prevented_is_reported(scene: Scene, begun: bool) -> None:
+    made, prevented = "a" * 20, "b" * 20
+    planned(scene, made, "10.0.0.9")
+    scene.later(0.1)
+    planned(scene, prevented, "robot")
+    if begun:
+        scene.later(0.1)
+        (scene.folder / f".{prevented}.part" / "progress").write_bytes(b"")  # as a power cut may leave it
+    scene.born = scene.clock.now = BEGAN + 3 * SECOND
+    scene.begin_anew()
+    told = scene.later(0.1, recorder_link.RecordingsAsked())
+    assert {recording.id for recording in scene.closed(told)} == {made}
+    missed = [answer for answer in told if isinstance(answer, recorder_link.RecordingMissed)]
+    assert [(one.planned, one.reason) for one in missed] == [
+        (prevented, "the appliance stopped before it was written")
+    ]
+    scene.happen("recording missed", detail={"recording": prevented})
+    told = scene.later(1, recorder_link.RecordingsAsked()) + scene.later(10)
+    assert not any(isinstance(answer, recorder_link.RecordingMissed) for answer in told)
+
+
 def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
     scene.happen()
     scene.clock.now += 3 * SECOND

@@ -117,6 +117,13 @@ def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict
     assert plan.detail("message changed", None, Severity.NOTICE, GUEST, NOW) == {}
 
 
+def test_a_clock_that_is_set_back_keeps_no_reason(dropped: Callable[..., dict[str, str]]) -> None:
+    plan = made()
+    later = NOW + 24 * HOUR
+    plan.missed(GUEST, dropped(plan, GUEST, later)["recording"], "the disk is nearly full", later)
+    assert "recording" in dropped(plan, GUEST, NOW)
+
+
 def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
