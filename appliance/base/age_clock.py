@@ -3,7 +3,8 @@
 1. While the process runs, the age clock follows the monotonic clock, whatever the system clock does.
 2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once, a longer
    one after the system clock has been ahead for `_STANDS` of running time: then the smallest gap seen in that
-   time. A system clock that is behind adds nothing until someone corrects it.
+   time. A system clock that is behind adds nothing until someone corrects it. If it is still behind at a later start,
+   it may have been ahead before: the time since its latest reading counts, up to `_AT_ONCE`.
 3. The state is saved every `_SAVE`; time since the last save counts as time off.
 4. When a long gap is added later, `dated` also adds it to the dates of data that was made in between.
 """
@@ -43,6 +44,7 @@ class _Kept(msgspec.Struct):
     step: int = 0  # the gap at the start, until it is counted
     since: int = 0  # `lived` when the gap was first seen
     jumps: list[_Jump] = []  # the gaps that were counted later than at once
+    shown: int | None = None  # the system clock minus `lived`, by the latest reading, even if it is behind
 
 
 class AgeClock:
@@ -64,6 +66,7 @@ class AgeClock:
         self._monotonic = monotonic
         self._seen = monotonic()
         self._saved = -_SAVE
+        self._starts = True
         self._open = True  # whether the time off is still unknown
         try:
             self._kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
@@ -77,7 +80,13 @@ class AgeClock:
         kept, seen = self._kept, self._monotonic()
         kept.lived += seen - self._seen
         self._seen = seen
-        stood, ahead = bool(kept.step), self._wall() - kept.lived - kept.believed
+        shown = self._wall() - kept.lived
+        stood, off = bool(kept.step), self._advanced(shown)
+        if self._starts and off and shown - kept.believed < -_AT_ONCE:
+            kept.credited += off
+            kept.believed += off
+            kept.step, kept.sets, self._open = 0, 0, False
+        ahead, self._starts = shown - kept.believed, False
         if self._open:
             self._was_off(ahead)
         else:
@@ -104,6 +113,15 @@ class AgeClock:
     def uncounted(self, date: int) -> int:
         """Return the time off after this date by the clock that does not count yet, although it may be real."""
         return max(0, self._kept.step) if date < self._kept.since + self._kept.credited else 0
+
+    def _advanced(self, shown: int) -> int:
+        """Return by how much the system clock advanced since its latest reading; 0 if it was set by a longer time."""
+        before = self._kept.shown
+        if before is None or abs(shown - before) > _AT_ONCE:
+            self._kept.shown = shown
+            return 0
+        self._kept.shown = max(before, shown)
+        return self._kept.shown - before
 
     def _was_off(self, ahead: int) -> None:
         kept, counts = self._kept, 0

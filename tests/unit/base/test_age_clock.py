@@ -82,6 +82,39 @@ def test_repeated_wrong_time_zones_do_not_add_up(machine: Machine) -> None:
     machine.off(16 * HOUR)
 
 
+@pytest.mark.parametrize("zone", [0, 2 * HOUR])
+def test_time_off_counts_after_a_clock_that_was_ahead_at_a_stop(machine: Machine, zone: int) -> None:
+    """Only the first time off is unknown."""
+    machine.wrong = YEAR
+    machine.run(HOUR)
+    machine.wrong = 0
+    machine.off(16 * HOUR)
+    lost = machine.true - machine.age()
+    for hours in (16, 16, 71, 16):
+        machine.wrong = 0
+        machine.run(8 * HOUR)
+        machine.wrong = zone
+        machine.off(hours * HOUR)
+    assert lost == 16 * HOUR
+    assert abs(machine.true - machine.age() - lost) <= 2 * HOUR
+    machine.wrong = 0
+    machine.run(YEAR)
+    machine.off(16 * HOUR)
+    assert abs(machine.true - machine.age() - lost) <= 2 * HOUR
+
+
+def test_time_off_of_a_clock_that_is_behind_counts_once(machine: Machine) -> None:
+    machine.wrong = -YEAR
+    for _ in range(5):
+        machine.run(8 * HOUR)
+        machine.off(16 * HOUR)
+    machine.wrong = 0
+    machine.run(8 * HOUR)
+    machine.off(16 * HOUR)
+    machine.run(30 * HOUR)
+    assert abs(machine.age() - machine.true) < DAY
+
+
 def test_a_new_robot_with_a_corrected_date(machine: Machine) -> None:
     machine.path.unlink()
     machine.wrong = 60 * DAY - machine.true
