@@ -4,6 +4,7 @@
    also reserved, and an address declared in hosts.yaml goes to another host only on request.
 2. A replaced or revoked certificate is on the list of revoked certificates at once.
 3. `revision` grows with every change by an operator or a host, even across restarts.
+4. A process that dies has stored all of a change, or nothing: otherwise a host's only certificate could be revoked.
 """
 
 import datetime
@@ -188,40 +189,44 @@ class HostTable:
 
     def keep(self, name: str, address: str, made: CertificateMade) -> HostRow:
         before, now = self.rows.get(name), earliest_now()
-        if before is not None and before.revoked is None:
-            self._revoke_certificates(before)
         enrolled = before.enrolled if before is not None and before.revoked is None else now
-        row = self._set(HostRow(name, address, made.serial, made.expires, enrolled, None))
-        self._set_certificate(CertificateRow(name, now, made.certificate.decode()))
-        self.changed()
+        with self._kept.together():
+            if before is not None and before.revoked is None:
+                self._revoke_certificates(before)
+            row = self._set(HostRow(name, address, made.serial, made.expires, enrolled, None))
+            self._set_certificate(CertificateRow(name, now, made.certificate.decode()))
+            self.changed()
         return row
 
     def keep_next(self, name: str, made: CertificateMade) -> None:
         row = self.certificates.get(name)
         before = row.certificate if row is not None else ""
         since = row.made if row is not None else earliest_now()
-        if row is not None and row.next is not None:
-            self.revoked.add(name, row.next.serial, row.next.expires)
         following = NextCertificate(made.serial, made.expires, made.certificate.decode())
-        self._set_certificate(CertificateRow(name, since, before, following))
-        self.changed()
+        with self._kept.together():
+            if row is not None and row.next is not None:
+                self.revoked.add(name, row.next.serial, row.next.expires)
+            self._set_certificate(CertificateRow(name, since, before, following))
+            self.changed()
 
     def take_next(self, name: str) -> HostRow | None:
         row, certificate = self.rows[name], self.certificates.get(name)
         if certificate is None or certificate.next is None:
             return None
         following = certificate.next
-        self.revoked.add(name, row.serial, row.expires)
-        taken = self._set(row._replace(serial=following.serial, expires=following.expires))
-        self._set_certificate(CertificateRow(name, earliest_now(), following.certificate))
-        self.changed()
+        with self._kept.together():
+            self.revoked.add(name, row.serial, row.expires)
+            taken = self._set(row._replace(serial=following.serial, expires=following.expires))
+            self._set_certificate(CertificateRow(name, earliest_now(), following.certificate))
+            self.changed()
         return taken
 
     def revoke(self, name: str) -> HostRow:
         row = self.enrolled_row(name)
-        self._revoke_certificates(row)
-        self.changed()
-        return self._set(row._replace(revoked=clock.wall()))
+        with self._kept.together():
+            self._revoke_certificates(row)
+            self.changed()
+            return self._set(row._replace(revoked=clock.wall()))
 
     def keep_ports(self, row: PortsRow) -> None:
         """Keep the check of a machine's ports. Raises `HostRefusedError` if there are too many machines."""

@@ -1,6 +1,7 @@
 """The tables of hosts: hosts that connect through tunnels, their certificates, awaited hosts, blocked hosts."""
 
 import json
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from appliance.store.writer_thread import Database
@@ -133,6 +134,10 @@ class HostTables:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+
+    def together(self) -> AbstractContextManager[None]:
+        """Store all changes of the block, or none if the process dies."""
+        return self._database.together()
 
     def save(self, row: HostRow) -> None:
         self._database.put("host", *row)

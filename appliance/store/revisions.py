@@ -141,14 +141,12 @@ class Revisions(ABC, Generic[R]):
 
     def store_revision(self, row: R, within: float | None = None) -> None:
         """Store a revision, with the time limit to confirm it, in seconds, or without one."""
-        if within is not None:  # set the limit first, because control may die during the change
-            back_to = next(iter(self.ends.names(self.unconfirmed)), str(self.revision))
-            with self.store.database.together():
-                self.end_limit()
-                self.ends.set(self.unconfirmed, back_to, within)
-        self._save(row)
-        if within is None:
+        back_to = next(iter(self.ends.names(self.unconfirmed)), str(self.revision))
+        with self.store.database.together():  # control may die during the change
             self.end_limit()
+            if within is not None:
+                self.ends.set(self.unconfirmed, back_to, within)
+            self._save(row)
 
     def end_limit(self) -> None:
         self._cancel_return()

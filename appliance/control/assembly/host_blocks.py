@@ -79,8 +79,9 @@ class BlockTable:
     def take(self, address: Address) -> HostBlockRow | None:
         row = self._rows.get(address)
         if row is not None:
-            self._store.hosts.forget_block(row.address)
-            self._ends.forget(BLOCKS, row.address)
+            with self._store.database.together():
+                self._store.hosts.forget_block(row.address)
+                self._ends.forget(BLOCKS, row.address)
             del self._rows[address]
             self._changed()
         return row

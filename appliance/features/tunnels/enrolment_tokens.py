@@ -45,8 +45,9 @@ class EnrolmentTokens:
         (token_id, secret, text), now = _FORM.make(), clock.wall()
         row = EnrolmentTokenRow(name, token_id, hash_of(secret), now, now + seconds, address, days, kit, who)
         self._rows[name] = row
-        self._ends.set(ENROLMENT, name, seconds)
-        self._tables.save_awaited(row)
+        with self._tables.together():  # an earlier token of the name must not get this end
+            self._ends.set(ENROLMENT, name, seconds)
+            self._tables.save_awaited(row)
         return row, text
 
     def take(self, text: str) -> EnrolmentTokenRow:

@@ -3,15 +3,19 @@
 import asyncio
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib import import_module
 from inspect import isawaitable
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from appliance.base import age_clock, clock
 from appliance.base.age_clock import AgeClock
+from appliance.control.errors import TokenRefusedError
 from appliance.store import access_tokens
+from appliance.store.changes import Change
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import SCHEMA, StateStore
 from appliance.store.writer_thread import StoreError
@@ -26,7 +30,10 @@ HOUR, DAY, YEAR = 3600.0, 86_400.0, 365 * 86_400.0
 _MADE = re.compile(r'EndKind\(\s*"([^"]+)"')
 
 
-def owned() -> Iterator[tuple[EndKind, Callable[[StateStore, EndTable], Ending]]]:
+Owner = Callable[[StateStore, EndTable], Ending]
+
+
+def owned() -> Iterator[tuple[EndKind, Owner]]:
     for path in sorted((ROOT / "tests").rglob("ending.py")):
         module = import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
         yield from module.ENDINGS.items()
@@ -127,8 +134,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setattr(age_clock, "write_whole", lambda path, data, _mode: path.write_bytes(data))
     site = Site(tmp_path)
     yield site
-    assert site.store is not None
-    site.store.close()
+    if site.store is not None:
+        site.store.close()
 
 
 async def begun(site: Site, *, paired: bool = False) -> None:
@@ -267,6 +274,66 @@ async def test_on_a_full_disk_each_thing_ends(site: Site, monkeypatch: pytest.Mo
     site.run(60.0)
     monkeypatch.undo()
     await site.end_after(lambda _kind: 2940.0)
+
+
+class KilledError(BaseException):
+    """Control dies."""
+
+
+async def _after_a_kill(owner: Owner, home: Path, writes: int) -> bool | None:
+    """Return whether a thing lasts 1.5 hours after it began for one, and control died after some writes of a change
+    to a day. None: control lived.
+    """
+    machine, killed, left = VirtualClock(wall=WALL, now=100.0), False, iter(range(writes))
+    with clock.using(machine):
+        store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
+        thing = owner(store, EndTable(store, AgeClock(home / "age")))
+        if isawaitable(begun := thing.begin(HOUR)):
+            await begun
+        keep = store.database.keep
+
+        def keep_some(changes: list[tuple[Change, bool]]) -> None:
+            if next(left, None) is None:
+                raise KilledError
+            keep(changes)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(store.database, "keep", keep_some)
+            try:
+                with suppress(TokenRefusedError):  # there is one already
+                    if isawaitable(begun := thing.begin(DAY)):
+                        await begun
+            except KilledError:
+                killed = True
+        store.close()
+        machine.advance(1.5 * HOUR)
+        again = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
+        ends = EndTable(again, AgeClock(home / "age"))
+        thing = owner(again, ends)
+        ends.look()
+        for _ in range(3):
+            await asyncio.sleep(0)
+        lasts = thing.lasts()
+        again.close()
+    return lasts if killed else None
+
+
+@pytest.mark.parametrize(
+    ("kind", "owner"),
+    [(kind, owner) for kind, owner in OWNED if kind.stored],
+    ids=lambda one: one.name if isinstance(one, EndKind) else "",
+)
+async def test_a_kill_at_any_write_gives_no_thing_the_end_of_another(
+    kind: EndKind, owner: Owner, tmp_path: Path, site: Site
+) -> None:
+    del site
+    for writes in count():
+        home = tmp_path / str(writes)
+        home.mkdir()
+        lasts = await _after_a_kill(owner, home, writes)
+        assert not lasts, f"{kind.name} after {writes} writes"
+        if lasts is None:
+            break
 
 
 async def test_time_off_that_counts_later_takes_no_time_from_a_later_beginning(site: Site) -> None:

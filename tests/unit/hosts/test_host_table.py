@@ -1,0 +1,72 @@
+import ipaddress
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from appliance.base import clock
+from appliance.channel.messages import CertificateMade
+from appliance.hosts.host_table import HostTable
+from appliance.hosts.hosts_file import DeclaredHosts
+from appliance.store.changes import Change
+from appliance.store.state_file import StateStore
+from tests.support.engines import InlineDatabase
+
+DAY = 86_400.0
+
+
+class KilledError(BaseException):
+    """Control dies."""
+
+
+def opened(home: Path) -> tuple[StateStore, HostTable]:
+    store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
+    return store, HostTable(store, ipaddress.IPv4Network("10.113.0.0/24"), DeclaredHosts(home / "hosts.yaml"))
+
+
+def made(serial: str) -> CertificateMade:
+    return CertificateMade(1, b"certificate", serial, clock.wall() + 30 * DAY)
+
+
+def die_after(store: StateStore, writes: int) -> None:
+    left, keep = iter(range(writes)), store.database.keep
+
+    def keep_some(changes: list[tuple[Change, bool]]) -> None:
+        if next(left, None) is None:
+            raise KilledError
+        keep(changes)
+
+    store.database.keep = keep_some  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda table: table.keep("ocu", "10.113.0.2", made("c3")),
+        lambda table: table.keep_next("ocu", made("c3")),
+        lambda table: table.take_next("ocu"),
+    ],
+    ids=["keep", "keep_next", "take_next"],
+)
+def test_a_host_keeps_a_certificate_whenever_control_dies(
+    change: Callable[[HostTable], object], tmp_path: Path
+) -> None:
+    for writes in count():
+        (home := tmp_path / str(writes)).mkdir()
+        store, table = opened(home)
+        table.keep("ocu", "10.113.0.2", made("a1"))
+        table.keep_next("ocu", made("b2"))
+        die_after(store, writes)
+        try:
+            change(table)
+            killed = False
+        except KilledError:
+            killed = True
+        store.close()
+        again, table = opened(home)
+        revoked = {row.serial for row in table.listed_as_revoked()}
+        assert table.rows["ocu"].serial not in revoked, f"after {writes} writes"
+        again.close()
+        if not killed:
+            break
