@@ -1,7 +1,7 @@
 """Keep revoked certificates until long after their end, and select those for the revocation list (CRL).
 
-1. A revoked certificate stays on the list until a day after its expiry, and is deleted more than a year later, so
-   it stays revoked even if the clock was ahead for a while and is then set back.
+1. A revoked certificate stays on the list until a day after its expiry. It is deleted more than a year later, by a
+   clock that has shown this for a day of running, so it stays revoked even if the clock was years ahead for a while.
 2. charon and swanctl reject a list that does not fit into one value of vici (65,535 bytes in DER). If it would not,
    certificates of hosts that are not enrolled are left out: charon has no connection that matches them. Before
    certificates of enrolled hosts exceed the limit, `require_room` rejects more replacements.
@@ -14,6 +14,7 @@ from appliance.store.host_tables import HostTables, RevokedCertificateRow
 
 AFTER_END_SECONDS = 86_400.0  # tolerated difference between clocks
 _KEPT_SECONDS = 400 * 86_400.0  # after a certificate's end
+_STANDS_SECONDS = 86_400.0
 ENTRIES_BYTES = 64_000  # of 65,535: names, extensions and the signature take less than 1,000
 _ENTRY_BYTES = 21  # of an entry, without its serial number
 _AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # two entries: a certificate and its stored successor
@@ -25,6 +26,7 @@ class RevokedCertificates:
     def __init__(self, kept: HostTables) -> None:
         self._kept = kept
         self._rows = {row.serial: row for row in kept.revoked()}
+        self._ended: dict[str, float] = {}  # since when the clock shows that they ended long ago (monotonic)
         self.forget_ended()
 
     def add(self, name: str, serial: str, expires: float) -> None:
@@ -35,12 +37,16 @@ class RevokedCertificates:
 
     def forget_ended(self) -> None:
         """Delete certificates that even a wrong clock would not accept."""
-        before = clock.wall() - _KEPT_SECONDS
-        ended = [row.serial for row in self._rows.values() if row.expires < before]
-        for serial in ended:
-            del self._rows[serial]
-        if ended:
-            self._kept.forget_revoked(before)
+        now, before = clock.now(), clock.wall() - _KEPT_SECONDS
+        self._ended = {
+            row.serial: self._ended.get(row.serial, now)
+            for row in self._rows.values()
+            if row.expires < before
+        }
+        for serial, since in list(self._ended.items()):
+            if now - since >= _STANDS_SECONDS:
+                del self._rows[serial], self._ended[serial]
+                self._kept.forget_revoked(serial)
 
     def listed(self, enrolled: Set[str]) -> list[RevokedCertificateRow]:
         rows = self._not_ended()

@@ -176,9 +176,10 @@ class HostTables:
     def save_revoked(self, row: RevokedCertificateRow) -> None:
         self._database.put("revocation", *row)
 
-    def forget_revoked(self, before: float) -> None:
-        self._database.delete("revocation", ("expires", "<", before))
-        self._database.delete("revoked_certificate", ("moment", "<", before - _LONGEST_SECONDS))
+    def forget_revoked(self, serial: str) -> None:
+        with self.together():
+            self._database.delete("revocation", serial=serial)
+            self._database.delete("revoked_certificate", serial=serial)
 
     def revoked(self) -> list[RevokedCertificateRow]:
         # Rows of the older table `revoked_certificate` have no expiry: assume the longest life of a certificate.

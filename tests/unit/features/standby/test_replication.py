@@ -469,7 +469,7 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
         store.save_setting(key, "value")
         store.hosts.save(HostRow(key, f"10.1.0.{key}", "ab", 5.0, 1.0, None))
         store.hosts.save_revoked(RevokedCertificateRow(key, "n", 4.0, 9.0))
-        store.hosts.forget_revoked(5.0)
+        store.hosts.forget_revoked("0")
         store.hosts.save_block(HostBlockRow(f"10.1.0.{key}", 4.0, "alice", ""))
         store.save_revision(RevisionRow(int(key), "text", "p.ini", 1.0, "disk", "note"))
 
