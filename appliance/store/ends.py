@@ -255,9 +255,8 @@ class EndTable:
         settings, now = self._store.settings(), self._now()
         text = settings.get(_READING)
         last = None if text is None else msgspec.json.decode(text, type=_Reading)
-        taken_over = (
-            last is not None and bool(self._appliance) and last.appliance not in ("", self._appliance)
-        )
+        # A standby that left its pair also has the ends of the other appliance, by its clock.
+        taken_over = last is not None and last.appliance not in ("", self._appliance)
         imported: list[EndRow] = []
         if _IMPORTED not in settings:
             wall, age = (last.wall, last.age) if last is not None and taken_over else (clock.wall(), now)

@@ -250,15 +250,16 @@ async def test_a_takeover_from_a_machine_whose_clock_was_not_set_prolongs_no_rig
     await site.end_after(lambda kind: (2590.0 if kind.dated else 2990.0) if kind.stored else 0.0)
 
 
+@pytest.mark.parametrize("paired", [True, False], ids=["paired", "left the pair"])
 @pytest.mark.parametrize("ahead", [0.0, HOUR, -HOUR, YEAR, -YEAR])
 async def test_a_takeover_without_a_view_of_the_other_appliance_prolongs_no_right(
-    site: Site, ahead: float
+    site: Site, ahead: float, paired: bool
 ) -> None:
     site.clocks["b"].set_wall(WALL + ahead)
     await begun(site, paired=True)
     for machine in site.clocks.values():
         machine.advance(600.0)
-    site.start("b", paired=True)
+    site.start("b", paired=paired)
     right = 3000.0 if ahead < 0 else max(0.0, 2400.0 - ahead)  # no more than by either clock
     await site.end_after(lambda kind: (3000.0 if kind.late else right) if kind.stored else 0.0)
 
