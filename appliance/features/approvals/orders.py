@@ -250,7 +250,8 @@ class ApprovalOrders:
     def _ended(self, entry: ApprovalEntry, approvers: Mapping[str, str]) -> str:
         approved = entry.state is ApprovalState.APPROVED
         if not self._table.seconds_left(entry):
-            return "its time is over" if approved else "no operator answered in time"
+            waited = entry.state is ApprovalState.WAITS
+            return "no operator answered in time" if waited else "its time is over"
         if approved and entry.credentials.isdisjoint(approvers):
             return f"{entry.who}, who approved it, no longer has a token or session with the role operator"
         return "" if self._asks(entry) else "the policy no longer asks"

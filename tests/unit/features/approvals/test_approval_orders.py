@@ -280,6 +280,8 @@ async def test_an_operator_refuses_a_call_and_ends_an_approval(site: Site) -> No
     assert first == again
     assert f"an operator refused approval {number}" in again
     await site.pass_time(WAIT_SECONDS)
+    [ended] = [row["reason"] for row in site.trail.rows if row["event"] == "approval ended"]
+    assert ended.endswith(f"approval {number} ended: its time is over")
     approval = number_in(site.publish("/x"))
     await site.orders.approve(ApproveCall(approval), "ann")
     await site.orders.refuse(RefuseCall(approval), "ann")
