@@ -86,12 +86,16 @@ class LogForwarder:
         try:
             position = self._position or self._begin()
             more = self._forward(position)
-            self._save(_SAVE_SECONDS)
         except (LogUnreadableError, OSError, ValueError) as error:
             return self._failed(str(error) or type(error).__name__)
         if self._failures:
             _log.warning("the audit log is forwarded again")
         self._failures = 0
+        try:
+            self._save(_SAVE_SECONDS)
+        except OSError as error:  # a full disk delays no record: only a restart sends some again
+            reason = f"the position is not kept, so a restart sends records again: {error}"
+            self.progress = msgspec.structs.replace(self.progress, trouble=reason)
         return 0.0 if more else _IDLE_SECONDS
 
     def close(self, *, stopped: bool = False) -> None:  # noqa: ARG002  syslog has no message for it

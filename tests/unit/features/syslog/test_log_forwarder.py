@@ -1,8 +1,10 @@
+import errno
 import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -352,3 +354,24 @@ def test_an_unreadable_position_is_an_error(tmp_path: Path, text: str) -> None:
     file.write_text(text)
     with pytest.raises(ValueError, match=r"position\.json.*remove it"):
         load_position(file)
+
+
+def test_a_full_disk_delays_no_record(make_log: MakeLog, kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = make_log()
+    record(log, 600)
+    one = forwarder(log.path, kept)
+    save = "appliance.features.syslog.log_forwarder.save_position"
+    with monkeypatch.context() as full:
+        full.setattr(
+            save, Mock(side_effect=OSError(errno.ENOSPC, "No space left on device", "position.json"))
+        )
+        run(one)
+        assert kept.sequences() == everything(log.path)
+        assert "position is not kept" in one.progress.trouble
+        assert "position.json" in one.progress.trouble
+    record(log, 1)
+    run(one)
+    assert one.progress.trouble == ""
+    position = load_position(log.path.with_name("position.json"))
+    assert position is not None
+    assert position.sequence == everything(log.path)[-1]
