@@ -22,8 +22,8 @@ _Done = TypeVar("_Done")
 ConfirmWithin = Annotated[
     str | None,
     typer.Option(
-        help="Commit-confirm: roll back after this time (5m; at most 24h) unless you run `rosrv policy confirm`, or"
-        " for monitors and guards `rosrv monitor confirm`"
+        help="Commit-confirm: roll back after this time (such as 5m; at most 24h) unless you run `rosrv policy"
+        " confirm`, or for monitors and guards `rosrv monitor confirm`"
     ),
 ]
 

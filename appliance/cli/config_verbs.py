@@ -12,17 +12,19 @@ import yaml
 from appliance.configuration.config_sources import ConfigError, json_schema, plain, resolve
 
 _CheckedFile = Annotated[
-    Path | None, typer.Argument(readable=False, metavar="[FILE]", help="The same as --config FILE")
+    Path | None, typer.Argument(readable=False, metavar="FILE", help="The same as --config FILE")
 ]
 _File = Annotated[
     Path | None,
-    typer.Option("--config", readable=False, help="Configuration file (default: ./appliance.yaml)"),
+    typer.Option(
+        "--config", readable=False, help="Configuration file (default: ROSRV_CONFIG, else ./appliance.yaml)"
+    ),
 ]
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 
 
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
-    """Report every error in the file and the environment. Exit status: 0 valid, 1 errors.
+    """Report every error in the configuration file and the environment variables. Exit status: 0 valid, 1 errors.
 
     Example: rosrv config check appliance.yaml
     """

@@ -60,7 +60,9 @@ _OTHER_COMMANDS = ("ackermann_msgs/", "control_msgs/", "mavros_msgs/", "std_msgs
 WhenStanding = Annotated[
     bool,
     typer.Option(
-        "--when-standing", help="Wait until the last command was zero and the odometry shows no motion"
+        "--when-standing",
+        help="On the appliance's machine: change nothing until the robot stands still, by its velocity commands and its"
+        " odometry",
     ),
 ]
 

@@ -42,7 +42,7 @@ _COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
-@speaks_with("One JSON object; with --watch one a line")
+@speaks_with("One JSON object; with --watch, one on each line")
 def status(
     appliance: Appliance,
     *,
@@ -58,7 +58,7 @@ def status(
 
     On a standby, show both appliances, as `rosrv standby status` does.
 
-    Exit status: 0 in service, 1 needs attention, 2 not running; with --watch, the last status's.
+    Exit status: 0 in service, 1 needs attention, 2 not running; with --watch, that of the last status.
 
     Example: rosrv status --watch --every 5s
     """

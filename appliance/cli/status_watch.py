@@ -21,7 +21,9 @@ from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, usage_error
 from rosmop.tool.terminal import printable
 
-Watch = Annotated[bool, typer.Option("--watch", help="Redraw it until Ctrl-C, in place on a terminal")]
+Watch = Annotated[
+    bool, typer.Option("--watch", help="Show it again and again until Ctrl-C; on a terminal, in place")
+]
 _SECONDS = 2.0
 _INTERRUPTED, _AWAY = 130, 2
 _MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment

@@ -44,7 +44,8 @@ def _isolations(incomplete: str) -> list[tuple[str, str]]:
 
 # Not `readable`, which click checks with the rights of root alone: see `base/owner_access.py`.
 _ConfigFile = Annotated[
-    Path | None, typer.Option(readable=False, help="Configuration file (default: ./appliance.yaml)")
+    Path | None,
+    typer.Option(readable=False, help="Configuration file (default: ROSRV_CONFIG, else ./appliance.yaml)"),
 ]
 _PolicyFile = Annotated[
     Path | None,
@@ -58,25 +59,51 @@ _MonitorFolder = Annotated[
 ]
 _Enable = Annotated[
     str | None,
-    typer.Option(help="Monitors to enable at start: all, none, NAME,…, or shadow (all in shadow mode)"),
+    typer.Option(
+        help="State of monitors that no operator has switched: all (enabled), none, NAME,…, or shadow (all in"
+        " shadow mode)"
+    ),
 ]
 _StateDirectory = Annotated[
-    Path | None, typer.Option(help="State directory: everything that survives a restart")
+    Path | None, typer.Option(help="State directory: all data that must survive a restart")
 ]
-_Listen = Annotated[str | None, typer.Option(help="Where RVMaster listens, for ROS_MASTER_URI; port 0: any")]
-_RosmasterPort = Annotated[int | None, typer.Option(help="Port of the ROS master; 0: any")]
-_Isolation = Annotated[str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)]
+_Listen = Annotated[
+    str | None,
+    typer.Option(help="Address where nodes find their master (ROS_MASTER_URI); with port 0, any free port"),
+]
+_RosmasterPort = Annotated[
+    int | None,
+    typer.Option(help="Loopback port of the ROS master behind the appliance; with 0, any free port"),
+]
+_Isolation = Annotated[
+    str | None,
+    typer.Option(
+        help="netns (a network namespace of this machine), container (the one of its container), or none (no"
+        " firewall: for development only)",
+        autocompletion=_isolations,
+    ),
+]
 _Relayed = Annotated[
     str | None,
-    typer.Option(help="all, or monitored: only topics that [Monitor] or a specification names"),
+    typer.Option(
+        help="Topics and services that go through the relay: all, or monitored (those in [Monitor] of the policy or in"
+        " a specification; this is not a boundary)"
+    ),
 ]
 _Mediation = Annotated[
-    str | None, typer.Option(help="full, or monitored: nodes get real URIs (with --relay monitored)")
+    str | None,
+    typer.Option(help="full, or monitored: nodes get each other's real URIs (needs --relay monitored)"),
 ]
 _Api = Annotated[
-    str | None, typer.Option(metavar="HOST:PORT", help="Where REST listens; port 0: any; or off")
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help="Address where REST and the console listen, or off; with port 0, any free port",
+    ),
 ]
-_ApiTls = Annotated[str | None, typer.Option(help="true, or false: clear text, on a loopback address only")]
+_ApiTls = Annotated[
+    str | None, typer.Option(help="TLS of REST: true, or false (clear text, on a loopback address only)")
+]
 _AsJson = Annotated[bool, typer.Option("--json", help="Print a JSON object when nodes may connect")]
 
 
@@ -96,6 +123,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     as_json: _AsJson = False,
 ) -> None:
     """Start the appliance and run until SIGTERM or Ctrl-C.
+
+    An option overrides the environment and the configuration file. `rosrv config show` prints the values without
+    options.
 
     Example: rosrv up --policy policies/default.ini --state /var/lib/rosrv
     """

@@ -37,7 +37,7 @@ _Command = Callable[..., None]
 _EXAMPLES = {
     "check": "monitors/*.rv",
     "run": "monitors/safe_triggering.rv --bag drive.bag",
-    "learn": "--bag monday.bag --bag tuesday.bag --output learnt.rv",
+    "learn": "--bag mon.bag --bag tue.bag --output learnt.rv",
     "coverage": "monitors/*.rv --bag drive.bag --fail-under 80",
 }
 
@@ -115,7 +115,7 @@ def _learn_of(program: CommandContext) -> _Command:
         report: ReportFile = None,
         show_progress: ShowProgress = False,
     ) -> None:
-        """Exit status 3 if recordings failed: they are reported, and the others were learnt from."""
+        """Exit status 3 if recordings failed: they are reported, and the result is from the others."""
         options = RecordingsOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
         status = learn_command.learn_monitors(
             program, options, topics or [], out, hold_out=hold_out, as_json=as_json

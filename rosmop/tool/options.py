@@ -5,9 +5,7 @@ from typing import Annotated
 
 import typer
 
-Files = Annotated[
-    list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
-]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE", help="Specifications (.rv)", show_default=False)]
 Folders = Annotated[
     list[Path] | None,
     typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
@@ -30,7 +28,9 @@ Workers = Annotated[
 ]
 On = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="Use a Ray cluster: ray://HEAD:PORT, or auto on one of its nodes"),
+    typer.Option(
+        metavar="ADDRESS", help="Use a Ray cluster: ray://HEAD:PORT, or `auto` on one of its machines"
+    ),
 ]
 Resume = Annotated[
     Path | None,
@@ -64,7 +64,7 @@ WhySlow = Annotated[
     typer.Option(
         "--why-slow",
         metavar="",
-        help="Also list the messages that the interpreter processes, with file, line and reason",
+        help="Also list the messages that are interpreted, not compiled, which is slower; with file, line and reason",
     ),
 ]
 Dot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz (.dot)")]
@@ -96,5 +96,8 @@ HoldOut = Annotated[
     typer.Option(min=0.0, max=0.9, metavar="SHARE", help="The share of the recordings that tests the result"),
 ]
 FailUnder = Annotated[
-    float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit with 1 below this percentage")
+    float,
+    typer.Option(
+        min=0.0, max=100.0, metavar="PERCENT", help="Exit status 1 if less than this percentage is covered"
+    ),
 ]

@@ -50,7 +50,12 @@ def filter_given(
         str | None, typer.Option("--category", help="Category of the request; a glob")
     ] = None,
     severity: Annotated[
-        Severity | None, typer.Option("--severity", help="This severity or a higher one")
+        Severity | None,
+        typer.Option(
+            "--severity",
+            metavar="SEVERITY",
+            help="This severity or a higher one: debug, info, notice, warning or alarm",
+        ),
     ] = None,
     rule: Annotated[
         str | None, typer.Option("--rule", help="Section or key of the policy rule; a glob")
@@ -62,7 +67,8 @@ def filter_given(
         str | None,
         typer.Option(
             "--who",
-            help="Author: a token's or person's name, `operator` (this machine), `disk` (a file), or a glob",
+            help="Author: the name of a token or person, `operator` (on the appliance's machine), `disk` (a file that"
+            " was read at a start), or a glob",
         ),
     ] = None,
 ) -> Filter:

@@ -69,7 +69,7 @@ State = Annotated[
     typer.Option(
         "--state",
         envvar="ROSRV_STATE",
-        help="State directory of the running appliance",
+        help="State directory of the appliance",
         readable=False,  # the user needs only search permission
     ),
 ]
@@ -207,7 +207,7 @@ def _choose(
             "--api",
             metavar="URL",
             envvar="ROSRV_API_URL",
-            help=f"Use REST instead; put the access token into {TOKEN}",
+            help=f"Use REST at this URL instead of --state; put the access token into {TOKEN}",
         ),
     ] = None,
     api_ca: Annotated[
@@ -216,7 +216,7 @@ def _choose(
             "--api-ca",
             metavar="FILE",
             envvar="ROSRV_API_CA",
-            help="Certificate to trust for REST (STATE/api/certificate.pem of the appliance)",
+            help="Certificate to trust for REST, as `rosrv certificate` prints it on the appliance",
         ),
     ] = None,
 ) -> _Target:

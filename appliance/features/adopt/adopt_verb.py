@@ -51,12 +51,18 @@ def adopt(
     check: Annotated[
         bool, typer.Option("--check", help="Only show the changes, and what prevents them")
     ] = False,
-    status: Annotated[bool, typer.Option("--status", help="Show the adoption")] = False,
+    status: Annotated[
+        bool,
+        typer.Option(
+            "--status", help="Show whether the graph is adopted, since when, and which nodes are not"
+        ),
+    ] = False,
     audit_only: Annotated[
         bool,
         typer.Option(
             "--audit-only",
-            help="Deny nothing at first. The policy must have `audit-only = all`; the shipped policy gets it",
+            help="Deny nothing: the policy must have `audit-only = all`. It is added to the shipped policy, and to no"
+            " other",
         ),
     ] = False,
     when_standing: WhenStanding = False,
@@ -65,8 +71,8 @@ def adopt(
     """Take over the graph of a running robot from its own ROS master, without restarting a node. Needs root.
 
     The robot's nodes are registered with the appliance, and their connections are cut, so that they connect again
-    through it. Each start of the appliance does this again; `rosrv release` gives the graph back. Exit status 1 if
-    something prevents it.
+    through it. Each later start of the appliance does this again; `rosrv release` gives the graph back. Exit status 1
+    if something prevents it.
 
     Example: rosrv adopt --check
     """

@@ -50,8 +50,9 @@ def release(
 ) -> None:
     """Give the graph of an adopted robot back to its own ROS master, without restarting a node. Needs root.
 
-    The appliance runs on, but the robot's nodes no longer use it. While monitors are enabled, it waits until the robot
-    stands still, because guards end with the release. Without a master of its own, the robot gets one.
+    The appliance runs on, but the robot's nodes no longer use it. While monitors are enabled, the command waits until
+    the robot stands still, because guards end with the release. If the robot's own master no longer runs, another one
+    is started.
 
     Example: rosrv release
     """

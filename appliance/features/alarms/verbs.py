@@ -36,7 +36,7 @@ def list_alarms(appliance: Appliance) -> None:
 def acknowledge(appliance: Appliance, kind: _Kind, *, note: _Note = "") -> None:
     """Record that you take care of an alarm. It remains an alarm, with your name, until its condition ends.
 
-    Example: rosrv alarm acknowledge audit-not-forwarded --note "the receiver is being replaced"
+    Example: rosrv alarm acknowledge audit-not-forwarded --note "new receiver"
     """
     _say(appliance.ask_or_exit(AlarmAcknowledge(kind, note)), as_json=appliance.as_json)
 
@@ -53,7 +53,9 @@ def silence(
     end: Annotated[bool, typer.Option("--end", help="End the silence, or an acknowledgement, now")] = False,
     note: _Note = "",
 ) -> None:
-    """Make an alarm a notice for a time, so that `rosrv status` exits with 0. Metrics do not change.
+    """Make an alarm a notice for some time, so that `rosrv status` exits with 0. Metrics do not change.
+
+    Give --for or --end.
 
     Example: rosrv alarm silence audit-not-forwarded --for 2h
     """

@@ -26,12 +26,12 @@ from roswire.standard import standard_definitions
 def approve(
     appliance: Appliance,
     number: Annotated[
-        int | None, typer.Argument(metavar="[NUMBER]", help="The number in the denial", show_default=False)
+        int | None, typer.Argument(metavar="NUMBER", help="The number in the denial", show_default=False)
     ] = None,
     *,
     last: Annotated[
         str | None,
-        typer.Option("--for", help="Approve all calls of this name by this host for 1s to 1h"),
+        typer.Option("--for", help="Approve all calls of this name by this host for this time, 1s to 1h"),
     ] = None,
     refused: Annotated[
         bool, typer.Option("--refuse", help="Former name of: rosrv approval refuse NUMBER", hidden=True)
@@ -42,7 +42,8 @@ def approve(
 ) -> None:
     """Approve a call that the policy holds for an operator. Without a number, list all calls and approvals.
 
-    A call of a service is approved once, for the same arguments. A topic or a parameter is approved for 60 s.
+    Without --for, a call of a service is approved once, with the same arguments; publishing a topic or writing a
+    parameter is approved for 60 s.
 
     Example: rosrv approve 48213 --for 30s
     """

@@ -42,7 +42,7 @@ _CHECKPOINT_SECONDS = (
     5.0  # pause between two queries: a checkpoint is made once a minute, and REST queries are recorded
 )
 _PROGRESS_EVERY = 1000  # records
-_JSON_HELP = "One JSON object a line (NDJSON)"
+_JSON_HELP = "One JSON object on each line (NDJSON)"
 _ALWAYS_JSON_HELP = "Accepted; the output is always NDJSON"
 
 
@@ -63,7 +63,7 @@ def search(
     """Find records, newest first.
 
     On a terminal, equal consecutive records share a row, which shows how many there are, the first and last time, the
-    first record's sequence and the last value. In a pipe and with --json, each record is one line.
+    number of the first record and the last value. In a pipe and with --json, each record is one line.
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
@@ -134,7 +134,8 @@ def verify(
     appliance: Appliance,
     *,
     key: Annotated[
-        Path | None, typer.Option("--key", help="Public key (PEM) that the checkpoints must be signed with")
+        Path | None,
+        typer.Option("--key", help="Public key (PEM) of the key pair that must have signed the checkpoints"),
     ] = None,
     checkpoints: Annotated[
         Path | None,
@@ -158,12 +159,12 @@ def verify(
 ) -> None:
     """Verify that the log is complete and unchanged. Exit status: 0 yes, 1 no, 2 cannot be read.
 
-    Signatures are checked with the key beside the log, or with --key. Root also compares checkpoints with the signer's
-    memory, and the output says whether it did. With --checkpoints, they are compared with copies on another machine,
-    which even root on this one cannot change. To prove records without the log, use `rosrv evidence export` and
-    `rosrv evidence verify`.
+    Signatures are checked with the key beside the log, or with --key. For root, checkpoints are also compared with
+    the signer's memory; the output says whether they were. With --checkpoints, they are compared with copies on
+    another machine, which even root on this one cannot change. To prove records without the log, use `rosrv evidence
+    export` and `rosrv evidence verify`.
 
-    Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
+    Example: rosrv audit verify --key audit.pub --checkpoints checkpoints.ndjson
     """
     if other is None and (other_key is not None or other_checkpoints is not None):
         fail("--other-key and --other-checkpoints need --other, the other appliance's state directory", 2)
@@ -230,7 +231,7 @@ def checkpoints(
     With --follow, an appliance that restarts is asked again until it answers. Exit status: 1 if the reader of the
     output ends, 2 if the token is rejected.
 
-    Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
+    Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> signed.ndjson'
     """
     with Errors(unread=1 if follow else 0):
         for found in _checkpoints(audit_of(appliance.way).checkpoints, after, follow=follow):
@@ -280,7 +281,7 @@ def export(
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     as_csv: Annotated[
-        bool, typer.Option("--csv", help="CSV for a spreadsheet, which proves nothing")
+        bool, typer.Option("--csv", help="CSV for a spreadsheet instead of NDJSON; it proves nothing")
     ] = False,
 ) -> None:
     """Write all matching records as NDJSON, oldest first, each with its position in the hash chain.

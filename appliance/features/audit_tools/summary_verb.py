@@ -33,8 +33,8 @@ def summarise(
 ) -> None:
     """Show the denials of each host: number, first and last time, callers, the three most frequent rules or reasons.
 
-    Hosts with the most denials come first, and decisions about calls before malformed data and other reasons.
-    Repetitions that the log only counts are included with their number.
+    The host with the most denials comes first. Its reasons begin with decisions about calls; all others, such as
+    malformed data, follow. Repetitions that the log only counts are included with their number.
 
     Example: rosrv audit summary --since 1h
     """

@@ -15,7 +15,7 @@ FEATURE = Feature(
     ),
     verbs={
         "drive": Group(
-            "Assign the command groups of [Authority]: each has at most one host that drives.",
+            "Assign the command groups in [Authority] of the policy. At most one host drives a group.",
             {
                 "status": Verb(f"{_PLACE}verbs:status"),
                 "assign": Verb(f"{_PLACE}verbs:assign"),

@@ -18,11 +18,14 @@ from appliance.features.authority.requests import (
 from rosmop.tool.terminal import say
 
 _GroupName = Annotated[
-    str, typer.Argument(metavar="GROUP", help="A command group of [Authority]", show_default=False)
+    str,
+    typer.Argument(metavar="GROUP", help="A command group in [Authority] of the policy", show_default=False),
 ]
 _Host = Annotated[
     str,
-    typer.Option("--host", metavar="HOST", help="An address, or the name of one host (robot, host:NAME)"),
+    typer.Option(
+        "--host", metavar="HOST", help="An address, or the name of one host: robot, host:NAME, door:NAME"
+    ),
 ]
 
 
@@ -34,7 +37,7 @@ _NO_GROUPS = (
 @speaks
 def status(
     appliance: Appliance,
-    group: Annotated[str | None, typer.Argument(metavar="[GROUP]", help="Only this group")] = None,
+    group: Annotated[str | None, typer.Argument(metavar="GROUP", help="Only this group")] = None,
 ) -> None:
     """Show the holder of each group, and the hosts that wait for it. Exit status 1 if there is no such group.
 
@@ -57,6 +60,8 @@ def status(
 def assign(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
     """Assign a group to a host that may take it, or that may override its holder.
 
+    Not for a group with ranks: its highest node that moves drives.
+
     Example: rosrv drive assign base --host host:ocu-1
     """
     _show(appliance, appliance.answer_or_exit(DriveTake(group, host)))
@@ -68,12 +73,16 @@ def free(
     group: _GroupName,
     *,
     to: Annotated[
-        str, typer.Option("--to", metavar="HOST", help="Assign it to this host, even if it may only ask")
+        str,
+        typer.Option(
+            "--to", metavar="HOST", help="Assign the group to this host, even if the host may only ask"
+        ),
     ] = "",
 ) -> None:
     """Take a group from its holder. The first host that waits and may take the group gets it.
 
-    In a group with ranks, all hosts may drive again, also after a driver was lost.
+    In a group with ranks, all hosts may drive again, for example after the driver's connection was lost. This is
+    refused while the driver moves.
 
     Example: rosrv drive free base
     """
@@ -82,7 +91,9 @@ def free(
 
 @speaks
 def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
-    """Let a host wait for a group, for a minute. A host that may take the group gets it as soon as it is free.
+    """Let a host wait for a group, for one minute. A host that may take the group gets it as soon as it is free.
+
+    Not for a group with ranks: its highest node that moves drives.
 
     Example: rosrv drive ask base --host host:agent-1
     """

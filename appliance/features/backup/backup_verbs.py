@@ -36,7 +36,7 @@ def backup(
 
     Your own files are not included: configuration, policy and specifications.
 
-    Example: rosrv backup /media/safe/rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
+    Example: rosrv backup /media/safe/rosrv-2026-03-01.tar.gz
     """
     try:
         names = back_up(state, file)
@@ -56,7 +56,7 @@ def restore(
 ) -> None:
     """Create a state directory from a backup, for `rosrv up --state`. Existing files are never overwritten.
 
-    Example: rosrv restore /media/safe/rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
+    Example: rosrv restore rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
     """
     try:
         names = put_back(file, state)
@@ -81,7 +81,8 @@ def purge(
 ) -> None:
     """Erase a state directory: audit log, policies, keys of the appliance and its hosts. Stop the appliance first.
 
-    Keys and other small files are overwritten first; copies that the disk itself keeps cannot be reached.
+    Keys and other small files are overwritten first; copies inside the disk, as SSDs make them, cannot be
+    erased.
 
     Example: rosrv purge --state /var/lib/rosrv
     """

@@ -39,19 +39,22 @@ def block(
     *,
     time: Annotated[
         str | None,
-        typer.Option("--for", help="End the block after this time (30s, 10m, 1h, 2d; default: never)"),
+        typer.Option(
+            "--for", help="End the block after this time: 30s, 10m, 1h, 2d (default: it has no end)"
+        ),
     ] = None,
     note: Annotated[str, typer.Option(help="The reason, for other operators")] = "",
     force: Annotated[
         bool,
         typer.Option(
             "--force",
-            help="Block even the robot's own host, a host with most of the registrations, or your own",
+            help="Block even the robot's own host, a host with most of the registrations, or the host that you use",
         ),
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what the block would end")] = False,
 ) -> None:
-    """Block a host at once at every entrance, and end its registrations, connections, sessions and tunnel.
+    """Block a host at once: refuse its calls and new connections, and end its registrations, connections, sessions
+    and tunnel.
 
     The block survives restarts. It ends after the given time, or with `rosrv host unblock`. Blocking it again
     replaces the block.

@@ -22,7 +22,8 @@ def demo(
         ),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
+        bool,
+        typer.Option("--json", help="One JSON object for each result; all other text goes to standard error"),
     ] = False,
     standby: Annotated[
         bool,

@@ -27,7 +27,7 @@ def add(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="NAME", help="Name of the identity, `door:NAME` in the policy", show_default=False
+            metavar="NAME", help="Name of the door, `door:NAME` in the policy", show_default=False
         ),
     ],
     *,
@@ -37,13 +37,18 @@ def add(
     ] = None,
     source: Annotated[
         str,
-        typer.Option("--from", metavar="ADDRESS", help="Address or network of the agent", show_default=False),
+        typer.Option(
+            "--from",
+            metavar="ADDRESS",
+            help="Address or network of the agent (default: any)",
+            show_default=False,
+        ),
     ] = "",
 ) -> None:
     """Add a door for one person, program or agent. Its rights are those of the host `door:NAME` in the policy.
 
-    Without --port, only tickets open the door. With --port, any program that connects to the port from the given
-    address has the rights of the door.
+    Without --port, only tickets open the door. With --port, any program that connects to the port from the address of
+    --from has the rights of the door; without --from, from any address.
 
     Example: rosrv door add agent-1 --port 9091 --from 10.0.0.7
     """
@@ -97,7 +102,7 @@ def ticket(
     appliance: Appliance,
     name: _Name,
     *,
-    time: Annotated[str, typer.Option("--for", help="How long it is valid (30m, 8h, 7d)")] = "8h",
+    time: Annotated[str, typer.Option("--for", help="How long it is valid: 30m, 8h; at most 30d")] = "8h",
 ) -> None:
     """Make a ticket: a URL with which a person's browser or Foxglove opens the door. It is shown only here.
 

@@ -43,7 +43,7 @@ def export_evidence(
     recording: Annotated[
         str | None,
         typer.Argument(
-            metavar="[RECORDING]",
+            metavar="RECORDING",
             help="Export the messages and the time of this recording",
             autocompletion=completion.names_of_feature(
                 "recordings", lambda body: [row.id for row in body.recordings]
@@ -57,10 +57,11 @@ def export_evidence(
 ) -> None:
     """Export the audit log of a period as a bundle that can be verified anywhere.
 
-    The bundle holds the recording (if one is given), the audit records, the policies and specifications in force,
-    signed checkpoints, a readable page and the verifier. The audit log records the export.
+    Give a recording, or --since with or without --until. The bundle holds the recording (if one is given), the audit
+    records, the policies and specifications in force, signed checkpoints, a readable page and the verifier. The audit
+    log records the export.
 
-    Example: rosrv evidence export --since 2026-03-01T10:00Z --until 2026-03-01T11:00Z -o incident.zip
+    Example: rosrv evidence export --since 10:00 --until 11:00 -o incident.zip
     """
     with Errors():
         if (recording is None) is (since is None) or (recording is not None and until is not None):
@@ -131,7 +132,7 @@ def verify(
 ) -> None:
     """Verify a bundle. Exit status: 0 valid, 1 invalid, 2 not a bundle.
 
-    Does the same as `python3 verify.py`, which is in each bundle and does not need an appliance.
+    It does the same as `python3 verify.py`, which is in each bundle and does not need an appliance.
 
     Example: rosrv evidence verify incident.zip --key /media/safe/audit.pub
     """

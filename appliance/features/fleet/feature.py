@@ -48,7 +48,7 @@ FEATURE = Feature(
     ),
     verbs={
         "fleet": Group(
-            "Push the audit log to a collector of many robots, and take its bundles.",
+            "Push the audit log to the collector of many robots, and take its bundles: policy, specifications, hosts.",
             {
                 "join": Verb(f"{_VERBS}:join"),
                 "leave": Verb(f"{_VERBS}:leave"),

@@ -15,9 +15,11 @@ _VERB = "rosrv fleet"
 
 @speaks_here
 def take(appliance: Appliance, *, when_standing: WhenStanding = False, within: Within = WITHIN) -> None:
-    """Try the bundle that waits for this order (`fleet.bundles.wait_for_order`). Exit status 1 if none waits.
+    """Bring the bundle that waits for this order into force. Exit status 1 if none waits.
 
-    With --when-standing, the bundle comes into force only when the robot stands still. `rosrv status` shows the result.
+    Bundles wait with the setting `fleet.bundles.wait_for_order`. The bundle is rolled back if the robot is not
+    healthy with it. With --when-standing, it comes into force only when the robot stands still. `rosrv status` shows
+    the result.
 
     Example: sudo rosrv fleet take --when-standing --within 10m
     """

@@ -35,19 +35,20 @@ def check_driver(
         str,
         typer.Option("--by", metavar="TOPIC", help="Topic of the odometry", autocompletion=completion.topics),
     ],
-    longest: Annotated[str, typer.Option("--for", help="How long motions are withheld, at most 10s")] = "2s",
+    longest: Annotated[
+        str, typer.Option("--for", help="How long motion commands are withheld, at most 10s")
+    ] = "2s",
     within: Annotated[
-        str, typer.Option("--within", help="The longest wait for a slow drive, up to 5m")
+        str, typer.Option("--within", help="The longest wait for slow motion, at most 5m")
     ] = "30s",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask; needed without a terminal")] = False,
 ) -> None:
-    """Measure whether the robot's driver stops the base when commands end, as if the appliance's machine had
-    died.
+    """Measure whether the base driver stops the base when commands end, as if the appliance's machine had died.
 
-    Drive the base slowly, with its wheels raised or in free space. After a second the appliance withholds the
-    motions of this topic once, and watches the odometry. Every stop command passes, guards stay in force, and
-    commands pass again afterwards. Exit status: 0 the driver stopped the base, 1 it still moved, 2 not
-    measured.
+    Drive the base slowly, at most 0.3 m/s and 0.6 rad/s, with its wheels raised or in free space. After one second of
+    such motion, the appliance withholds the motion commands of this topic, at most for the time of --for, and watches
+    the odometry. Stop commands pass, and guards stay in force. Then all commands pass again. Exit status: 0 the base
+    driver stopped the base, 1 the base still moved, 2 not measured.
 
     Example: rosrv guard check-driver /cmd_vel --by /odom
     """

@@ -32,7 +32,7 @@ def show(
         ),
     ],
 ) -> None:
-    """Show a guard: its state, its parameters, and the values on which it decides now.
+    """Show a guard: whether it is in force, its parameters, and the values on which it decides now.
 
     The audit log records who looked, because the values come from messages.
 

@@ -56,7 +56,9 @@ _Name = Annotated[
 _Values = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="PARAMETER=VALUE…", help="Parameters of the preset, such as silent=0.5", show_default=False
+        metavar="PARAMETER=VALUE",
+        help="Parameters of the preset, such as silent=0.5; `rosrv guard list` prints their units",
+        show_default=False,
     ),
 ]
 _DryRun = Annotated[
@@ -65,7 +67,8 @@ _DryRun = Annotated[
 _Hold = Annotated[
     bool,
     typer.Option(
-        "--hold", help="Load even if a monitor then blocks topics in use until `rosrv monitor resume`"
+        "--hold",
+        help="Load even if a monitor then holds topics in use: it drops their messages until `rosrv monitor resume`",
     ),
 ]
 
@@ -131,15 +134,28 @@ def new(
     *,
     by: Annotated[
         str | None,
-        typer.Option("--by", metavar="TOPIC", help="Topic of the sensor", autocompletion=completion.topics),
+        typer.Option(
+            "--by",
+            metavar="TOPIC",
+            help="Topic of the sensor, if the preset needs one",
+            autocompletion=completion.topics,
+        ),
     ] = None,
     further: Annotated[
         list[str] | None,
-        typer.Option("--topic", metavar="NAME=TOPIC", help="Another topic of the preset (repeatable)"),
+        typer.Option(
+            "--topic",
+            metavar="NAME=TOPIC",
+            help="Another topic of the preset; NAME as in `rosrv guard list` (repeatable)",
+        ),
     ] = None,
     kinds: Annotated[
         list[str] | None,
-        typer.Option("--type", metavar="NAME=TYPE", help="Type of a topic that no node has yet (repeatable)"),
+        typer.Option(
+            "--type",
+            metavar="NAME=TYPE",
+            help="Type of a topic that no node has yet, such as command=geometry_msgs/Twist (repeatable)",
+        ),
     ] = None,
     name: Annotated[
         str | None, typer.Option("--name", help="Name of the guard (default: the preset's)")
@@ -155,8 +171,8 @@ def new(
 ) -> None:
     """Make a guard from a preset and load it. Its file is also written into the folder of specifications.
 
-    The robot must have the topics, with types that the preset knows. `rosrv guard list` prints the presets with their
-    parameters.
+    The robot must have the topics, with types that the preset knows; --type is for a topic that no node has yet. With
+    --confirm-within, and over REST, no file is written. `rosrv guard list` prints the presets with their parameters.
 
     Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5
     """
@@ -187,8 +203,8 @@ def set_values(
     values: Annotated[
         list[str],
         typer.Argument(
-            metavar="PARAMETER=VALUE…",
-            help="Parameters of the preset, such as silent=0.5",
+            metavar="PARAMETER=VALUE",
+            help="Parameters of the preset, such as silent=0.5; `rosrv guard list` prints their units",
             show_default=False,
         ),
     ],
@@ -197,8 +213,8 @@ def set_values(
         bool,
         typer.Option(
             "--dry-run",
-            help="Only report what would be loaded, changed and held, and what it would have stopped, from the flight"
-            " recorder",
+            help="Only report what would be loaded, changed and held, and which messages of the flight recorder the"
+            " guard would have stopped",
         ),
     ] = False,
     since: Annotated[
@@ -213,7 +229,8 @@ def set_values(
     within: Within = WITHIN,
     hold: _Hold = False,
 ) -> None:
-    """Set parameters of a guard while it runs. It keeps its state, unless limits of joints or a deadline are set.
+    """Set parameters of a guard while it runs. It keeps its state, but starts again after a change of joint limits or
+    of a deadline.
 
     Example: rosrv guard set fence margin=0.5
     """
@@ -259,7 +276,7 @@ def enforce(
     within: Within = WITHIN,
     dry_run: _DryRun = False,
 ) -> None:
-    """Bring a guard from shadow mode into force. It keeps its state.
+    """Bring a guard from shadow mode into force. It keeps its state, unless it missed messages in shadow mode.
 
     With --confirm-within it returns to shadow mode after this time unless you run `rosrv monitor confirm`.
 
@@ -306,10 +323,11 @@ def upgrade(
     hold: _Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
-    """Replace guards of an older version by those of the present presets, with the same topics and values.
+    """Replace guards of an older version with new ones from the present presets. Topics and values stay the same.
 
     Each guard starts without its state: the base is stopped until the next command. A guard whose value or topic the
-    present version rejects is not upgraded, and is named; the others are.
+    present version rejects is named and stays as it is; all others are upgraded. --topic and --confirm-within need a
+    GUARD.
 
     Example: rosrv guard upgrade --dry-run
     """
@@ -353,6 +371,8 @@ def _upgrade(appliance: Appliance, order: GuardUpgrade) -> None:
 @speaks
 def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = None) -> None:
     """Remove a guard, and its file from the folder of specifications.
+
+    With --confirm-within, and over REST, the file stays: a reload of the folder loads the guard again.
 
     Example: rosrv guard remove fence
     """

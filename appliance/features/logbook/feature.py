@@ -8,7 +8,7 @@ _PLACE = "appliance.features.logbook."
 FEATURE = Tool(
     verbs={
         "report": Group(
-            "Print the machine's logbook: interventions in its safety settings.",
+            "Print the robot's logbook: interventions in its safety settings.",
             {"interventions": Verb(f"{_PLACE}report_verb:report_interventions")},
             after="audit",
         ),

@@ -65,14 +65,15 @@ def report_interventions(
         ),
     ] = None,
 ) -> None:
-    """Report who changed which safety setting of the machine, its values before and after, and the gaps of the proof.
+    """Report who changed which safety setting of the robot, its values before and after, and the gaps of the log.
 
-    The report has all changes of the policy, guards, monitors, driving rights, approvals, blocks, doors, tokens, hosts,
-    alarms and software, what was off or blocked and for how long, who drove, the present interfaces, and the gaps of
-    the log. It contains no secret and no value of a parameter. It does not verify the log: `rosrv audit verify` does,
-    and the report names its last result on this machine. With --other, it covers both appliances of a pair.
+    The report has all changes of the policy, guards, monitors, driving rights, approvals, blocks, doors, tokens,
+    hosts, alarms and software. It also says what was off or blocked and for how long, who drove, and which interfaces
+    are present, such as REST and doors. It contains no secret and no value of a ROS parameter. It does not verify the
+    log: `rosrv audit verify` does, and the report names its last result on this machine. With --other, it covers both
+    appliances of a pair.
 
-    Example: rosrv report interventions --since 2026-03-01 --until 2026-04-01 --output march.html
+    Example: rosrv report interventions --since 2026-03-01 --output march.html
     """
     with Errors():
         if since is not None and after is not None:

@@ -34,10 +34,10 @@ def who_drove(
     ] = None,
     other: Other = None,
 ) -> None:
-    """List the hosts that held a group of [Authority] at a time, since when, and by whose order.
+    """List the hosts that held a command group, since when, and by whose order.
 
-    Without a group in [Authority] the log does not say who drove: every host that may publish may drive. Exit status 1
-    if no host held a group then.
+    Give --at or --between. Without a group in [Authority] of the policy, the log does not say who drove: every host
+    that may publish may drive. Exit status 1 if no host held a group then.
 
     Example: rosrv who-drove --at 14:03
     """

@@ -22,7 +22,7 @@ from rosmop.tool.terminal import printable, say
 _Names = Annotated[
     list[str],
     typer.Argument(
-        metavar="MONITOR…",
+        metavar="MONITOR",
         help="Names as in `rosrv monitor list`",
         show_default=False,
         autocompletion=completion.monitors,
@@ -37,20 +37,22 @@ Shadow = Annotated[
 Hold = Annotated[
     bool,
     typer.Option(
-        "--hold", help="Load even if a monitor then blocks topics in use until `rosrv monitor resume`"
+        "--hold",
+        help="Load even if a monitor then holds topics in use: it drops their messages until `rosrv monitor resume`",
     ),
 ]
 Force = Annotated[
     bool,
     typer.Option(
-        "--force", help="Load or enforce even if this cuts a topic whose publisher has another type"
+        "--force",
+        help="Load or enforce even if this cuts a topic, because its publisher and the monitor have different types",
     ),
 ]
 
 
 @speaks
 def list_monitors(appliance: Appliance) -> None:
-    """List the monitors with their state, topics and counts.
+    """List the monitors: whether they are enabled, disabled or in shadow mode, their topics and counts.
 
     Example: rosrv monitor list --json
     """
@@ -157,7 +159,19 @@ def disable(
 
 
 @speaks
-def remove(appliance: Appliance, names: _Names, confirm_within: ConfirmWithin = None) -> None:
+def remove(
+    appliance: Appliance,
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="MONITOR",
+            help="Names as in `rosrv monitor list`, or of files (.rv)",
+            show_default=False,
+            autocompletion=completion.monitors,
+        ),
+    ],
+    confirm_within: ConfirmWithin = None,
+) -> None:
     """Remove specifications, by the names of their monitors or files.
 
     Example: rosrv monitor remove safeTrigger --confirm-within 5m
@@ -196,7 +210,9 @@ def reload(
 
 @speaks
 def resume(appliance: Appliance, names: _Names) -> None:
-    """Release the topics that these monitors hold, for example because their state was lost.
+    """Let messages pass again on the topics that these monitors hold.
+
+    A monitor holds its topics, for example, after it lost its state: it drops all their messages.
 
     Example: rosrv monitor resume safeTrigger
     """
@@ -216,16 +232,18 @@ def set_given(
     values: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="NAME=VALUE…", help="Constants that are given to it, such as vMax=0.3", show_default=False
+            metavar="NAME=VALUE", help="Constants that are given to it, such as vMax=0.3", show_default=False
         ),
     ] = None,
     *,
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
 ) -> None:
-    """Set constants that are given to a monitor while it runs. Without values, print everything given to it.
+    """While a monitor runs, change the constants in the `given` of its specification. Without values, print all of
+    it.
 
-    The monitor keeps its source and its state. A value outside its range is rejected. Topics are set by a load.
+    The monitor keeps its source and its state. A value outside its range is rejected. To change topics, use `rosrv
+    monitor load --set`.
 
     Example: rosrv monitor set speed vMax=0.3
     """

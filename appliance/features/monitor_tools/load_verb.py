@@ -22,7 +22,7 @@ def load(
     appliance: Appliance,
     files: Annotated[
         list[Path],
-        typer.Argument(readable=False, metavar="FILE…", help="Specification files (.rv)", show_default=False),
+        typer.Argument(readable=False, metavar="FILE", help="Specification files (.rv)", show_default=False),
     ],
     msg: Annotated[
         list[Path] | None,
@@ -37,7 +37,9 @@ def load(
     given: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="MONITOR.NAME=VALUE", help="Constant or topic given to a monitor (repeatable)"
+            "--set",
+            metavar="MONITOR.NAME=VALUE",
+            help="Constant or topic in the `given` of a specification (repeatable)",
         ),
     ] = None,
     when_standing: WhenStanding = False,
@@ -45,10 +47,10 @@ def load(
 ) -> None:
     """Load specifications while the robot runs; files of the same name are replaced.
 
-    They are compiled and compared with the robot's topics first. After an error nothing changes and the exit status is
-    1. A monitor whose source changes loses its state; if it then holds topics with traffic, the load needs --hold. With
-    --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the files and
-    from --msg.
+    They are compiled and compared with the robot's topics first. After an error nothing changes: exit status 1. A
+    monitor whose source changes loses its state; if it then holds topics with traffic, the load needs --hold. With
+    --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the files
+    and from --msg.
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """

@@ -44,10 +44,10 @@ def show(appliance: Appliance, revision: _Revision = None) -> None:
 @speaks
 def diff(
     appliance: Appliance,
-    old: Annotated[int | None, typer.Argument(help="A kept revision (default: the previous one)")] = None,
+    old: Annotated[int | None, typer.Argument(help="A kept revision (default: the one before NEW)")] = None,
     new: _Revision = None,
 ) -> None:
-    """Show the changes of a revision. Exit status: 0 no difference, 1 differences.
+    """Compare two revisions of the specifications. Exit status: 0 no difference, 1 differences.
 
     Example: rosrv monitor diff 6 7
     """

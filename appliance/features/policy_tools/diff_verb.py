@@ -71,8 +71,8 @@ def compare(
 ) -> None:
     """Compare the texts of two policies or, with --decisions, their decisions. Exit status 1 if they differ.
 
-    Give a file or a revision to compare it with the policy in force; nothing, to show the last change. Two files are
-    compared by their decisions.
+    Give a file or a revision to compare it with the policy in force. Give neither to show the last change. Two files
+    are always compared by their decisions.
 
     Example: rosrv policy diff next.ini
     """

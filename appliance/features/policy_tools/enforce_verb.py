@@ -66,7 +66,7 @@ def enforce(
     appliance: Appliance,
     sections: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[SECTION]...", help="Sections such as Publishers (default: all)"),
+        typer.Argument(metavar="SECTION", help="Sections such as Publishers (default: all)"),
     ] = None,
     *,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would have been denied")] = False,
@@ -87,10 +87,12 @@ def enforce(
 ) -> None:
     """Enforce sections of the policy in force that are `audit-only`, after a comparison with the recorded requests.
 
-    The rights of running nodes are compared too, because the record of a right may be older than the period. With
-    --dry-run, exit status 1 if a recorded request would have been denied, or a right of a running node would end. The
-    policy file is not changed: a reload brings its text back. Denials that depend on which host
-    has a node name now are not compared.
+    The comparison is printed, and prevents nothing: first use --dry-run, which changes nothing and has exit status 1
+    if a recorded request would have been denied, or a right of a running node would end.
+
+    The rights of running nodes are compared too, because the record of a right may be older than the period. The
+    policy file is not changed: a reload brings its text back. Denials that depend on which host has a node name now
+    are not compared.
 
     Example: rosrv policy enforce Publishers --confirm-within 5m
     """

@@ -31,7 +31,8 @@ from rosmop.tool.terminal import printable, say
 
 @speaks
 def why(appliance: Appliance, record: RecordArgument) -> None:
-    """Explain a record: its sender, events, values, line and recording, and the rule that would allow a denied request.
+    """Explain a record: its sender, events, values, line of the specification and recording, and the rule that would
+    allow a denied request.
 
     The listed events are those that led to a monitor's verdict. The appliance may be stopped; only the rule that would
     allow a denied request needs the running appliance.

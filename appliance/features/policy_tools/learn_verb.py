@@ -40,7 +40,11 @@ def learn_policy(
     since: Since = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="File, must not exist, except with --ask, which continues it"),
+        typer.Option(
+            "--output",
+            "-o",
+            help="File (default: standard output); must not exist, except with --ask, which continues it",
+        ),
     ] = None,
     tests: Annotated[
         Path | None,
@@ -52,7 +56,8 @@ def learn_policy(
     with_start: Annotated[
         bool,
         typer.Option(
-            "--with-start", help="Also grant what a start needs to nodes whose start is not in the log"
+            "--with-start",
+            help="To nodes whose start is not in the log, also grant the rights that a start needs",
         ),
     ] = False,
     robot: Robot = None,
@@ -63,7 +68,8 @@ def learn_policy(
     if the log has no requests, or if the log lacks the start of nodes that were adopted (see --with-start). Hosts get
     their names from /etc/hosts, and the hosts of the running appliance's robot become the group `robot`.
 
-    --ask starts with the policy in force, asks on the terminal, and writes the changed policy with its tests.
+    --ask needs --output. It starts with the policy in force, asks on the terminal, and writes the changed policy with
+    its tests.
 
     Example: rosrv policy learn --state /var/lib/rosrv --output learned.ini
     """

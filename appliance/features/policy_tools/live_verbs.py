@@ -57,7 +57,7 @@ def reload(
 ) -> None:
     """Reload the policy file: check it, run its tests, enforce it, and revoke rights that it no longer grants.
 
-    An invalid file changes nothing: all errors are shown and the exit status is 1.
+    An invalid file changes nothing. All errors are shown, with exit status 1.
 
     Example: rosrv policy reload --confirm-within 5m
     """

@@ -35,14 +35,14 @@ from appliance.policy.policy import Policy
 usage_error = functools.partial(output.usage_error, verb="rosrv policy")
 Robot = Annotated[
     list[str] | None,
-    typer.Option("--robot", metavar="ADDRESS", help="Address of the group robot (repeatable)"),
+    typer.Option("--robot", metavar="ADDRESS", help="Address or network of the group `robot` (repeatable)"),
 ]
 Enrolled = Annotated[
     list[str] | None,
     typer.Option(
         "--enrolled",
         metavar="NAME=ADDRESS",
-        help="An enrolled host, for host:NAME, or a door as door:NAME (repeatable)",
+        help="Address of an enrolled host, `host:NAME` in the policy; door:NAME=ADDRESS for a door (repeatable)",
     ),
 ]
 

@@ -156,23 +156,28 @@ def explain_request(
     node: Annotated[
         str, typer.Option(help="The requesting node's name (caller_id), if the request needs one")
     ] = "",
-    publish: Annotated[str | None, typer.Option(metavar="TOPIC", help="publish a topic")] = None,
-    subscribe: Annotated[str | None, typer.Option(metavar="TOPIC", help="subscribe to a topic")] = None,
-    command: Annotated[str | None, typer.Option(metavar="CALL", help="make a call")] = None,
-    offer: Annotated[str | None, typer.Option(metavar="SERVICE", help="offer a service")] = None,
-    call: Annotated[str | None, typer.Option(metavar="SERVICE", help="call a service")] = None,
-    read: Annotated[str | None, typer.Option(metavar="PARAMETER", help="read a parameter")] = None,
-    write: Annotated[str | None, typer.Option(metavar="PARAMETER", help="write a parameter")] = None,
-    use_node: Annotated[str | None, typer.Option(metavar="NODE", help="use a node name")] = None,
+    publish: Annotated[str | None, typer.Option(metavar="TOPIC", help="Action: publish a topic")] = None,
+    subscribe: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Action: subscribe to a topic")
+    ] = None,
+    command: Annotated[
+        str | None, typer.Option(metavar="CALL", help="Action: make a call of [Commands], such as getParam")
+    ] = None,
+    offer: Annotated[str | None, typer.Option(metavar="SERVICE", help="Action: offer a service")] = None,
+    call: Annotated[str | None, typer.Option(metavar="SERVICE", help="Action: call a service")] = None,
+    read: Annotated[str | None, typer.Option(metavar="PARAMETER", help="Action: read a parameter")] = None,
+    write: Annotated[str | None, typer.Option(metavar="PARAMETER", help="Action: write a parameter")] = None,
+    use_node: Annotated[str | None, typer.Option(metavar="NODE", help="Action: use a node name")] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
 ) -> None:
-    """Explain whether a request is allowed, by which rule, and the overridden rules. Exit status 1 unless allowed.
+    """Explain whether a request is allowed, by which rule, and which rules it overrides. Exit status 1 unless
+    allowed.
 
     Without an action, list the rules that grant the host something; exit status 1 if none does. Without a file, the
     policy in force is used.
 
-    Example: rosrv policy explain --host 10.0.0.9 --node /joystick --publish /cmd_vel
+    Example: rosrv policy explain --host 10.0.0.9 --node /joy --publish /cmd_vel
     """
     asked = {
         Category.PUBLISH: publish,

@@ -23,10 +23,10 @@ def list_unused(
     ] = "30d",
     everything: Annotated[bool, typer.Option("--all", help="Also list the used rules")] = False,
 ) -> None:
-    """List the rules of the policy in force, and the hosts in them, that were not used since a time.
+    """List the rules of the policy in force, and the hosts in them, that were not used since the time of --since.
 
-    Registrations of running nodes count as uses. A right is `unknown` instead of `unused` if a use may be among
-    removed records, or among records that only count a host's requests.
+    Registrations of running nodes count as uses. A rule or host is `unknown` instead of `unused` if a use may be
+    among removed records, or among records that only count a host's requests.
 
     Example: rosrv policy unused --since 30d
     """

@@ -62,11 +62,17 @@ def now(
     *,
     before: Annotated[
         str | None,
-        typer.Option(help="Time before now to keep: 30s, 2m (default: recorder.before)", show_default=False),
+        typer.Option(
+            help="Time before now to keep: 30s, 2m (default: `recorder.before` of the configuration)",
+            show_default=False,
+        ),
     ] = None,
     after: Annotated[
         str | None,
-        typer.Option(help="Time after now to record: 10s (default: recorder.after)", show_default=False),
+        typer.Option(
+            help="Time after now to record: 10s (default: `recorder.after` of the configuration)",
+            show_default=False,
+        ),
     ] = None,
     note: Annotated[
         str, typer.Option(help="Description of the event, for the recording and the audit log")
@@ -161,7 +167,8 @@ def messages(
     at: Annotated[
         str | None,
         typer.Option(
-            help="A time, the id of a record in the recording, or a message's position (default: its first trigger)",
+            help="A time, the id of an audit record in the recording, or the position of a message (default: the first"
+            " trigger of the recording)",
             show_default=False,
         ),
     ] = None,
@@ -219,7 +226,7 @@ def fetch(
 ) -> None:
     """Write a recording to a bag file. The audit log records the request.
 
-    Example: rosrv record fetch 1879f3c2a4b5d6e7f012 && rosbag info rosrv-1879f3c2a4b5d6e7f012.bag
+    Example: rosrv record fetch 1879f3c2a4b5d6e7f012 --mcap
     """
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
     if os.path.lexists(target):

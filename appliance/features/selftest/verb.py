@@ -33,7 +33,11 @@ def selftest(
     appliance: Appliance,
     config: Annotated[
         Path | None,
-        typer.Option("--config", readable=False, help="Configuration file (default: ./appliance.yaml)"),
+        typer.Option(
+            "--config",
+            readable=False,
+            help="Configuration file (default: ROSRV_CONFIG, else ./appliance.yaml)",
+        ),
     ] = None,
 ) -> None:
     """Check whether this machine can run the appliance, and whether a running appliance works.

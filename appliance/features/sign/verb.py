@@ -19,7 +19,7 @@ _OPENSSH = b"-----BEGIN OPENSSH PRIVATE KEY-----"
 
 def sign(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE…", help="Files whose text is signed", show_default=False)
+        list[Path], typer.Argument(metavar="FILE", help="Files whose text is signed", show_default=False)
     ],
     key: Annotated[
         Path, typer.Option(metavar="FILE", help="The private key (ssh-keygen -t ed25519 -f FILE)")
@@ -29,7 +29,7 @@ def sign(
     """Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.
 
     Add the public key (KEY.pub) to `site_keys` of appliance.yaml: from then on, only signed files come into force.
-    `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same signature, and supports passphrases and agents.
+    `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same signature, and supports passphrases and ssh-agent.
 
     Example: rosrv sign policies/default.ini --key site
     """

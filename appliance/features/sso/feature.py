@@ -45,7 +45,7 @@ FEATURE = Feature(
     ),
     verbs={
         "sso": Group(
-            "Sessions of people who signed in at the provider.",
+            "List and end the sessions of people who signed in at the single sign-on provider.",
             {"list": Verb(f"{_VERBS}:list_sessions"), "end": Verb(f"{_VERBS}:end")},
             after="token",
         )

@@ -13,7 +13,7 @@ from rosmop.tool.terminal import say
 
 @speaks
 def list_sessions(appliance: Appliance) -> None:
-    """List the sessions of people who signed in at the provider.
+    """List the sessions of people who signed in at the single sign-on provider.
 
     Example: rosrv sso list
     """
@@ -34,7 +34,7 @@ def end(
     appliance: Appliance,
     name: Annotated[str, typer.Argument(help="Name of the person, as in the list", show_default=False)],
 ) -> None:
-    """End all sessions of a person now. To keep them out, also remove their access at the provider.
+    """End all sessions of a person now. To keep them out, also remove their access at the single sign-on provider.
 
     Example: rosrv sso end sso:alice@example.org
     """

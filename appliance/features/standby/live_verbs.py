@@ -24,7 +24,7 @@ _AGAIN_SECONDS = 0.2
 _SHOW_SECONDS = 2.0
 
 
-@speaks_with("One JSON object; with --watch one a line")
+@speaks_with("One JSON object; with --watch, one on each line")
 def status(
     appliance: Appliance,
     *,

@@ -35,10 +35,10 @@ _Fixed = Annotated[
     typer.Option(help="Unused address in the robot's network, at which nodes reach the active appliance"),
 ]
 _Name = Annotated[
-    str | None, typer.Option(help="Name of this appliance (default: its name in an earlier pair, or a)")
+    str | None, typer.Option(help="Name of this appliance (default: its name in an earlier pair, or `a`)")
 ]
 _OtherName = Annotated[
-    str | None, typer.Option(help="Name of the other appliance (default: as in an earlier pair, or b)")
+    str | None, typer.Option(help="Name of the other appliance (default: as in an earlier pair, or `b`)")
 ]
 _Followers = Annotated[
     list[str] | None,
@@ -54,7 +54,9 @@ _Ports = Annotated[
 _PeerPort = Annotated[int, typer.Option(help="Port between the appliances, UDP and TCP", min=1, max=65_535)]
 _Configuration = Annotated[
     Path | None,
-    typer.Option(help="Configuration file, for the default of --ports (default: ./appliance.yaml)"),
+    typer.Option(
+        help="Configuration file, for the default of --ports (default: ROSRV_CONFIG, else ./appliance.yaml)"
+    ),
 ]
 _KitFolder = Annotated[
     Path | None,
@@ -62,13 +64,13 @@ _KitFolder = Annotated[
         "--output",
         "-o",
         metavar="DIR",
-        help="New folder for the files of the other machines; it has private keys",
+        help="New folder for the files of the other machines; it contains private keys",
     ),
 ]
 _Force = Annotated[
     bool,
     typer.Option(
-        "--force", help="Join even if this appliance is one of a pair; all machines are set up again"
+        "--force", help="Join even if this appliance is one of a pair; then set up all machines again"
     ),
 ]
 
@@ -172,8 +174,9 @@ def _single(state: Path) -> typer.Exit:
 def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     """Forget the stored epoch, so that the next start takes the witness's epoch. Stop the appliance first.
 
-    Use it if the witness reports a smaller epoch although its disk was not restored. Run it on both appliances. Exit
-    status: 0 done, 1 the appliance runs, 2 it is not one of a pair.
+    The epoch is a number that grows with each takeover. Use this command if the witness reports a smaller epoch
+    although its disk was not restored. Run it on both appliances. Exit status: 0 done, 1 the appliance runs, 2 it is
+    not one of a pair.
 
     Example: rosrv standby repair
     """

@@ -41,7 +41,7 @@ def survey(
     graph's hosts. It needs no appliance: run it on the robot, or on a computer of its network. Exit status 1 if the
     master does not answer.
 
-    Example: rosrv survey --master http://robot:11311 --output survey.html --policy draft.ini
+    Example: rosrv survey --output survey.html --policy draft.ini
     """
     seconds = bounded_span("--within", within, "1s", "10m", _VERB, bare="s")
     tests = None if policy is None else policy.with_name(f"{policy.name}.tests.yaml")

@@ -27,8 +27,10 @@ def add(
     role: Annotated[
         TokenRole,
         typer.Option(
-            help="viewer: read; operator: also reload, roll back, approve, block hosts, make tickets; admin: also load"
-            " new policies; investigator: read, and fetch the messages of recordings"
+            metavar="ROLE",
+            help="viewer: read; investigator: also fetch the messages of recordings, which no other role may;"
+            " operator: read, reload, roll back, approve, block hosts, make tickets; admin: also load policies and"
+            " specifications, enrol hosts, end tokens",
         ),
     ] = "viewer",
     *,
@@ -61,7 +63,7 @@ def rotate(
         ),
     ] = None,
 ) -> None:
-    """Replace a token by a new one with the same name and role. It is printed once and stored nowhere.
+    """Replace a token with a new one with the same name and role. It is printed once and stored nowhere.
 
     With --grace, the earlier token stays valid for that time, so that its holder can change to the new one.
 

@@ -61,7 +61,9 @@ _Open = Annotated[
     list[str] | None,
     typer.Option("--open", metavar="SERVICES", help="Services of the host to keep open: tcp/22 (repeatable)"),
 ]
-_Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
+_Ports = Annotated[
+    str, typer.Option(help="The host's local port range, where ROS nodes listen; the kit closes it")
+]
 _Within = Annotated[
     str | None,
     typer.Option(
@@ -77,7 +79,8 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     name: _Name,
     appliance: _Endpoint = None,
     address: Annotated[
-        str | None, typer.Option(help="Its virtual address (default: the next free one)")
+        str | None,
+        typer.Option(help="Virtual address of the host in its tunnel (default: the next free one)"),
     ] = None,
     token: Annotated[
         bool,
@@ -92,7 +95,8 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     opened: _Open = None,
     ports: _Ports = "32768-60999",
 ) -> None:
-    """Enrol a host: write its kit (one archive). With --token, print a token with which the host enrols itself.
+    """Enrol a host: write its kit, one archive with the files for its tunnel. With --token, print a token with which
+    the host enrols itself.
 
     Example: rosrv host add ocu-1 --token
     """
@@ -120,7 +124,8 @@ def kit(  # noqa: PLR0917  as above
     opened: _Open = None,
     ports: _Ports = "32768-60999",
 ) -> None:
-    """Write a new kit for an enrolled host. Its old certificate is revoked and its tunnel closed.
+    """Write a new kit for an enrolled host. Its old certificate is revoked and its tunnel closed; with --token, only
+    when the host enrols.
 
     Example: rosrv host kit ocu-1
     """
@@ -138,7 +143,9 @@ def list_hosts(
     running: Appliance,
     group: Annotated[str | None, typer.Option(help="Only hosts of this group of hosts.yaml")] = None,
 ) -> None:
-    """List enrolled, awaited and declared hosts with their tunnels, and machines that connect in clear text.
+    """List the hosts with their tunnels, and machines that connect in clear text.
+
+    `awaited` is a host whose one-time token was not used yet; `not enrolled` is one that only hosts.yaml declares.
 
     Example: rosrv host list
     """
