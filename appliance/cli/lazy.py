@@ -165,9 +165,14 @@ def loaded(verb: Verb, name: str) -> "Command":
     for option in _without_type_of_flags(command.get_params(context)):
         if isinstance(option, TyperOption) and option.metavar is None:
             option.metavar = _metavar(option, option.display_type(context) or "")
-        elif isinstance(option, TyperArgument) and option.metavar is None and option.name:
-            option.metavar = option.name.upper()
+        elif isinstance(option, TyperArgument):
+            option.metavar = option.metavar or (option.name or "").upper()
+            option.display_type_rich = _no_type  # type: ignore[method-assign]  # typer has no option for it
     return command
+
+
+def _no_type(ctx: "Context") -> None:
+    """Leave out the type of an argument, such as `<list[str]>`: the help says what it is."""
 
 
 def _metavar(option: TyperOption, kind: str) -> str | None:
