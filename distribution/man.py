@@ -48,7 +48,7 @@ def _page(title: str, command: Any, context: Any, date: str) -> Iterator[str]:
     if rest:
         yield ".SH DESCRIPTION\n"
         for paragraph in rest.split("\n\n"):
-            yield f".PP\n{_text(_one_line(paragraph))}\n"
+            yield f".PP\n{_paragraph(paragraph)}\n"
     if hasattr(command, "list_commands"):
         yield ".SH COMMANDS\n"
         for verb in command.list_commands(context):
@@ -65,6 +65,11 @@ def _page(title: str, command: Any, context: Any, date: str) -> Iterator[str]:
 def _records(command: Any, context: Any) -> Iterator[tuple[str, str] | None]:
     for parameter in command.get_params(context):
         yield parameter.get_help_record(context)
+
+
+def _paragraph(text: str) -> str:
+    """Return a paragraph for troff; one of commands (`\\b`) keeps its lines."""
+    return f".nf\n{_text(text[2:])}\n.fi" if text.startswith("\b\n") else _text(_one_line(text))
 
 
 def _one_line(text: str) -> str:
