@@ -64,3 +64,7 @@ def open_log(path: Path, **settings: Any) -> AuditLog:
 class InlineDatabase(Database):
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
         super().__init__(path, schema, failed=failed, drive=Inline)
+
+
+class KilledError(BaseException):
+    """Control was killed."""

@@ -188,7 +188,7 @@ class _Writers:
     def _bytes(self, field: Field) -> _Write:
         write_bytes = self._counted(field, bytes, 1)
 
-        def write(value: Any, out: bytearray, now: Now) -> None:
+        def write(value: object, out: bytearray, now: Now) -> None:
             write_bytes(_of_base64(value) if isinstance(value, str) else value, out, now)
 
         return write

@@ -11,13 +11,9 @@ from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.store.changes import Change
 from appliance.store.state_file import StateStore
-from tests.support.engines import InlineDatabase
+from tests.support.engines import InlineDatabase, KilledError
 
 DAY = 86_400.0
-
-
-class KilledError(BaseException):
-    """Control dies."""
 
 
 def opened(home: Path) -> tuple[StateStore, HostTable]:

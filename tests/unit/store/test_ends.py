@@ -20,7 +20,7 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import SCHEMA, StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.ends import Ending
-from tests.support.engines import InlineDatabase
+from tests.support.engines import InlineDatabase, KilledError
 from tests.support.sources import ROOT
 from tests.support.virtual_clock import VirtualClock
 
@@ -275,10 +275,6 @@ async def test_on_a_full_disk_each_thing_ends(site: Site, monkeypatch: pytest.Mo
     site.run(60.0)
     monkeypatch.undo()
     await site.end_after(lambda _kind: 2940.0)
-
-
-class KilledError(BaseException):
-    """Control dies."""
 
 
 async def _after_a_kill(owner: Owner, home: Path, writes: int) -> bool | None:

@@ -29,14 +29,11 @@ from roswire.errors import EncodingError
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts, Told
+from tests.support.engines import KilledError
 
 LINK = "10.111.0.1"
 _NODE_SECONDS = 2.0
 _KINDS = {"Publisher": "publication", "Subscriber": "subscription", "Service": "service"}
-
-
-class KilledError(BaseException):
-    """Control was killed."""
 
 
 @dataclass

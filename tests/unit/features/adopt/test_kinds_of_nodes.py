@@ -14,8 +14,9 @@ import pytest
 from appliance.features.adopt.adopt_record import Phase
 from tests.support import autojump
 from tests.support.control_parts import ControlParts
+from tests.support.engines import KilledError
 from tests.support.examples import covering
-from tests.unit.features.adopt.robot_world import LINK, KilledError, RobotNode, RobotWorld
+from tests.unit.features.adopt.robot_world import LINK, RobotNode, RobotWorld
 from tests.unit.features.adopt.test_takeover import GIVE, TAKE
 
 Act = Callable[[RobotWorld], Awaitable[None]]

@@ -13,7 +13,8 @@ from roswire.parameter_tree import same_value
 from roswire.xmlrpc import Value
 from tests.support import autojump
 from tests.support.control_parts import ControlParts
-from tests.unit.features.adopt.robot_world import LINK, KilledError, RobotWorld
+from tests.support.engines import KilledError
+from tests.unit.features.adopt.robot_world import LINK, RobotWorld
 
 MANY = 10_000
 TAKE = ("read", "parameters", "register", "forward", "connect", "tell", "cut", "read again", "taken")
