@@ -278,6 +278,37 @@ def test_a_few_rays_and_things_beside_the_zone_do_not_count() -> None:
     assert moves(guard, FAST, 910)
 
 
+@pytest.mark.parametrize("reading", [3.2, math.nan, 0.0])
+@pytest.mark.parametrize("rays", [1, 2, 3, 5])
+def test_a_zone_is_not_free_if_all_rays_that_cross_it_end_in_it_or_see_nothing(
+    rays: int, reading: float
+) -> None:
+    """Also if fewer than `points` cross it: a thing would never count."""
+    edge = 3 * math.tan(0.1 * rays / 2 - 0.001)
+    guard = Guarded("zone", polygon=f"3,{-edge} 3.3,{-edge} 3.3,{edge} 3,{edge}", points=20, clear=0)
+    start, count = -0.05 * (rays - 1) - 0.1 * 3, rays + 6
+    free = [math.inf] * count
+    for ranges, passes in ((free, True), ([*free[:3], *[reading] * rays, *free[-3:]], False), (free, True)):
+        guard.tell("by", scan(ranges, start=start, step=0.1), 100, "/b")
+        moves(guard, STILL, 100)
+        assert moves(guard, FAST, 100) == passes
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("x", [2, 4, 8])
+def test_a_zone_that_no_ray_covers_is_not_free(x: int, side: int) -> None:
+    """A narrow one too, between two directions, between two rays, and with one corner beside the last ray."""
+    corners = f"{x},{0.01 * x * side} {x + 0.1},{0.01 * x * side} {x + 0.1},{0.045 * x * side} {x},{0.045 * x * side}"
+    guard = Guarded("zone", polygon=corners, clear=0)
+    for start, step, rays, passes in (
+        (0.5, 0.01, 100, False), (-0.2, 0.01, 41, True), (-0.15, 0.15, 3, False),
+        (-0.2 if side > 0 else -0.02, 0.01, 23, False),
+    ):  # fmt: skip
+        guard.tell("by", scan([math.inf] * rays, start=start, step=step), 100, "/b")
+        moves(guard, STILL, 100)
+        assert moves(guard, FAST, 100) == passes, (start, step, rays)
+
+
 def test_a_silent_scanner_stops() -> None:
     guard = clear_zone()
     guard.advance(1000)
