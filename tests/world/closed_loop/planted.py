@@ -164,7 +164,7 @@ FAULTS: Mapping[str, Fault] = {
     "separation judges no tick": Fault("L3", "separation", replaced(r"if \(lastV > 0 &&", "if (false &&")),
     "fence forgets how long the base needs": Fault("L3", "fence", replaced(r"\bahead\b(?! =)", "0.0")),
     "fence forgets its margin": Fault(
-        "L3", "fence", replaced(r"part \* swing \+ stray", "-1 + 0 * (swing + stray)")
+        "L3", "fence", replaced(r"fmax\(margin \+ part \* swing \+ stray, between\)", "-1")
     ),
     "deadman never ends a motion": Fault(
         "L3", "deadman", replaced(r"if \(stopped && pause == 0\)", "if (false)")
@@ -249,7 +249,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L2", "standstill", "hears no silence", r"sinceMeasure <= silent &&", ""),
     ("L2", "zone", "hears no silence", r"!\(sinceScan <= silent\) \|\|", ""),
     ("L2", "zone", "takes NaN for free", r"blankIsFree && !\(r < 0\)", "!(r < 0)"),
-    ("L2", "zone", "does not ask whether rays cover it", r"\|\| !covers\([^)]*\)[^)]*\)", ""),
+    ("L2", "zone", "does not ask whether rays cover it", r"valid && covers\([^)]*\)\)", "valid"),
     ("L2", "agree", "hears no silence", r"since <= silent && sinceOther <= silent", "true"),
     ("L2", "arm", "hears no silence", r"battery <= silent &&", ""),
     ("L2", "sensor", "hears no silence", r"since <= silent &&", ""),

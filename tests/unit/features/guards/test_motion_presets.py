@@ -1,5 +1,6 @@
 import math
 import struct
+from itertools import product
 from typing import Any
 
 import pytest
@@ -276,6 +277,40 @@ def test_a_base_stays_inside_a_fence() -> None:
         begin = random.uniform(-1.7, 1.7), random.uniform(-1.7, 1.7), random.uniform(-4, 4)
         depths = simulated(guard, random, begin, random.choice((20, 50, 200, 500, 1000)))
         assert min(depths) >= 0 and not any(map(math.isnan, depths))
+
+
+@pytest.mark.parametrize("thick", [0.01, 0.1])
+@pytest.mark.parametrize(
+    ("speed", "margin", "ahead"), [(2.0, 0.05, 1), (3.0, 0.1, 1), (5.0, 0.2, 1), (5.0, 0.0, 2)]
+)
+def test_a_fast_base_does_not_drive_across_a_thin_part_outside(
+    speed: float, margin: float, ahead: float, thick: float
+) -> None:
+    """A line that nobody may cross is a thin notch of the polygon; the places that the guard looks at are beside it."""
+    polygon = f"0,0 20,0 20,8 {20 + thick},8 {20 + thick},0 40,0 40,10 0,10"
+    for begin in (5.0, 11.3, 19.0):
+        guard, x, v = Guarded("fence", margin=margin, ahead=ahead, polygon=polygon), begin, 0.0
+        for at in range(0, 8000, 10):
+            if at % 100 == 0:
+                guard.tell("by", odometry(x, 5, 0), at)
+            if at % 50 == 0:
+                guard.drive(twist(speed), at)
+            guard.advance(at)
+            wanted = legs_of(guard.got[-1][1])[0]
+            v = max(wanted, v - 0.01 * speed / (0.9 * ahead))
+            x += v / 100
+        assert begin < x < 20
+
+
+@pytest.mark.parametrize("inward", [0.3, 1.0, 2.0])
+def test_a_motion_from_the_margin_leads_across_no_part_outside(inward: float) -> None:
+    polygon = "0,0 20,0 20,8 20.02,8 20.02,0 40,0 40,10 0,10"
+    for here, before, turned in product((0.05, 0.1), (0.1, 0.2, 0.3, 0.5), (0.5, 0.8, 1.1)):
+        guard = Guarded("fence", polygon=polygon, inward=inward)
+        guard.tell("by", odometry(20 - before, here, turned), 0)
+        guard.tell("by", odometry(20 - before, here, turned), 100)
+        v = guard.drive(twist(inward), 110)[0]
+        assert v * (0.15 + 0.5) * math.cos(turned) < before, (here, before, turned)
 
 
 def test_a_base_outside_a_fence_only_comes_back() -> None:
