@@ -211,6 +211,10 @@ def text_of(guard: Guard) -> str:
     topics = preset.given_topics | dict(guard.topics)
     for name, topic in topics.items():
         _require_topic(preset, name, topic)
+        if same := [other for other in topics if topics[other] == topic and other != name]:
+            raise GuardError(
+                f"{preset.name} needs two topics for {name} and {same[0]}, and {topic} is given for both"
+            )
     types = {name: types[0] for name, types in preset.topics.items()}
     for name, kind in guard.types.items():
         if name in types:

@@ -20,10 +20,12 @@ _WORDS_OF_A_STOP = {
 }  # fmt: skip
 _KNOWN_STOPS = re.compile(r"/(?:software_runstop_enabled|enable_software_runstop|is_runstopped)$")
 """True stops, by the drivers of Fetch and Stretch."""
-_RESET = re.compile(r"reset|clear", re.IGNORECASE)
+_RESET = re.compile(r"(?:(?<![A-Za-z])[rc]|(?<![A-Z])[RC])(?:eset|lear)(?![a-z])|RESET|CLEAR")
+"""A word of the name, not a part of another one, such as `clearpath` or `preset`."""
 _FILTERED = re.compile(r"filtered|fused|ekf|local_position", re.IGNORECASE)
 _WHEELS = re.compile(r"wheel|encoder|(?:^|[/_])(?:enc|raw)(?=[/_]|$)", re.IGNORECASE)
 _SIDE = re.compile(r"(?:^|[/_])(?:f|b|r|l|front|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
+_NOT_AHEAD = re.compile(r"(?:^|[/_])(?:b|r|l|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
 _RAW = re.compile(r"(?:^|[/_])raw(?=[/_]|$)", re.IGNORECASE)
 _AMCL = re.compile(r"amcl", re.IGNORECASE)
 _NO_POSITION = re.compile(r"initialpose|goal|target|setpoint|ground_truth", re.IGNORECASE)
@@ -222,7 +224,11 @@ class _Writer:
 
     def _add_stops(self, command: TopicFacts) -> None:
         switches = self.graph.sources(command, {_BOOL})
-        resets = [topic for topic in switches if _STOP.search(topic.name) and _RESET.search(topic.name)]
+        resets = [
+            topic
+            for topic in switches
+            if _STOP.search(topic.name) and _RESET.search(topic.name) and not _stops(topic.name)
+        ]
         stops = [topic for topic in switches if _stops(topic.name)]
         stops = [
             topic for topic in stops if not any(self.graph.derived_from(other, [topic]) for other in stops)
@@ -299,6 +305,12 @@ class _Writer:
         raw = sides if len(sides) > 1 else [topic for topic in scans if topic not in merged] or scans
         for preset, chosen in (("sensor", raw), ("separation", merged or raw)):
             several = len(chosen) > 1
+            if preset == "separation" and chosen and _WORLD_FRAME.search(base.name):
+                self._say(
+                    f"separation of {base.name} is left out: it takes velocities in the frame of the base, and"
+                    " these are in that of the map"
+                )
+                continue
             for scan in chosen:
                 if 0 < scan.rate < _SLOWEST_HZ:
                     self._leave(preset, base, _slow(scan), [scan])
@@ -312,7 +324,7 @@ class _Writer:
                         topics={"by": scan.name},
                         others=others,
                     )
-            if several and preset == "separation":
+            if preset == "separation" and (several or any(_NOT_AHEAD.search(scan.name) for scan in chosen)):
                 self._say(
                     "each separation needs the direction and the view of its scanner: set mounted and sector"
                     f" ({', '.join(scan.name for scan in chosen)})"

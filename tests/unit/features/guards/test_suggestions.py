@@ -138,6 +138,57 @@ def test_a_stop_is_proposed_only_if_its_name_says_what_true_means(topic: str, st
     assert found == ({topic} if stops else set())
 
 
+RESETS = {
+    "/emergency_stop_reset": True, "/estop/reset": True, "/clear_estop": True, "/safety/resetEstop": True,
+    "/estopReset": True, "/clearpath/e_stop": False, "/preset/emergency_stop": False, "/nuclear/estop_button": False,
+    "/clearpath/estop_released": False, "/reset/estop": False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("topic", "resets"), RESETS.items())
+def test_a_reset_is_a_word_of_its_name_and_never_the_stop_itself(topic: str, resets: bool) -> None:
+    """A stop that is its own reset could never be reset."""
+    graph = [
+        TopicFacts("/cmd_vel", "geometry_msgs/Twist", ("/teleop",), ("/base",)),
+        TopicFacts("/e_stop", "std_msgs/Bool", ("/plc",), (), 10),
+        TopicFacts(topic, "std_msgs/Bool", ("/plc",), (), 10),
+    ]
+    found = [one.topics for one in advice(graph).proposals if one.preset == "estop"]
+    assert found and all(("reset" in one) == resets and one["stop"] != one.get("reset") for one in found)
+
+
+def scanned(command: str, kind: str, scan: str) -> Advice:
+    return advice([
+        TopicFacts(command, kind, ("/teleop",), ("/base",), 10),
+        TopicFacts(scan, "sensor_msgs/LaserScan", ("/lidar",), ("/base",), 10),
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("scan", "said"),
+    [
+        ("/scan", False),
+        ("/front/scan", False),
+        ("/scan_rear", True),
+        ("/lidar_left/scan", True),
+        ("/b_scan", True),
+    ],
+)
+def test_a_scanner_that_may_not_look_ahead_needs_its_direction(scan: str, said: bool) -> None:
+    found = scanned("/cmd_vel", "geometry_msgs/Twist", scan)
+    assert "separation" in {one.preset for one in found.proposals}
+    assert any("set mounted and sector" in one for one in found.left_out) == said
+
+
+@pytest.mark.parametrize("leaf", ["cmd_vel", "cmd_vel_unstamped"])
+def test_no_separation_is_proposed_for_velocities_in_the_frame_of_the_map(leaf: str) -> None:
+    kind = "geometry_msgs/TwistStamped" if leaf == "cmd_vel" else "geometry_msgs/Twist"
+    found = scanned(f"/mavros/setpoint_velocity/{leaf}", kind, "/scan")
+    presets = {one.preset for one in found.proposals}
+    assert "sensor" in presets and "separation" not in presets
+    assert any("separation of /mavros" in one for one in found.left_out)
+
+
 def test_a_flood_of_topics_is_cut_and_said() -> None:
     graph = [
         TopicFacts(f"/r{number}/cmd_vel", "geometry_msgs/Twist", ("/operator",), (f"/r{number}",), 10)
@@ -187,6 +238,12 @@ PLANS = [
         {"command": "/cmd_vel"},
         {"command": "geometry_msgs/TwistStamped"},
         "has the type geometry_msgs/Twist on",
+    ),
+    (
+        "agree",
+        {"command": "/cmd_vel", "by": "/odom", "other": "/odom"},
+        {},
+        "agree needs two topics for by and other, and /odom is given for both",
     ),
     (
         "agree",
