@@ -182,6 +182,20 @@ def test_a_ninth_button_stops() -> None:
     assert not runs(guard, 5)
 
 
+def test_a_ninth_hand_resets_nothing_until_all_are_forgotten() -> None:
+    """A tool with a new name for each person uses up the places."""
+    guard, at = Guarded("estop", silent=0), 0
+    guard.tell("stop", button(False), at)
+    for place, node in enumerate((*NODES[2:11], *NODES[10:11]), 1):
+        if place == 10:
+            guard.monitors.give({"guard": {"forget": 1, "silent": 0}})
+        guard.tell("stop", button(True), at + 500)
+        reset(guard, at + 600, node)
+        guard.drive(twist(), at + 800)
+        assert runs(guard, at + 810) == (place != 9)
+        at += 1000
+
+
 @pytest.mark.parametrize(
     ("acts", "freed"),
     [
