@@ -589,3 +589,17 @@ def test_a_base_meets_nothing_in_its_way() -> None:
             )
             met += space < 0.25 and math.hypot(base.vx, base.vy) > 0.02
     assert met == 0
+
+
+@pytest.mark.parametrize("legs", [(0.0, 0.0, -1.5), (0.01, 0.0, -1.5), (1e-300, 0.0, 1.5), (0.5, 0.2, 1.0)])
+def test_a_steep_motion_needs_everything_around_the_base_free(legs: tuple[float, ...]) -> None:
+    """Also with a small velocity ahead, where nothing is; a flat motion needs only its way."""
+    angles = [-math.pi + math.pi / 90 * ray for ray in range(181)]
+    for beside, passes in ((9.0, True), (0.6, False)):
+        guard = Guarded("separation")
+        ranges = [beside if abs(abs(angle) - math.pi / 2) < 0.3 else 9.0 for angle in angles]
+        scan = {"angle_min": -math.pi, "angle_increment": math.pi / 90, "range_min": 0.1, "range_max": 10.0}
+        for at in (0, 50):
+            guard.tell("by", message("sensor_msgs/LaserScan", **scan, ranges=ranges), at)
+        assert (guard.drive(twist(*legs), 60)[:3] == legs) == passes
+        assert guard.drive(twist(0.5, 0.0, 0.05), 70)[:3] == (0.5, 0.0, 0.05)
