@@ -137,7 +137,10 @@ class DrivenWorld(World):
         ghost.report, ghost.escaped = Report(), False
         ghost.base.order(self.now + SLACK, STILL)
         try:
-            while ghost.now < self.now + 200 or math.hypot(*ghost.base.velocity) > 0:
+            while (
+                ghost.now < self.now + max(200, self.base.lag + 2 * SLACK)
+                or math.hypot(*ghost.base.velocity) > 0
+            ):
                 ghost.move(ghost.now + 10)
                 ghost.now += 10
                 ghost.harm()

@@ -44,6 +44,11 @@ def test_no_world_of_a_night_breaks_a_law(preset: str) -> None:
     judge(preset, seeds_of_night(AT_NIGHT.get(preset, 1000)))
 
 
+def test_a_base_that_executes_a_command_late_is_not_judged_by_the_time_without_its_guard() -> None:
+    """It got a motion while its guard was disabled, and still stands when the guard is enabled."""
+    judge("separation", range(700_081, 700_082))
+
+
 @pytest.mark.complete
 def test_every_preset_has_a_world_or_a_reason() -> None:
     where = "WORLDS of tests/world/closed_loop/worlds.py, or to NOT_MODELLED there with the reason"
