@@ -145,8 +145,10 @@ EVIDENCE: Mapping[str, Evidence] = {
     "joints": Evidence(
         ("ISO 10218-1, soft limits of axes",),
         "a point beyond a limit, before the trajectory begins",
-        assumed=("the controller follows the trajectory",),
-        fails=("a path within all limits that meets something",),
+        assumed=(
+            "the controller follows the trajectory from now on, and does not leave the straight way between two points",
+        ),
+        fails=("a path within all limits that meets something; a stamp in the past",),
         unit=(
             "test_a_trajectory_keeps_the_limits_of_its_joints",
             "test_a_trajectory_needs_the_present_position_of_each_joint",
