@@ -49,6 +49,8 @@ class DrivenWorld(World):
     """When the first measurement without any evidence arrived that no valid one has followed."""
     escaped = False
     """Whether the base drove without the guard, so that no stop prevents the harm, and has not stood since."""
+    each_counts = False
+    """Whether persons also count who stepped in from beside, so near that no moving base can stop."""
 
     def built(self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float) -> None:
         r = self.random
@@ -134,7 +136,7 @@ class DrivenWorld(World):
         ghost = copy.deepcopy(
             self, {id(one): one for one in (self.guard, self.random, self._queue, self._trace)}
         )
-        ghost.report, ghost.escaped = Report(), False
+        ghost.report, ghost.escaped, ghost.each_counts = Report(), False, True
         ghost.base.order(self.now + SLACK, STILL)
         try:
             while (
@@ -382,7 +384,9 @@ class SeparationWorld(DrivenWorld):
             self._follow(person)
         self.escaped = self.escaped and not self._caught()
         places = [(*geometry.nearest_on(wall, self.base.x, self.base.y), 0.0) for wall in self.walls]
-        places += [(one.x, one.y, PERSON_RADIUS) for one in self.persons if not one.stepped_in]
+        places += [
+            (one.x, one.y, PERSON_RADIUS) for one in self.persons if self.each_counts or not one.stepped_in
+        ]
         vx, vy = self.base.velocity
         for x, y, radius in places:
             dx, dy = x - self.base.x, y - self.base.y
