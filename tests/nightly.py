@@ -101,6 +101,7 @@ LINES = (
         Stage(  # files that each compute for a quarter of an hour or more
             "worlds",
             (
+                "rosmop/tests/prove/test_equality.py",
                 "tests/world",
                 "tests/integration/test_entrance_mutants.py",
                 "tests/unit/features/test_without_a_feature.py",
