@@ -114,7 +114,7 @@ class _Survey:
             self._uri, host, nodes, topics, found, tuple(self._cut("parameters", sorted(parameters))),
             await self._listeners({host, *hosts}), self._calls,
             round(clock.now() - self._began, 2), tuple(self._left_out),
-            tuple(sorted(filter(_is_here, hosts))) if _is_here(host) else (),
+            tuple(sorted(filter(is_here, hosts))) if is_here(host) else (),
         )  # fmt: skip
 
     def _cut(self, what: str, names: Sequence[str]) -> Sequence[str]:
@@ -228,7 +228,7 @@ class _Survey:
         return tuple(dict.fromkeys([master, *filter(None, found)]))
 
 
-def _is_here(address: str) -> bool:
+def is_here(address: str) -> bool:
     """Return whether an address belongs to this machine: packets to it would also have it as source."""
     with suppress(OSError, ValueError):
         if ipaddress.ip_address(address).is_loopback:

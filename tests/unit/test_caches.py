@@ -120,7 +120,6 @@ BY_HAND = {
     "appliance/features/doors/door_node.py::_locks": LOCKS,
     "appliance/features/doors/door_node.py::_offers": OPEN,
     "appliance/features/doors/door_node.py::_publications": OPEN,
-    "appliance/features/doors/door_node.py::_refused": "if len(self._refused) >= self._topics.whole",
     "appliance/features/doors/door_parameters.py::_clients": OPEN,
     "appliance/features/doors/door_parameters.py::_reads": "if self._reads[client] >= _MOST_READS",
     "appliance/features/doors/door_processes.py::_host_numbers": "if len(self._host_numbers) >= _MOST_HOSTS",

@@ -233,10 +233,10 @@ def machine_lines(state: CheckedRobot, host: Namespace) -> Iterator[CheckLine]:
             yield CheckLine("warn", "firewall", text)
     except NetworkError as error:
         yield CheckLine("stop", "firewall", str(error))
-    yield from _units(state)
+    yield from unit_lines(state)
 
 
-def _units(state: CheckedRobot) -> Iterator[CheckLine]:
+def unit_lines(state: CheckedRobot) -> Iterator[CheckLine]:
     master = state.master
     if master is None or not master.unit:
         return

@@ -66,8 +66,8 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
     record, registry = _record(state), Registry()
     restore(registry, store)
     trail = cast(AuditTrail, _Log())
-    port = _port(state)
-    machine = _DeadMachine(state, record, port)
+    port = port_of_master(state)
+    machine = DeadMachine(state, record, port)
     graph = AdoptedGraph(
         registry, RosGraph(registry, Grants(lambda _row: None, set), trail), cast(Subscribers, _NoSubscribers()), trail,
         _no_order, flush=lambda: None,
@@ -89,7 +89,7 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
     return report
 
 
-def _port(state: Path) -> int:
+def port_of_master(state: Path) -> int:
     """Return the port of RVMaster, and so of the robot's own master."""
     settings = running_settings(state)
     return MASTER_PORT if settings is None else settings.listen_address[1]
@@ -119,7 +119,7 @@ def _opened(state: Path) -> Iterator[StateStore]:
         store.close()
 
 
-class _DeadMachine:
+class DeadMachine:
     """Does the supervisor's work in its absence: see `machine_side.py`."""
 
     def __init__(self, state: Path, record: AdoptRecord, port: int) -> None:

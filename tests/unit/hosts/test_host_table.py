@@ -33,7 +33,7 @@ def die_after(store: StateStore, writes: int) -> None:
             raise KilledError
         keep(changes)
 
-    store.database.keep = keep_some  # type: ignore[method-assign]
+    store.database.keep = keep_some  # type: ignore[method-assign]  # only some writes reach the disk
 
 
 @pytest.mark.parametrize(

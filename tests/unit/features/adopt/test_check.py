@@ -83,7 +83,7 @@ def test_a_roscore_that_no_drop_in_can_help_must_not_restart(
 ) -> None:
     monkeypatch.setattr(adopt_check, "programs_of_unit", {unit: programs}.__getitem__)
     found = list(
-        adopt_check._units(replace(robot(), master=RobotMaster(1, "/usr/bin/rosmaster", "robot", unit)))
+        adopt_check.unit_lines(replace(robot(), master=RobotMaster(1, "/usr/bin/rosmaster", "robot", unit)))
     )
     assert [(line.level, text in line.text) for line in found] == [(level, True)]
 
@@ -136,7 +136,7 @@ def test_a_release_without_the_appliance_looks_for_the_master_on_its_port(
     (tmp_path / "run" / "config.json").write_text(json.dumps({"listen": listen}))
     asked: list[int] = []
     monkeypatch.setattr(dead_release, "master_of", lambda _host, port: asked.append(port))
-    machine = dead_release._DeadMachine(tmp_path, AdoptRecord(), dead_release._port(tmp_path))
+    machine = dead_release.DeadMachine(tmp_path, AdoptRecord(), dead_release.port_of_master(tmp_path))
     asyncio.run(machine("look"))
     assert asked == [int(listen[-5:])]
 

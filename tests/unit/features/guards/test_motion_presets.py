@@ -286,7 +286,7 @@ def test_a_base_stays_inside_a_fence() -> None:
 def test_a_fast_base_does_not_drive_across_a_thin_part_outside(
     speed: float, margin: float, ahead: float, thick: float
 ) -> None:
-    """A line that nobody may cross is a thin notch of the polygon; the places that the guard looks at are beside it."""
+    """A line that no base may cross is a thin notch of the polygon, beside the places that the guard looks at."""
     polygon = f"0,0 20,0 20,8 {20 + thick},8 {20 + thick},0 40,0 40,10 0,10"
     for begin in (5.0, 11.3, 19.0):
         guard, x, v = Guarded("fence", margin=margin, ahead=ahead, polygon=polygon), begin, 0.0

@@ -141,11 +141,11 @@ def test_the_addresses_of_the_machine_of_the_master_are_known_only_on_that_machi
     run: Any, monkeypatch: pytest.MonkeyPatch, here: bool, own: tuple[str, ...]
 ) -> None:
     mine = {"10.0.0.1", "127.0.0.1"} if here else {"10.0.0.1"}  # by chance, a node has an own address
-    monkeypatch.setattr(reader, "_is_here", mine.__contains__)
+    monkeypatch.setattr(reader, "is_here", mine.__contains__)
     assert run(lookupNode="http://10.0.0.1:4000/").own == own
 
 
 @pytest.mark.real
 @pytest.mark.parametrize(("address", "here"), [("127.0.1.1", True), ("::1", True), ("192.0.2.99", False)])
 def test_an_address_of_another_machine_is_not_an_own_one(address: str, here: bool) -> None:
-    assert reader._is_here(address) is here
+    assert reader.is_here(address) is here

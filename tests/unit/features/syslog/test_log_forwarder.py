@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
@@ -361,10 +360,12 @@ def test_a_full_disk_delays_no_record(make_log: MakeLog, kept: Kept, monkeypatch
     record(log, 600)
     one = forwarder(log.path, kept)
     save = "appliance.features.syslog.log_forwarder.save_position"
+
+    def no_space(*_arguments: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "position.json")
+
     with monkeypatch.context() as full:
-        full.setattr(
-            save, Mock(side_effect=OSError(errno.ENOSPC, "No space left on device", "position.json"))
-        )
+        full.setattr(save, no_space)
         run(one)
         assert kept.sequences() == everything(log.path)
         assert "position is not kept" in one.progress.trouble
