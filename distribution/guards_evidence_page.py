@@ -146,11 +146,16 @@ EVIDENCE: Mapping[str, Evidence] = {
         ("ISO 10218-1, soft limits of axes",),
         "a point beyond a limit, before the trajectory begins",
         assumed=(
-            "the controller follows the trajectory from now on, and does not leave the straight way between two points",
+            "the controller follows the trajectory from now on: straight to the first point, then along the splines"
+            " of joint_trajectory_controller",
         ),
-        fails=("a path within all limits that meets something; a stamp in the past",),
+        fails=(
+            "a path within all limits that meets something; a curve to the first point; a stamp in the past",
+        ),
         unit=(
             "test_a_trajectory_keeps_the_limits_of_its_joints",
+            "test_the_curve_of_a_controller_keeps_the_limits_of_joints",
+            "test_samples_of_a_motion_that_ends_at_a_limit_pass",
             "test_a_trajectory_needs_the_present_position_of_each_joint",
         ),
     ),

@@ -1,9 +1,13 @@
-"""Worlds of `joints`: an arm that executes trajectories, and nodes that report the positions of its joints."""
+"""Worlds of `joints`: an arm that executes trajectories, and nodes that report the positions of its joints.
+
+Between two points it drives the curve of joint_trajectory_controller, and to the first one straight.
+"""
 
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import ClassVar
 
 from tests.world.closed_loop.messages import header
@@ -12,6 +16,8 @@ from tests.world.closed_loop.world import COMMAND, NEVER, World
 JOINTS: Sequence[str] = ("shoulder", "elbow", "wrist")
 TRAJECTORY = "trajectory_msgs/JointTrajectory"
 _NEAR = 1e-6
+OVERSHOOT = 1.1
+"""How much of `vMax` a curve between two points may have."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +27,46 @@ class Point:
     positions: tuple[float, ...]
     velocities: tuple[float, ...] = ()
     accelerations: tuple[float, ...] = ()
+
+
+def curve(one: Point, other: Point, joint: int) -> tuple[float, ...]:
+    """Return the coefficients of the way between two points, the constant first, as joint_trajectory_controller has it.
+
+    It is a quintic with velocities and accelerations in both points, a cubic with velocities, and otherwise straight.
+    """
+    p, q, t = one.positions[joint], other.positions[joint], other.at - one.at
+    if not (one.velocities and other.velocities):
+        return p, (q - p) / t
+    v, w = one.velocities[joint] * t, other.velocities[joint] * t
+    if not (one.accelerations and other.accelerations):
+        return p, v / t, (3 * (q - p) - 2 * v - w) / t**2, (2 * (p - q) + v + w) / t**3
+    a, b = one.accelerations[joint] * t**2, other.accelerations[joint] * t**2
+    return (
+        p,
+        v / t,
+        a / (2 * t**2),
+        (20 * (q - p) - 12 * v - 8 * w - 3 * a + b) / (2 * t**3),
+        (30 * (p - q) + 16 * v + 14 * w + 3 * a - 2 * b) / (2 * t**4),
+        (12 * (q - p) - 6 * v - 6 * w - a + b) / (2 * t**5),
+    )
+
+
+def on(coefficients: Sequence[float], after: float) -> float:
+    """Return the value of a polynomial."""
+    return sum(one * after**power for power, one in enumerate(coefficients))
+
+
+def extremes(points: Sequence[Point], samples: int = 60) -> tuple[float, float]:
+    """Return the greatest distance from zero and the greatest velocity of a joint between points, of samples."""
+    far = fast = 0.0
+    for one, other in pairwise(points):
+        for joint in range(len(one.positions)):
+            way = curve(one, other, joint)
+            velocity = [power * part for power, part in enumerate(way)][1:]
+            times = [(other.at - one.at) * sample / samples for sample in range(samples + 1)]
+            far = max(far, *(abs(on(way, time)) for time in times))
+            fast = max(fast, *(abs(on(velocity, time)) for time in times))
+    return far, fast
 
 
 def _texts(names: Sequence[str]) -> bytes:
@@ -64,6 +110,8 @@ class JointsWorld(World):
         self.fastest, self.most = round(r.uniform(0.5, 3), 2), round(r.uniform(1, 3), 2)
         self.jump, self.silent = round(r.uniform(0.02, 0.2), 2), round(r.uniform(0.1, 0.6), 2)
         self.growth = 20.0
+        self.curved = r.choice(("", "", "velocities", "velocities and accelerations"))
+        """The values of points beside their positions."""
         self.place = [0.0] * len(JOINTS)
         self.way: tuple[int, list[float], tuple[Point, ...]] = (0, [0.0] * len(JOINTS), ())
         """When the trajectory in force began, the position then, and its points."""
@@ -164,6 +212,23 @@ class JointsWorld(World):
             ]
             at += seconds
             points.append(Point(at, tuple(place)))
+        return self.bent(points, lambda far, fast: far <= 0.99 * self.most and fast <= 0.99 * self.fastest)
+
+    def bent(self, points: list[Point], fits: Callable[[float, float], bool]) -> list[Point]:
+        """Return the points with velocities such that the curves between them fit, or else as they are."""
+        r = self.random
+        for _try in range(20 if self.curved else 0):
+            v, a = (r.choice((0.1, 0.5, 1.0)) * most for most in (self.fastest, self.growth))
+            made = [
+                replace(
+                    one,
+                    velocities=tuple(r.uniform(-v, v) for _ in JOINTS),
+                    accelerations=tuple(r.uniform(-a, a) for _ in JOINTS) if "acc" in self.curved else (),
+                )
+                for one in points
+            ]
+            if fits(*extremes(made)):
+                return made
         return points
 
     def _command(self) -> None:
@@ -179,9 +244,8 @@ class JointsWorld(World):
             self.receive(*one)
         self._judge(bad, points, passes=passed == data)
         if passed is not None:
-            self.receive(
-                self.now, self.guard.topics[COMMAND], passed, points if passed == data and not bad else ()
-            )
+            driven = passed == data and (not bad or (bad == "curve" and not self.switched_off))
+            self.receive(self.now, self.guard.topics[COMMAND], passed, points if driven else ())
 
     def _judge(self, bad: str, points: Sequence[Point], *, passes: bool) -> None:
         honest = not bad and self.live and self.now > 1000
@@ -217,15 +281,18 @@ class JointsWorld(World):
         self.force = (now, self.force[1])
 
     def move(self, until: int) -> None:
-        began, before, points = self.way
-        passed, last = (until - began) / 1000, 0.0
+        began, start, points = self.way
+        passed, before = (until - began) / 1000, Point(0.0, tuple(start))
         for one in points:
             if passed <= one.at:
-                part = 1.0 if one.at == last else (passed - last) / (one.at - last)
-                self.place = [a + (b - a) * part for a, b in zip(before, one.positions, strict=True)]
+                if one.at > before.at:
+                    after = passed - before.at
+                    self.place = [on(curve(before, one, joint), after) for joint in range(len(JOINTS))]
+                else:
+                    self.place = [*one.positions]
                 return
-            before, last = [*one.positions], one.at
-        self.place = [*before]
+            before = one
+        self.place = [*before.positions]
 
     def watch(self) -> None:
         if not self.switched_off and any(not abs(one) <= self.most + _NEAR for one in self.place):
@@ -262,10 +329,31 @@ def _fast(world: JointsWorld, points: list[Point]) -> Damaged:
     ]
 
 
+def _bending(world: JointsWorld, points: list[Point]) -> Damaged:
+    """Return points within the limits, and curves between them that are not."""
+    last = points[-1]
+
+    def beyond(far: float, fast: float) -> bool:
+        return far >= 1.01 * world.most or fast >= 1.01 * OVERSHOOT * world.fastest
+
+    found = world.bent(points, beyond)
+    if beyond(*extremes(found)):
+        return JOINTS, found
+    out = tuple(math.copysign(world.fastest, one) for one in last.positions)
+    home = tuple(-one for one in out)
+    long = 8 * world.most / world.fastest + 0.1
+    return JOINTS, [
+        *points[:-1],
+        replace(last, velocities=out, accelerations=()),
+        Point(last.at + long, last.positions, home),
+    ]
+
+
 DAMAGE: Mapping[str, Callable[[JointsWorld, list[Point]], Damaged]] = {
     "far": _far,
     "jump": _jumping,
     "fast": _fast,
+    "curve": _bending,
     "velocity": lambda world, points: _first(points, velocities=(1.01 * world.fastest, 0.0, 0.0)),
     "acceleration": lambda world, points: _first(points, accelerations=(0.0, -1.01 * world.growth, 0.0)),
     "NaN": lambda _world, points: (

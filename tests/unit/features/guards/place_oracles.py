@@ -1,6 +1,7 @@
 """Naive models of the guards that know a place: a fence, the nearest thing, the joints of an arm."""
 
 import math
+import random
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from tests.unit.features.guards.tracing import (
     pause,
     straight,
 )
+from tests.world.closed_loop import arms
 from tests.world.closed_loop.messages import (
     ODOMETRY,
     Legs,
@@ -192,8 +194,8 @@ Point = tuple[float, list[float], list[float], list[float]]
 def _trajectory(names: list[str], points: list[Point]) -> bytes:
     made = [
         _POINT(
-            positions=np.array(positions), velocities=np.array(velocities), accelerations=np.array(accelerations),
-            effort=np.array([]),
+            positions=np.array(positions, float), velocities=np.array(velocities, float),
+            accelerations=np.array(accelerations, float), effort=np.array([]),
             time_from_start=_DURATION(sec=math.floor(at), nanosec=round((at - math.floor(at)) * 1e9)),
         )
         for at, positions, velocities, accelerations in points
@@ -201,12 +203,12 @@ def _trajectory(names: list[str], points: list[Point]) -> bytes:
     return message("trajectory_msgs/JointTrajectory", joint_names=names, points=made)
 
 
-def _keeps(points: list[Point], joints: int, v_max: float, a_max: float) -> bool:
+def _keeps(points: list[Point], joints: int, most: float, v_max: float, a_max: float) -> bool:
     """Whether each point has all joints within their limits, and the times increase from one that is not negative."""
     before: Point | None = None
     for point in points:
         at, positions, velocities, accelerations = point
-        if len(positions) != joints or not all(abs(one) <= 6.2832 for one in positions):
+        if len(positions) != joints or not all(abs(one) <= most for one in positions):
             return False
         if at < 0 or (before and at <= before[0]):
             return False
@@ -224,11 +226,41 @@ def _keeps(points: list[Point], joints: int, v_max: float, a_max: float) -> bool
     return True
 
 
+def _bent(points: list[Point], most: float, v_max: float) -> tuple[float, float]:
+    """Return how much of the limits of position and of velocity the ways between points have, of samples."""
+    far, fast = arms.extremes([arms.Point(one[0], *map(tuple, one[1:])) for one in points], 200)
+    return far / most, fast / (1.1 * v_max)
+
+
+def _with_speeds(chance: random.Random, points: list[Point], v_max: float, *, grow: bool) -> list[Point]:
+    """Return the points, at longer intervals, with velocities, and perhaps with accelerations."""
+    slower, part = chance.choice((1.0, 1.0, 4.0)), chance.choice((0.1, 1.0))
+    return [
+        (
+            at * slower,
+            places,
+            [chance.uniform(-1, 1) * part * v_max for _ in places] if chance.random() < 0.9 else [],
+            [chance.uniform(-10, 10) * part for _ in places] if grow and chance.random() < 0.9 else [],
+        )
+        for at, places, _speeds, _growths in points
+    ]
+
+
 def joint_limits(seed: int, events: int = 25) -> None:  # noqa: PLR0912  one branch for each fault
     """A trajectory passes as it is if it keeps every limit and begins where the joints are; otherwise it is a stop."""
     chance = seeded(seed)
     v_max, a_max, jump, silent = chance.choice((1.0, 3.2)), 50.0, chance.choice((0.05, 0.15)), 500
-    trace = Trace("joints", seed, "trajectory_msgs/JointTrajectory", vMax=v_max, aMax=a_max, jump=jump)
+    most = chance.choice((2.3, 6.2832))
+    trace = Trace(
+        "joints",
+        seed,
+        "trajectory_msgs/JointTrajectory",
+        vMax=v_max,
+        aMax=a_max,
+        jump=jump,
+        low=-most,
+        high=most,
+    )
     joints = ["elbow", "wrist"]
     known: list[float] = []
     heard = -(10**9)
@@ -272,15 +304,24 @@ def joint_limits(seed: int, events: int = 25) -> None:  # noqa: PLR0912  one bra
             )
         elif fault < 0.55:
             points = []
+        elif fault < 0.8:
+            points = _with_speeds(chance, points, v_max, grow=fault < 0.7)
         data = _trajectory(names, points)
         passed, sent = trace.guard.tell(trace.guard.topics["command"], data, trace.now, 1)
         trace.log.append(f"{trace.now} {names} {points}: {passed == data}")
         age = (trace.now - heard) / 1000
-        good = names == joints and trace.now - heard <= silent and _keeps(points, len(joints), v_max, a_max)
+        good = (
+            names == joints
+            and trace.now - heard <= silent
+            and _keeps(points, len(joints), most, v_max, a_max)
+        )
         if good and points:
+            bent = max(_bent(points, most, v_max))
+            if 0.99 < bent < 1.01:
+                continue  # too near to a limit for samples
             ways = [abs(one - other) for one, other in zip(points[0][1], known, strict=True)]
             reach = jump + v_max * (points[0][0] - age)
-            good = all(way <= reach + 1e-9 for way in ways)
+            good = bent <= 1 and all(way <= reach + 1e-9 for way in ways)
         if not points:
             assert passed == data, trace.said("an empty trajectory must pass")
             continue

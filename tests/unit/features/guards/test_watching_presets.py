@@ -1,3 +1,4 @@
+import itertools
 import math
 from typing import Any
 
@@ -418,19 +419,20 @@ def test_a_base_in_motion_is_stopped_when_its_battery_is_empty() -> None:
     assert stops(guard) == [700]
 
 
-def trajectory(names: list[str], *points: tuple[float, list[float]]) -> bytes:
+def trajectory(names: list[str], *points: tuple[Any, ...]) -> bytes:
+    """Return a trajectory of points, each with its time, positions, and perhaps velocities and accelerations."""
     point = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"]
     duration = STORE.types["builtin_interfaces/msg/Duration"]
     empty = np.array([], dtype=np.float64)
     made = [
         point(
             positions=np.array(positions, dtype=np.float64),
-            velocities=empty,
-            accelerations=empty,
+            velocities=np.array(more[0] if more else [], dtype=np.float64),
+            accelerations=np.array(more[1] if len(more) > 1 else [], dtype=np.float64),
             effort=empty,
             time_from_start=duration(sec=int(at), nanosec=round(at % 1 * 1e9)),
         )
-        for at, positions in points
+        for at, positions, *more in points
     ]
     return message("trajectory_msgs/JointTrajectory", joint_names=names, points=made)
 
@@ -472,6 +474,81 @@ def test_a_trajectory_keeps_the_limits_of_its_joints(points: Any, passes: bool) 
         outcome = guard.tell("command", trajectory(names, *points), 2)
         assert (outcome.result == "passed") == good
         assert good or not fields("trajectory_msgs/JointTrajectory", bytes(outcome.buffer)).points
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "passes"),
+    [
+        ((0, 1.45, 3.1), (10, 1.45, -3.1), False),
+        ((0, 1.45, 3.1), (10, 1.45), True),  # straight
+        ((0, 1.45), (10, 1.45, -3.1), True),
+        ((0, 1.399, 0.4), (1, 1.399, -0.4), True),  # a parabola, 0.1 high
+        ((0, 1.401, 0.4), (1, 1.401, -0.4), False),
+        ((0, 1.399, 0.4, 0.0), (1, 1.399, -0.4), True),  # a cubic if one of them has no accelerations
+        ((0, 1.401, 0.4), (1, 1.401, -0.4, 0.0), False),
+        ((0, -1.17, 0.0), (1, 1.17, 0.0), True),  # 1.5 times its mean velocity
+        ((0, -1.18, 0.0), (1, 1.18, 0.0), False),
+        ((0, -0.935, 0.0, 0.0), (1, 0.935, 0.0, 0.0), True),  # 1.875 times
+        ((0, -0.945, 0.0, 0.0), (1, 0.945, 0.0, 0.0), False),
+        ((0, 0.874, 0.0, 20.0), (1, 0.874, 0.0, 20.0), True),  # 20 / 32 high
+        ((0, 0.876, 0.0, 20.0), (1, 0.876, 0.0, 20.0), False),
+        ((0, 0.0, 0.0), (1, 1.5, 0.0), True),
+        ((0, 0.0, 0.0, 0.0), (1, 1.5, 0.0, 0.0), True),
+        ((0, 1.4, 0.0, 0.0), (1, 1.5, 0.0, 5.0), False),  # it comes from beyond the limit
+        ((0, 1.5, 0.0, 0.0), (1, 1.5, 0.0, 0.0), True),
+    ],
+)
+def test_the_curve_of_a_controller_keeps_the_limits_of_joints(
+    one: tuple[float, ...], other: tuple[float, ...], passes: bool
+) -> None:
+    guard = Guarded("joints", limits="still:0..0 elbow:-1.5..1.5")
+    names = ["still", "elbow"]
+    for now, side in enumerate((1, -1)):
+        guard.tell("state", state(0, side * one[1], names=names), now)
+        points = [(at, *([0.0, side * value] for value in values)) for at, *values in (one, other)]
+        assert (guard.tell("command", trajectory(names, *points), now).result == "passed") == passes
+
+
+Part = tuple[float, float, float]
+"""Seconds of a motion, the acceleration at first, and the jerk."""
+
+
+def _trapezoid(ramp: float) -> list[Part]:
+    return [(ramp, 1 / ramp, 0), (0.83, 0, 0), (ramp, -1 / ramp, 0)]
+
+
+def _s_curve(ramp: float) -> list[Part]:
+    half, jerk = ramp / 2, 4 / ramp**2
+    return [(half, 0, jerk), (half, 2 / ramp, -jerk), (0.83, 0, 0), (half, 0, -jerk), (half, -2 / ramp, jerk)]
+
+
+def _at(parts: list[Part], time: float) -> list[float]:
+    """Return the position, velocity and acceleration of a motion to 1 rad/s and back."""
+    p = v = a = 0.0
+    for length, first, jerk in parts:
+        if time <= 0:
+            break
+        t = min(time, length)
+        p += v * t + first * t**2 / 2 + jerk * t**3 / 6
+        v, a = v + first * t + jerk * t**2 / 2, first + jerk * t
+        time -= length
+    return [p, min(v, 1.0), a]
+
+
+def test_samples_of_a_motion_that_ends_at_a_limit_pass() -> None:
+    guard = Guarded("joints", limits="elbow:-1..1.5", vMax=1, aMax=1000)
+    cases = itertools.product((_trapezoid, _s_curve), (0.02, 0.05, 0.1, 0.2), (0.7, 0.9, 1.5, 4.3), (2, 3))
+    for now, (motion, period, ramp, values) in enumerate(cases):
+        parts = motion(ramp * period)
+        last = sum(length for length, _first, _jerk in parts)
+        end = _at(parts, last)[0]
+        points = []
+        for at in (*np.arange(0, last - 1e-6, period), last):
+            p, *more = _at(parts, at)
+            points.append((float(at), [1.5 - (end - p)], *([value] for value in more[: values - 1])))
+        guard.tell("state", state(1.5 - end, names=["elbow"]), now)
+        outcome = guard.tell("command", trajectory(["elbow"], *points), now)
+        assert outcome.result == "passed", (motion, period, ramp, values)
 
 
 def test_a_trajectory_needs_the_present_position_of_each_joint() -> None:
