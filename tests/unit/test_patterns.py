@@ -37,7 +37,6 @@ LIMITED = {
     "appliance.base.varying_numbers:_NUMBER": "a record's reason; time is linear, see the comment there",
     "appliance.configuration.inventory:_COMMON": "the licence files of the installation",
     "appliance.configuration.inventory:_LICENCE": "the licence files of the installation",
-    "appliance.features.doors.png_frames:_OTHERS": "49,152 bytes and the rest of a character, `_STEP_BYTES`",
     "appliance.ipsec.leftovers:_ENCAPSULATED": "the output of `ip xfrm`",
     "appliance.ipsec.leftovers:_POLICY": "the output of `ip xfrm`",
     "appliance.signing.log_proof:_CHECKPOINT": "a newline ends each number, so no shorter one matches; for Python 3.8",

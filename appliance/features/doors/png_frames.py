@@ -17,7 +17,7 @@ from appliance.features.doors.client_frames import ClientFrame, text_frame
 
 _STEP_BYTES = 3 << 14  # of the text, or of the image: about a millisecond
 _NOT_ASCII = bytes(range(128, 256))
-_OTHERS = re.compile(rb"[\x80-\xff]+")
+_OTHERS = re.compile(rb"[\x80-\xff]++")
 
 
 class PngFrame:
