@@ -17,7 +17,7 @@ KERNEL_FILE = Path(__file__).with_name("kernel.txt")
 OUTSIDE = "modules outside of it that the kernel may import"
 _PLAY = 1.05
 # Lines of Python, with blank lines, comments and docstrings; of the kernel, lines of code. Set again at each release.
-LIMITS = {"core": 58_780, "features": 41_090, "language": 41_160, "tests": 130_830, "kernel": 11_216}
+LIMITS = {"core": 68_660, "features": 50_620, "language": 45_680, "tests": 161_220, "kernel": 12_005}
 _NO_CODE = {
     tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,
 }  # fmt: skip

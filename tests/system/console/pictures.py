@@ -147,13 +147,13 @@ def _many_nodes(reader: Reader) -> None:
     expect(page.locator(".box.many")).to_have_count(10)
     expect(page.locator(".line.flowing").first).to_be_attached()
     expect(page.locator("g.attempt")).to_have_count(len(_UNKNOWN_NODES))
-    _take(page, "console-robot")
+    _take(page, "console-nodes")
 
 
 def _who_drives(reader: Reader) -> None:
     page = reader.go("robot")
     expect(page.get_by_role("region", name="Guards").get_by_text("deadman").first).to_be_visible()
-    _take(page, "console-drive")
+    _take(page, "console-robot")
 
 
 def _now(reader: Reader) -> Page:
