@@ -74,12 +74,15 @@ def process_key(pid: int) -> str:
 
 
 def program_of(pid: int) -> str:
-    """Return the beginning of a process's command line; empty if it has ended."""
+    """Return the program and first argument of a process, such as a script; empty if it has ended.
+
+    Later arguments may be secret.
+    """
     try:
         line = Path("/proc", str(pid), "cmdline").read_bytes()
     except OSError:
         return ""
-    return line[:_LONGEST_LINE].replace(b"\0", b" ").decode("utf-8", "replace").strip()
+    return b" ".join(line.split(b"\0")[:2])[:_LONGEST_LINE].decode("utf-8", "replace").strip()
 
 
 def user_of(pid: int) -> str:

@@ -252,7 +252,10 @@ class AdoptWork:
         connected = {process_key(one.pid) for one in found if one.master_address} - {*record.nodes, ""}
         if connected:
             record = msgspec.structs.replace(record, nodes=(*record.nodes, *sorted(connected))[-_MOST_NODES:])
-            save_record(self._state, record)
+            try:
+                save_record(self._state, record)
+            except NetworkError as error:  # a full disk prevents no cut
+                log.warning("the nodes of this cut are not remembered", reason=str(error))
         return record.nodes
 
     # --- giving back ---

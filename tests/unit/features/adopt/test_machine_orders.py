@@ -15,7 +15,7 @@ from appliance.features.adopt.machine_side import AdoptWork
 from appliance.features.adopt.operator_orders import ADOPT, RELEASE, ordered
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings, LinkAddresses
-from appliance.network.namespaces import Namespace
+from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.socket_owners import NodeSockets
 from tests.support.virtual_clock import VirtualClock
 
@@ -176,6 +176,16 @@ def test_a_node_whose_connection_to_the_master_was_cut_is_a_node_at_the_next_cut
         assert machine.order("cut", ports=[NODE])["kept"] == {}
     save_record(machine.state, msgspec.structs.replace(machine.record, boot="another"))
     assert machine.record.nodes == (), "another process may have the number"
+
+
+def test_a_full_disk_prevents_no_cut(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine.begin(Phase.TAKEN)
+
+    def full(*_arguments: object) -> None:
+        raise NetworkError("adopt.json cannot be written: No space left on device")
+
+    monkeypatch.setattr(machine_side, "save_record", full)
+    assert machine.order("cut", ports=[NODE]) == {"master": 1, "nodes": 1, "kept": {}}
 
 
 def test_the_cuts_of_a_taking_and_of_a_taken_graph_are_bounded(machine: Machine) -> None:
