@@ -9,7 +9,7 @@
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any
@@ -261,7 +261,8 @@ class WasmLane:
         monitors: Sequence[MonitorInstance],
         events: Sequence[str],
     ) -> None:
-        self._topic, feed = topic, module.feeds[topic]
+        self.topic, feed = topic, module.feeds[topic]
+        self.brief, self.exhausted = feed.brief, False
         self.events = tuple((name,) for name in events)
         self.monitors = tuple(monitor.name for monitor in monitors)
         self.drops = feed.drops
@@ -298,8 +299,8 @@ class WasmLane:
 
     def ready(self) -> bool:
         for monitor in self._monitors:
-            if monitor.enabled and (not monitor.seen or self._topic in monitor.starting or monitor.blocks):
-                if monitor.seen and self._topic not in (*monitor.starting, *monitor.held_channels):
+            if monitor.enabled and (not monitor.seen or self.topic in monitor.starting or monitor.blocks):
+                if monitor.seen and self.topic not in (*monitor.starting, *monitor.held_channels):
                     continue  # it only observes this topic, and goes on to
                 return False
         return not any(
@@ -419,6 +420,7 @@ class WasmLane:
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
         end = self._frames + 4 + len(message)
+        self.exhausted = False
         if end > self._frames + AREA:
             return None
         frame = self._memory[self._frames : end]
@@ -426,7 +428,8 @@ class WasmLane:
         frame[4:] = message
         prepared.changed.clear()
         walked = self.process_one(frame, 0, 0, [], time_ns, prepared, fuel)
-        if walked is not None and not walked.position:
+        self.exhausted = walked.paused
+        if not walked.position:
             return None
         outcome = Outcome(message, time_ns)
         happened = zip(self.events, self.happened(), strict=True)
@@ -437,11 +440,30 @@ class WasmLane:
                 bytes(frame[4:]),
                 self.writers(who),
             )
-        if walked is not None:
-            outcome.log = [line for _, line in walked.output]
-            counts = zip(self.verdicts, walked.told, strict=False)  # `told` may be empty
-            outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
+        outcome.log = [line for _, line in walked.output]
+        counts = zip(self.verdicts, walked.told, strict=False)  # `told` may be empty
+        outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
         return outcome
+
+    def judge(
+        self, message: Buffer, time_ns: int, judging: Collection[MonitorInstance], source: int, fuel: int
+    ) -> Outcome | None:
+        enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor in judging)
+        prepared = self.prepare(loud=True, told=[True] * len(self.events), source=source)
+        earlier = self.happened()  # of batches, which are counted later
+        area = self._memory[self._frames : self._frames + min(4 + len(message), AREA)]
+        kept = bytes(area) if self._holds(message) else b""  # other frames of its batch
+        try:
+            return self.process_message(message, time_ns, prepared._replace(enabled=enabled), fuel)
+        finally:
+            area[: len(kept)] = kept
+            self._counts.pack_into(self._memory, self._feed.counters, *earlier)
+
+    def whole(self, message: Buffer) -> bool:
+        return self._holds(message) or 4 + len(message) <= BEGINNING
+
+    def _holds(self, message: Buffer) -> bool:
+        return isinstance(message, memoryview) and message.obj is self._owner
 
     def _process_elsewhere(  # noqa: PLR0917  as `process_batch`
         self,

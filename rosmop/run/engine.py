@@ -21,11 +21,11 @@ from rosmop.form.connected_groups import channel_of
 from rosmop.form.findings import Diagnostic
 from rosmop.form.specification_groups import groups
 from rosmop.run.execution import Asked, MonitorExecution, OnFault
-from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, FastLane, FastPath, Lanes
+from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, FastLane, FastPath, Lanes, Tried
 from rosmop.run.guards import guards_of
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.margins import begin_margins, taken_margins
-from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, monitors_of
+from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, Tap, monitors_of
 from rosmop.run.outcomes import NOBODY, SHADOW_BUDGET, Margin, MessageSender, Outcome
 from rosmop.run.readout import Readout, read_out
 from rosmop.run.slice_quota import HolderOf, no_holder
@@ -56,12 +56,6 @@ _CHANGED = "its text, or the definition of a message, has changed, and its state
 
 def _never() -> bool:
     return False
-
-
-class _Tap(Step):
-    """A pseudo-event that never happens: it copies messages for shadow mode."""
-
-    __slots__ = ()
 
 
 class ShadowCopy(NamedTuple):
@@ -194,7 +188,7 @@ class MonitorSet:
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
         self._restarted: Outcome | None = None
-        self._broken = False
+        self._broken: frozenset[str] = frozenset()
         self._index()
         self._lanes = Lanes()
         if fast is not None:
@@ -338,7 +332,7 @@ class MonitorSet:
     def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
         """Return None if the topic has no enabled event. Shadow mode counts only if `shadowed`."""
         steps = self.steps.get(topic, ())
-        return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
+        return next((step.event.type for step in steps if shadowed or not isinstance(step, Tap)), None)
 
     def stamped(self, topic: str) -> bool:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
@@ -346,7 +340,7 @@ class MonitorSet:
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
         for part in ("request", "response"):
             for step in self.steps.get(channel_of(service, part), ()):
-                if shadowed or not isinstance(step, _Tap):
+                if shadowed or not isinstance(step, Tap):
                     return step.event.service_type
         return None
 
@@ -399,7 +393,7 @@ class MonitorSet:
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
         """Return whether the fast lane may take the next batch."""
-        return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
+        return not self._agenda.has_come(time_ns) and lane.topic not in self._broken and lane.ready()
 
     def monitor(self, name: str) -> MonitorInstance:
         for monitor in self._monitors:
@@ -565,7 +559,9 @@ class MonitorSet:
             awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
             for timer in monitor.timers:
                 timer.due = None if awaited else time_ns + timer.period
-        self._broken = any(monitor.broken for monitor in self._monitors)
+        self._broken = frozenset().union(
+            *(group.channels for group in self.groups if any(one.broken for one in group.monitors))
+        )
         if outcome.published:
             self._judge_published(outcome)
         self._agenda.schedule()
@@ -714,13 +710,27 @@ class MonitorSet:
 
     # Events
 
-    def process(self, topic: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY) -> Outcome:
+    def process(
+        self,
+        topic: str,
+        buffer: Buffer,
+        time_ns: int,
+        sender: MessageSender = NOBODY,
+        *,
+        tried: Tried = "",
+    ) -> Outcome:
+        """Process a message; `tried` is what became of it in the topic's lane, if that has got it before."""
         outcome, steps = Outcome(buffer, time_ns), self.steps.get(topic, ())
         if self._agenda.has_come(time_ns):
             outcome.before = self.advance(time_ns)
         if steps:
             ticked = len(outcome.before)
-            self._execution.message(steps, buffer, outcome, sender)
+            lane = None if topic in self._broken or sender.altered else self._lanes.of_topic.get(topic)
+            if lane is not None and tried == "left" and lane.whole(buffer):
+                lane = None
+            over = tried == "over"
+            if lane is None or not self._execution.in_module(lane, steps, outcome, sender, over=over):
+                self._execution.message(steps, buffer, outcome, sender)
             for deadline in outcome.before[ticked:]:
                 self._follow_up(deadline)
             self._follow_up(outcome)
@@ -875,14 +885,14 @@ class MonitorSet:
             places.setdefault(step.event.channel or "", []).append(place)
         self._places = places
         for found in steps.values():
-            acting = [step for step in found if not isinstance(step, _Tap)]
+            acting = [step for step in found if not isinstance(step, Tap)]
             for place, step in enumerate(acting):
                 step.first = not place or acting[place - 1].monitor is not step.monitor
             for step in found if acting else ():
-                if isinstance(step, _Tap):
+                if isinstance(step, Tap):
                     step.monitor = acting[0].monitor  # its state must be copied back to Python
         self._tapped_ways = frozenset(
-            channel for channel, found in steps.items() if any(isinstance(step, _Tap) for step in found)
+            channel for channel, found in steps.items() if any(isinstance(step, Tap) for step in found)
         )
         self.steps = {channel: tuple(found) for channel, found in steps.items()}
         self._withheld = {}
@@ -896,7 +906,7 @@ class MonitorSet:
 
     def _taps(self, shadow: "MonitorSet") -> tuple[Step, ...]:
         return tuple(
-            _Tap(found[0].monitor, found[0].event, 0, "", self._tap(shadow, found[0].event))
+            Tap(found[0].monitor, found[0].event, 0, "", self._tap(shadow, found[0].event))
             for found in shadow.steps.values()
         )
 

@@ -20,14 +20,22 @@ from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Categories, RunFaultError
 from rosmop.logics.pattern import TimedPattern
 from rosmop.run.explain import Bound, of_slice
+from rosmop.run.fast_path import FastLane
 from rosmop.run.guards import Guards
 from rosmop.run.interpreter import Interpreter, LastFailure
-from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step
+from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step, Tap
 from rosmop.run.origins import Origin
-from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
+from rosmop.run.outcomes import DROPPED, FUEL_PER_SECOND, NOBODY, Fault, MessageSender, Outcome, Verdict
 from rosmop.run.slices import Key, Slice, Slices, of_nan
 from rosmop.runtime import safe_messages
-from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError, Published
+from rosmop.runtime.action_context import (
+    FOLDED_NS,
+    FaultError,
+    LogLine,
+    MalformedError,
+    OverBudgetError,
+    Published,
+)
 from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.counted import counted
 
@@ -138,7 +146,7 @@ class MonitorExecution:
                     break
             if step.monitor is passing:
                 continue
-            self._function = step.event.function
+            self._function, faults = step.event.function, len(outcome.faults)
             if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
                 outcome.dropped_by = step.monitor.name
                 break
@@ -150,15 +158,89 @@ class MonitorExecution:
             if message.stopped is not None:
                 writers = (*writers, (step, [message.stopped]))
                 self._replaced(message)
+            if any(fault.over for fault in outcome.faults[faults:]):
+                passing = step.monitor
+                self._turn.begin()
         if heard or outcome.faults:
-            self._note_nodes(steps, heard, message, outcome)
+            self._note_nodes(steps, heard, message.channel or "", outcome)
         self._finish(message, writers, outcome)
+
+    def in_module(
+        self, lane: FastLane, steps: Sequence[Step], outcome: Outcome, sender: MessageSender, *, over: bool
+    ) -> bool:
+        """Judge a message that the lane was not `ready` for; return False, and do nothing, if the engine has to.
+
+        If it is `over` the fuel of all monitors together, each one has that fuel for itself, and those that it does not
+        suffice for have a fault.
+        """
+        self._sender, turn = sender, self._turn
+        turn.now, turn.source = outcome.time, sender.source
+        node, channel = self._node(), lane.topic
+        acting = [step.monitor for step in steps if step.first]
+        judging: list[MonitorInstance] = []
+        heard: list[tuple[MonitorInstance, Origin]] = []
+        for monitor in acting:
+            source = monitor.sources.get(channel)
+            awaited = source is not None and (source.waits or source.speakers)
+            if source is not None and awaited and not source.hears(node):
+                continue
+            judges, reason = self._judges(monitor, channel)
+            if reason is not None:
+                return False
+            if source is not None and awaited:
+                heard.append((monitor, source))
+            if judges:
+                judging.append(monitor)
+        fuel = FUEL_PER_SECOND // 100 if turn.clock is None else int(FUEL_PER_SECOND * turn.seconds * turn.part)
+        given = outcome.buffer, outcome.time
+        if judging and not over:
+            found = lane.judge(*given, judging, sender.source, fuel)
+            if found is None and not lane.exhausted:
+                return False
+            over = found is None
+            outcome.events, outcome.log = ((), ()) if found is None else (found.events, found.log)
+        if judging and over:
+            if turn.clock is None or any(channel in monitor.code.acts_on for monitor in judging):
+                return False
+            for monitor in judging:
+                found = lane.judge(*given, [monitor], sender.source, fuel) if len(judging) > 1 else None
+                if found is None:
+                    self._exceeded(monitor, channel, outcome)
+                else:
+                    outcome.events = (*outcome.events, *found.events)
+                    outcome.log = [*outcome.log, *found.log]
+        for monitor in acting:
+            monitor.starting.discard(channel)
+        for monitor in judging:
+            self._see(monitor, outcome.time)
+        steps[0].monitor.touch()
+        if heard or outcome.faults:
+            self._note_nodes(steps, heard, channel, outcome)
+        for step in steps:
+            if isinstance(step, Tap):
+                step.function(WireMessage(outcome.buffer, outcome.time, channel))
+        return True
+
+    def _exceeded(self, monitor: MonitorInstance, channel: str, outcome: Outcome) -> None:
+        """Note that a message of an observed topic, of which the monitor has seen nothing, is over its budget.
+
+        The state is that of the message before. It counts on if the ages of all events of the topic do.
+        """
+        events = [step.event for step in monitor.steps if step.event.channel == channel]
+        ages = all(f"age({event.name})" in monitor.code.variables for event in events)
+        kept = ages and {*self._guards.depending[monitor.name]} <= {monitor.name}
+        text = self._turn.too_late
+        if kept:
+            text += f"; {monitor.name} goes on with what it knew before, until that is too old"
+        monitor.faults += 1
+        fault = Fault(monitor.name, events[0].position, text, {}, outdates=not kept, over=True)
+        outcome.faults = (*outcome.faults, fault)
 
     def _note_nodes(
         self,
         steps: Sequence[Step],
         heard: Sequence[tuple[MonitorInstance, Origin]],
-        message: WireMessage,
+        channel: str,
         outcome: Outcome,
     ) -> None:
         node, faulty = self._node(), {fault.monitor for fault in outcome.faults}
@@ -167,7 +249,7 @@ class MonitorExecution:
                 outcome.doubtful = (*outcome.doubtful, monitor.name)
         unreadable = {fault.monitor for fault in outcome.faults if fault.malformed and fault.outdates}
         for step in steps if self.on_fault == "drop" else ():
-            source = step.monitor.sources.get(message.channel or "")
+            source = step.monitor.sources.get(channel)
             if step.first and source is not None and step.monitor.name in unreadable:
                 source.doubt(node)
 
@@ -611,17 +693,7 @@ class MonitorExecution:
         It then drops all messages except the safe message, on the topics on which it acts. Messages that it only
         observes pass, and keep its state up to date, unless it has none.
         """
-        broken = monitor.broken and self.on_fault == "drop"
-        if (message.channel or "") not in monitor.held_channels:
-            if broken:
-                return True
-        elif monitor.held:
-            why = f" ({monitor.why_held})" if monitor.why_held else ""
-            outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
-        elif monitor.blocks:
-            outcome.reason = f"{monitor.name} holds its topics until it has heard {monitor.awaits}"
-        elif broken:
-            outcome.reason = f"{monitor.name} could not start: its initial values or `init` faulted"
+        judges, outcome.reason = self._judges(monitor, message.channel or "")
         if outcome.reason is not None:
             sender = monitor.safes.get(message.channel or "")
             if sender is not None and safe_messages.is_safe(sender.safe, message.buffer):
@@ -630,11 +702,30 @@ class MonitorExecution:
             outcome.dropped_at = monitor.code.position
             message.dropped = True
             return True
+        if judges:
+            self._see(monitor, message.time)
+        return not judges
+
+    def _judges(self, monitor: MonitorInstance, channel: str) -> tuple[bool, str | None]:
+        """Return whether the monitor judges messages of the channel, and if it drops them, why."""
+        broken = monitor.broken and self.on_fault == "drop"
+        if channel not in monitor.held_channels:
+            return not broken, None
+        if monitor.held:
+            why = f" ({monitor.why_held})" if monitor.why_held else ""
+            return False, f"{monitor.name} holds its topics until it is resumed{why}"
+        if monitor.blocks:
+            return False, f"{monitor.name} holds its topics until it has heard {monitor.awaits}"
+        if broken:
+            return False, f"{monitor.name} could not start: its initial values or `init` faulted"
+        return True, None
+
+    def _see(self, monitor: MonitorInstance, time_ns: int) -> None:
+        """Note that the monitor judges a message; before the first one, its timers do not run."""
         for timer in () if monitor.seen else monitor.timers:
             if not timer.ticked:
-                timer.due = message.time + timer.period
+                timer.due = time_ns + timer.period
         monitor.seen = True
-        return False
 
     def _note(self, monitor: MonitorInstance) -> None:
         if self._bound is not None and (not monitor.trail or monitor.trail[-1] is not self._bound):
@@ -734,7 +825,10 @@ class MonitorExecution:
             self._block(monitor, message, outcome)
 
     def _block(self, monitor: MonitorInstance, message: WireMessage | None, outcome: Outcome) -> None:
+        """Drop or replace the message of a fault. One that is over its budget reaches others if it is only observed."""
         if message is None or self.on_fault != "drop":
+            return
+        if outcome.faults[-1].over and message.channel not in monitor.code.acts_on:
             return
         sender = monitor.safes.get(message.channel or "")
         if sender is not None:
@@ -765,7 +859,9 @@ class MonitorExecution:
         # other topics they reach no subscriber.
         malformed, function = isinstance(error, MalformedError | struct.error), self._function
         outdates = function in self._guards.observing if malformed else function not in self._guards.judging
-        fault = replace(fault, outdates=outdates, malformed=malformed)
+        fault = replace(
+            fault, outdates=outdates, malformed=malformed, over=isinstance(error, OverBudgetError)
+        )
         monitor.faults += 1
         outcome.faults = (*outcome.faults, fault)
 

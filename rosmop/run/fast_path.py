@@ -1,8 +1,8 @@
 """The interface between the engine and compiled code (`rosmop/fast/wasm_runner.py`)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from rosmop.form.compiled import Compiled
 from rosmop.run.interpreter import Interpreter
@@ -12,6 +12,9 @@ from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import Buffer
 
 MESSAGE_FUEL = FUEL_PER_SECOND // 100
+
+Tried = Literal["", "left", "over"]
+"""Whether a lane has left a message to the engine, or had not enough fuel for it."""
 
 
 class BatchResult(NamedTuple):
@@ -98,6 +101,11 @@ class Pieces(Protocol):
 class FastLane(Protocol):
     """Processes the messages of one topic, or part of a service, many at a time."""
 
+    topic: str
+
+    brief: bool
+    """Whether the code has no loops, so that a message in the engine takes little time as well."""
+
     events: tuple[tuple[str], ...]
     """The value of `Outcome.events` for each event, if it happens alone."""
 
@@ -174,6 +182,21 @@ class FastLane(Protocol):
         The conditions are those of `process_batch`. Use separate options for this method, and do not call
         `happened`.
         """
+
+    exhausted: bool
+    """Whether the fuel was not enough for the last message of `process_message` or `judge`."""
+
+    def judge(
+        self, message: Buffer, time_ns: int, judging: Collection[MonitorInstance], source: int, fuel: int
+    ) -> Outcome | None:
+        """Process a message for some of the monitors. Return None for a message left to the engine.
+
+        The lane need not be `ready`, but nothing may be due. A message that a monitor would drop or change, or that
+        gives a verdict, is left.
+        """
+
+    def whole(self, message: Buffer) -> bool:
+        """Whether `process_batch` sees all of a message in this buffer."""
 
 
 class Lanes(NamedTuple):

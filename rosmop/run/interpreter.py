@@ -22,7 +22,7 @@ from typing import Any
 from rosmop.form import nodes
 from rosmop.form.sites import Site
 from rosmop.runtime import formatting, numbers, safe_messages, strings, times, vectors, wire
-from rosmop.runtime.action_context import MAX_CALLS, ActionState, Context, FaultError
+from rosmop.runtime.action_context import MAX_CALLS, PART, ActionState, Context, FaultError
 from rosmop.runtime.builtin_functions import CHARGING, FAULTING, FUNCTIONS
 from rosmop.runtime.values import BILLION, ValueCodec, struct_code, struct_size
 from rosmop.types import value_types
@@ -86,7 +86,7 @@ class Interpreter:
         self.turn = ActionState()
         self.variables: dict[str, Any] = {}
         self.failed = LastFailure()
-        self._values = ValueCodec(messages, self.turn.check)
+        self._values = ValueCodec(messages, partial(self.turn.check, PART))
         self._functions = functions
         self._made: dict[str, Callable[[Variables], Any]] = {}
         self._calls: list[Variables] = []

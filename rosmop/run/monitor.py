@@ -131,6 +131,12 @@ class Step:
     key: Callable[[WireMessage], Any] | None = None
 
 
+class Tap(Step):
+    """A pseudo-event that never happens: it copies messages for shadow mode."""
+
+    __slots__ = ()
+
+
 @dataclass(eq=False, slots=True)
 class Timer:
     """A periodic event. `due` is None while it does not run."""

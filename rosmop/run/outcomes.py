@@ -91,7 +91,8 @@ class Fault:
     """A runtime error that stopped an action, with the `values` of the variables involved.
 
     If it `outdates`, the monitor's state may be out of date, because an event that it observes did not take
-    effect. `malformed`: the bytes were not a message of the event's type.
+    effect. `malformed`: the bytes were not a message of the event's type. `over`: the message exceeded its budget,
+    which is a limit of the monitor and says nothing about the sender.
     """
 
     monitor: str
@@ -100,6 +101,7 @@ class Fault:
     values: Mapping[str, object]
     outdates: bool = False
     malformed: bool = False
+    over: bool = False
 
 
 def named(verdict: Verdict) -> str:

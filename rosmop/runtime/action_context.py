@@ -2,7 +2,8 @@
 
 1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, long copies
 and reads of many elements are charged before they run. With `ActionState.limit`, processor time is read every `STEP`
-instructions and every `PART` elements.
+instructions and every `PART` elements, but only after `INSTRUCTIONS_PER_SECOND`: the same instructions take several
+times longer on a busy machine, and an honest message must not become a fault there.
 2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes, after which `allocate` measures the
 live values.
 """
@@ -19,6 +20,9 @@ BUDGET = 1_000_000
 STEP = 250
 
 PART = 250
+
+INSTRUCTIONS_PER_SECOND = 5_000_000
+"""The instructions that a second of the time limit always permits."""
 
 _AT_ONCE = 10e-9  # seconds: the least that an instruction takes, where many are charged in advance
 
@@ -43,6 +47,10 @@ class FaultError(Exception):
         super().__init__(text)
         self.site = site
         self.text = text
+
+
+class OverBudgetError(FaultError):
+    """A message, tick or deadline needs more instructions, or more processor time, than it has."""
 
 
 class MalformedError(Exception):
@@ -92,6 +100,9 @@ class ActionState:
     seconds: float = inf
     part: float = 1.0  # the usable fraction of `seconds`
     until: float = inf
+    least: float = inf
+    """The instructions and elements after which the time counts, and those of this message so far (`spent`)."""
+    spent: int = 0
 
     def limit(self, clock: Callable[[], float], seconds: float) -> None:
         """Limit the processor time (seconds) of each message, tick or deadline, starting with the next."""
@@ -100,20 +111,26 @@ class ActionState:
     def begin(self) -> None:
         if self.clock is not None:
             self.until = self.clock() + self.seconds * self.part
+            self.least, self.spent = INSTRUCTIONS_PER_SECOND * self.seconds * self.part, 0
 
-    def late(self, more: float = 0.0) -> bool:
-        return self.clock is not None and self.clock() + more > self.until
+    def late(self, more: int = 0) -> bool:
+        """Whether the time is over, or will be after so many more instructions."""
+        if self.clock is None or self.spent + more < self.least:
+            return False
+        return self.clock() + more * _AT_ONCE > self.until
 
-    def check(self) -> None:
+    def check(self, elements: int = 0) -> None:
+        """Raise an error if the time is over; `elements` follow that no instruction is charged for."""
         if self.late():
-            raise FaultError(-1, self.too_late)
+            raise OverBudgetError(-1, self.too_late)
+        self.spent += elements
 
     @property
     def too_late(self) -> str:
         return (
             f"more than {self.seconds * self.part * 1000:g} ms of processor time for one message: it has too many"
-            f" elements or characters for its monitors (relay.budget is {self.seconds * 1000:g} ms; for a second after"
-            " a message that took longer, the next ones have a tenth)"
+            f" elements or characters for its monitors (relay.budget is {self.seconds * 1000:g} ms; for some seconds"
+            " after such a message, others of at least half its size have a tenth)"
         )
 
     def exclude(self, make: Callable[[], _T]) -> _T:
@@ -165,10 +182,10 @@ class Context:
         self._left = whole - self.budget
 
     def put_off(self) -> Callable[[], None]:
-        budget, left, until = self.budget, self._left, self.turn.until
+        budget, left, until, spent = self.budget, self._left, self.turn.until, self.turn.spent
 
         def go_on() -> None:
-            self.budget, self._left, self.turn.until = budget, left, until
+            self.budget, self._left, self.turn.until, self.turn.spent = budget, left, until, spent
 
         return go_on
 
@@ -186,11 +203,12 @@ class Context:
         missing = -self.budget
         if missing > self._left:
             self._left = 0
-            raise FaultError(site, f"more than {self.most} instructions for one message{otherwise}")
-        if self.turn.late(missing * _AT_ONCE):
+            raise OverBudgetError(site, f"more than {self.most} instructions for one message{otherwise}")
+        if self.turn.late(missing):
             self._left = 0
-            raise FaultError(site, self.turn.too_late)
+            raise OverBudgetError(site, self.turn.too_late)
         given = min(self._left, missing + STEP)
+        self.turn.spent += given
         self._left -= given
         self.budget += given
 

@@ -347,15 +347,15 @@ class Interceptor:
         if outcome is None:
             self.invalidate_prepared()
             time_budget = self.time_budgets.of(point)
-            self.monitors.hurry(time_budget.part(now))
+            self.monitors.hurry(time_budget.part(now, len(body)))
             try:
                 outcome = self.monitors.process_service(
                     service, part, bytearray(body), now, MessageSender(self.senders.number(point))
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 outcome = dropped(view, now, self.observer.defect(error, point, now))
-            if outcome.faults and self.monitors.late:
-                time_budget.cut(now)
+            if any(fault.over for fault in outcome.faults):
+                time_budget.cut(now, len(body))
             if self.monitors.tapped:
                 self.shadow.wait(point, None)
         elif self.monitors.next_due != due:
@@ -415,7 +415,7 @@ class Interceptor:
             return prepared
 
         try:
-            fuel = self.time_budgets.of(point).fuel(now, self.budget)
+            fuel = self.time_budgets.of(point).fuel(now, self.budget, len(body))
             return monitors.process_fast(way, body, now, prepare, fuel)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             observer.defect(error, point, now)

@@ -1,7 +1,8 @@
 """The processor time that the next message of a publication, or of a service's client, may take.
 
-After a message is cut off, messages get a tenth of the budget for some seconds, because more may follow. Hosts that
-the policy does not name share one budget, because each of many addresses could send such a message.
+After a message is cut off, others get a tenth of the budget for some seconds, because more may follow: those of at
+least half its size, since shorter ones cost less. Hosts that the policy does not name share one budget, because each of
+many addresses could send such a message.
 """
 
 from collections.abc import Callable
@@ -17,23 +18,26 @@ _REDUCED = 0.1
 class TimeBudget:
     """The fraction of the time budget for messages of one point; times are nanoseconds of the monitors' clock."""
 
-    __slots__ = ("_length", "_until")
+    __slots__ = ("_length", "_size", "_until")
 
     def __init__(self) -> None:
         self._length = 0
         self._until = 0
+        self._size = 0
 
-    def part(self, now: int) -> float:
-        return _REDUCED if now < self._until else 1.0
+    def part(self, now: int, size: int) -> float:
+        return _REDUCED if now < self._until and 2 * size >= self._size else 1.0
 
-    def fuel(self, now: int, budget: float) -> int:
-        """Return the most instructions for one message; `budget` is in seconds."""
-        return int(FUEL_PER_SECOND * budget * self.part(now))
+    def fuel(self, now: int, budget: float, size: int) -> int:
+        """Return the most instructions for one message of `size` bytes; `budget` is in seconds."""
+        return int(FUEL_PER_SECOND * budget * self.part(now, size))
 
-    def cut(self, now: int) -> None:
-        if now >= self._until:
-            self._length = _SHORTEST if self.recovered(now) else min(2 * self._length, _LONGEST)
-            self._until = now + self._length
+    def cut(self, now: int, size: int) -> None:
+        if now < self._until:
+            self._size = min(self._size, size)
+            return
+        self._length = _SHORTEST if self.recovered(now) else min(2 * self._length, _LONGEST)
+        self._until, self._size = now + self._length, size
 
     def recovered(self, now: int) -> bool:
         return now >= self._until + self._length

@@ -21,7 +21,7 @@ from appliance.relay.transport.pump import ModuleCall
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-    from rosmop.run.fast_path import BatchOptions, BatchResult, FastLane
+    from rosmop.run.fast_path import BatchOptions, BatchResult, FastLane, Tried
 
 _unpack_length = struct.Struct("<I").unpack_from
 _NEVER = 1 << 63
@@ -114,42 +114,43 @@ class TopicPipeline:
                 progress.stop()
             elif lane is None:
                 self._one_by_one(monitors, progress, batch.messages)
-            elif not self._walk(monitors, lane, progress):
-                self._one_by_one(monitors, progress, progress.turns())
+            elif (tried := self._walk(monitors, lane, progress)) is not None:
+                self._one_by_one(monitors, progress, progress.turns() if lane.brief else 1, tried)
         interceptor.schedule()
         return progress.result()
 
     def _usable(self, monitors: MonitorSet, lane: FastLane, now: int) -> bool:
         return lane is not self._defect and monitors.lane_ready(lane, now)
 
-    def _walk(self, monitors: MonitorSet, lane: FastLane, progress: BatchProgress) -> bool:
+    def _walk(self, monitors: MonitorSet, lane: FastLane, progress: BatchProgress) -> Tried | None:
+        """Process messages in the lane; return what became of the next one if the engine has to process it."""
         interceptor = self._interceptor
         if not self._usable(monitors, lane, progress.time):
-            return False
+            return "left" if lane is self._defect else ""
         prepared, counts = self._prepare(monitors, lane)
         try:
             given = progress.view, progress.position, progress.run, progress.pieces, progress.time, prepared
             walked = lane.process_batch(*given)
             alone = walked is not None and walked.paused and walked.position == progress.position
             if alone:
+                size = _unpack_length(progress.view, progress.position)[0]
+                time_budget = interceptor.time_budgets.of(self.point)
                 walked = lane.process_one(
-                    *given, interceptor.time_budgets.of(self.point).fuel(progress.time, interceptor.budget)
+                    *given, time_budget.fuel(progress.time, interceptor.budget, size)
                 )
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, lane, progress.time)
-            return False
+            return "left"
         if not counts.begun:
             interceptor.observer.collect_later(counts)
         if walked is None:
             progress.walked(progress.end, progress.run, 0)
-            return True
+            return None
         begun = progress.position
         self._account(walked, progress, counts)
-        if alone:
-            if walked.paused:  # the engine would take much longer
-                interceptor.time_budgets.of(self.point).cut(progress.time)
-            return progress.position > begun
-        return walked.paused or progress.position == progress.end
+        if alone and progress.position == begun:
+            return "over" if walked.paused else "left"
+        return None if alone or walked.paused or progress.position == progress.end else "left"
 
     def _report(self, walked: BatchResult, progress: BatchProgress) -> None:
         interceptor, monitors = self._interceptor, self._interceptor.monitors
@@ -185,7 +186,9 @@ class TopicPipeline:
         self._prepared, self._preparation = (lane, options, counts), number
         return options, counts
 
-    def _one_by_one(self, monitors: MonitorSet, progress: BatchProgress, count: int) -> None:
+    def _one_by_one(
+        self, monitors: MonitorSet, progress: BatchProgress, count: int, tried: Tried = ""
+    ) -> None:
         interceptor, observer = self._interceptor, self._interceptor.observer
         point, now = self.point, progress.time
         view, position, end = progress.view, progress.position, progress.end
@@ -201,9 +204,9 @@ class TopicPipeline:
             body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
             observed = ObservedMessage(progress, position, bytes(body[:head]))
-            monitors.hurry(interceptor.time_budgets.of(point).part(now))
+            monitors.hurry(interceptor.time_budgets.of(point).part(now, len(body)))
             try:
-                outcome = process(topic, body, now, observed.sender(self._source))
+                outcome = process(topic, body, now, observed.sender(self._source), tried=tried)
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 outcome = dropped(body, now, observer.defect(error, point, now, observed))
             if monitors.tapped:
@@ -222,8 +225,8 @@ class TopicPipeline:
                     progress.replace(position, following, outcome.buffer)
             position = following
             looked += 1
-            if outcome.faults and monitors.late:
-                interceptor.time_budgets.of(point).cut(now)
+            if any(fault.over for fault in outcome.faults):
+                interceptor.time_budgets.of(point).cut(now, len(body))
             if interceptor.over():
                 break
         progress.position = position
