@@ -8,8 +8,8 @@ from rosmop.tests.acting import message
 from roswire.standard import standard_definitions
 
 JOINTS = "sensor_msgs/JointState"
-NAMES = message(JOINTS, name=[""] * 20_000, position=[0.5] * 20_000)
-TEXT = message("std_msgs/String", data="x" * 20_000)
+NAMES = message(JOINTS, name=[""] * 200_000, position=[0.5] * 200_000)
+TEXT = message("std_msgs/String", data="x" * 200_000)
 
 WALKS = {
     "a loop": ("std_msgs/String", "std::string s", "{data:s}", "for (int i = 0; i < s.size(); i++) n += i;", TEXT),
@@ -41,10 +41,10 @@ def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
     readings: list[None] = []
     monitors.limit_time(ticking(readings), 0.010)
     outcome = monitors.process("/t", bytearray(data), 2)
-    assert outcome.result == "dropped"
+    assert outcome.result == "passed"  # the topic is only observed
     assert "more than 10 ms of processor time" in outcome.faults[0].text
     assert len(readings) <= 16
-    assert monitors.late
+    assert outcome.faults[0].over
 
 
 def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
@@ -59,7 +59,7 @@ def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
     outcome = monitors.process("/t", bytearray(TEXT), 1)
     assert outcome.result == "passed"
     assert [fault.monitor for fault in outcome.faults] == ["a", "b"]
-    assert len(readings) <= 16
+    assert len(readings) <= 32
 
 
 def test_a_hurried_message_has_a_part_of_the_time() -> None:

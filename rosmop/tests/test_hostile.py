@@ -64,7 +64,8 @@ def test_a_bomb_is_a_fault(body: str, before: str, text: str) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert [text in fault.text for fault in outcome.faults] == [True]
-    assert outcome.result == "dropped"
+    observes = outcome.faults[0].over and "x++" not in body
+    assert outcome.result == ("passed" if observes else "dropped")
     assert took < PATIENCE
     assert peak < 200 << 20
 
@@ -241,7 +242,7 @@ def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
         outcome = monitors.process("/t", data, at)
         took.append(time.process_time() - began)
     assert min(took) < 0.05
-    assert (outcome.result, len(outcome.faults)) == ("dropped", 1)
+    assert (outcome.result, len(outcome.faults)) == ("passed", 1)
     assert "too many elements precede a field" in outcome.faults[0].text
 
 

@@ -22,6 +22,7 @@ from appliance.relay.transport.pump import ModuleCall
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
     from rosmop.run.fast_path import BatchOptions, BatchResult, FastLane, Tried
+    from rosmop.run.outcomes import Outcome
 
 _unpack_length = struct.Struct("<I").unpack_from
 _NEVER = 1 << 63
@@ -192,7 +193,7 @@ class TopicPipeline:
         interceptor, observer = self._interceptor, self._interceptor.observer
         point, now = self.point, progress.time
         view, position, end = progress.view, progress.position, progress.end
-        process, topic = monitors.process, point[1]
+        topic = point[1]
         shows = observer.shows(point)
         head = HEAD if monitors.stamped(topic) else 0
         number = progress.number_at(position) if monitors.taps(topic) else 0
@@ -205,10 +206,7 @@ class TopicPipeline:
             before = bytes(body[:SHOWN]) if shows else b""
             observed = ObservedMessage(progress, position, bytes(body[:head]))
             monitors.hurry(interceptor.time_budgets.of(point).part(now, len(body)))
-            try:
-                outcome = process(topic, body, now, observed.sender(self._source), tried=tried)
-            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                outcome = dropped(body, now, observer.defect(error, point, now, observed))
+            outcome = self._processed(monitors, body, now, observed, tried)
             if monitors.tapped:
                 interceptor.shadow.wait(point, observed.at(number + looked))
             if outcome.events or outcome.log or outcome.faults or outcome.before:
@@ -230,6 +228,19 @@ class TopicPipeline:
             if interceptor.over():
                 break
         progress.position = position
+
+    def _processed(
+        self, monitors: MonitorSet, body: memoryview, now: int, observed: ObservedMessage, tried: Tried
+    ) -> Outcome:
+        point = self.point
+        try:
+            return monitors.process(point[1], body, now, observed.sender(self._source), tried=tried)
+        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+            defect = self._interceptor.observer.defect(error, point, now, observed)
+        if tried != "left" and (lane := monitors.lane(point[1])) is not None:  # it may be one of the lane
+            self._defect = lane
+            return self._processed(monitors, body, now, observed, "left")
+        return dropped(body, now, defect)
 
     def _block(self, batch: Batch, progress: BatchProgress) -> Batch | None:
         if not self._interceptor.blocked:

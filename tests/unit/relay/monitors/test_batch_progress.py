@@ -286,10 +286,10 @@ def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> No
     single = 0
     process = monitored.set.process
 
-    def counted(*arguments: Any) -> Any:
+    def counted(*arguments: Any, tried: Any) -> Any:
         nonlocal single
         single += 1
-        return process(*arguments)
+        return process(*arguments, tried=tried)
 
     monkeypatch.setattr(monitored.set, "process", counted)
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)

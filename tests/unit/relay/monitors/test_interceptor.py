@@ -186,11 +186,11 @@ def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> 
         world.state(NodePlaced(key, "/node", host), world.listen())
         world.state(PublicationPlaced(key, "/t", "*", named=named))
     one, other, robot = (ObservationPoint("k", "/t", host) for host in ("10.9.0.1", "10.9.0.2", "10.0.0.1"))
-    interceptor.time_budgets.of(one).cut(1)
-    assert [interceptor.time_budgets.of(place).part(2) for place in (one, other, robot)] == [0.1, 0.1, 1]
-    interceptor.time_budgets.of(robot).cut(1)
+    interceptor.time_budgets.of(one).cut(1, 10)
+    assert [interceptor.time_budgets.of(place).part(2, 10) for place in (one, other, robot)] == [0.1, 0.1, 1]
+    interceptor.time_budgets.of(robot).cut(1, 10)
     assert [
-        interceptor.time_budgets.of(place).part(2) for place in (robot, robot._replace(resource="/u"))
+        interceptor.time_budgets.of(place).part(2, 10) for place in (robot, robot._replace(resource="/u"))
     ] == [
         0.1,
         1,
