@@ -102,6 +102,8 @@ class TopicCode:
     says: bool
     """Whether the code may print lines; those before the address stored at `SURE` are final."""
     settle: str
+    budgets: Sequence[int]
+    """The addresses of the instructions (i64) that the specifications have left; less than zero: too few."""
 
 
 @dataclass(frozen=True)

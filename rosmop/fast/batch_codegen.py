@@ -367,6 +367,7 @@ class TopicCodegen:
             [written.number for written in self._written],
             self._says,
             f"settle {self._cells.settle}" if self._settles else "",
+            self._budgets,
         )
 
     def handlers(self) -> list[WasmFunction]:

@@ -372,7 +372,8 @@ class WasmLane:
                 if sooner:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
-                return BatchResult(position, run, dropped, told, sooner, output, paused and answer >= LEFT)
+                paused = answer >= LEFT and (paused or self._overspent())
+                return BatchResult(position, run, dropped, told, sooner, output, paused)
             answer = None
 
     def native(self) -> NativeCall | None:
@@ -544,6 +545,9 @@ class WasmLane:
             return self._call(*call) or 0
         except WasmTrap:
             return self._stopped(*call)
+
+    def _overspent(self) -> bool:
+        return any(_TIME.unpack_from(self._memory, address)[0] < 0 for address in self._feed.budgets)
 
     def _undo(self) -> None:
         memory = self._memory

@@ -31,7 +31,9 @@ class BatchResult(NamedTuple):
     output: Sequence[tuple[int, LogLine]] = ()
     """The printed lines in order, each with the offset of its message."""
     paused: bool = False
-    """Whether the fuel is used up; the next batch may begin with the message at `position`."""
+    """Whether the fuel, or a budget of instructions, is used up. The next batch may begin with the message at
+    `position`.
+    """
 
 
 class BatchOptions(NamedTuple):
