@@ -551,6 +551,8 @@ class MonitorSet:
         self, monitors: Sequence[MonitorInstance], time_ns: int, expected: frozenset[str] | None
     ) -> Outcome:
         self.began = tuple(monitor.name for monitor in monitors)
+        for monitor in monitors:
+            monitor.move_to_python()
         outcome = self._execution.begin(monitors, time_ns)
         for monitor in monitors:
             monitor.touch()

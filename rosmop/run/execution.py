@@ -144,7 +144,7 @@ class MonitorExecution:
                         continue
                     outcome.dropped_by = monitor.name
                     break
-            if step.monitor is passing:
+            if step.monitor is passing and not isinstance(step, Tap):
                 continue
             self._function, faults = step.event.function, len(outcome.faults)
             if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
