@@ -158,12 +158,17 @@ class MonitorExecution:
             if message.stopped is not None:
                 writers = (*writers, (step, [message.stopped]))
                 self._replaced(message)
-            if any(fault.over for fault in outcome.faults[faults:]):
-                passing = step.monitor
-                self._turn.begin()
+            passing = self._exhausted(step, outcome.faults[faults:]) or passing
         if heard or outcome.faults:
             self._note_nodes(steps, heard, message.channel or "", outcome)
         self._finish(message, writers, outcome)
+
+    def _exhausted(self, step: Step, faults: Sequence[Fault]) -> MonitorInstance | None:
+        """Return the monitor if the message exceeded its budget. Later monitors have the same time again."""
+        if not any(fault.over for fault in faults):
+            return None
+        self._turn.begin()
+        return step.monitor
 
     def in_module(
         self, lane: FastLane, steps: Sequence[Step], outcome: Outcome, sender: MessageSender, *, over: bool
@@ -175,51 +180,59 @@ class MonitorExecution:
         """
         self._sender, turn = sender, self._turn
         turn.now, turn.source = outcome.time, sender.source
-        node, channel = self._node(), lane.topic
         acting = [step.monitor for step in steps if step.first]
-        judging: list[MonitorInstance] = []
-        heard: list[tuple[MonitorInstance, Origin]] = []
-        for monitor in acting:
-            source = monitor.sources.get(channel)
-            awaited = source is not None and (source.waits or source.speakers)
-            if source is not None and awaited and not source.hears(node):
-                continue
-            judges, reason = self._judges(monitor, channel)
-            if reason is not None:
-                return False
-            if source is not None and awaited:
-                heard.append((monitor, source))
-            if judges:
-                judging.append(monitor)
-        fuel = FUEL_PER_SECOND // 100 if turn.clock is None else int(FUEL_PER_SECOND * turn.seconds * turn.part)
-        given = outcome.buffer, outcome.time
+        admitted = self._admitted(acting, lane.topic)
+        if admitted is None:
+            return False
+        judging, heard = admitted
+        whole = FUEL_PER_SECOND * (0.01 if turn.clock is None else turn.seconds * turn.part)
+        judge = partial(lane.judge, outcome.buffer, outcome.time, source=sender.source, fuel=int(whole))
         if judging and not over:
-            found = lane.judge(*given, judging, sender.source, fuel)
+            found = judge(judging)
             if found is None and not lane.exhausted:
                 return False
             over = found is None
             outcome.events, outcome.log = ((), ()) if found is None else (found.events, found.log)
         if judging and over:
-            if turn.clock is None or any(channel in monitor.code.acts_on for monitor in judging):
+            if turn.clock is None or any(lane.topic in monitor.code.acts_on for monitor in judging):
                 return False
             for monitor in judging:
-                found = lane.judge(*given, [monitor], sender.source, fuel) if len(judging) > 1 else None
-                if found is None:
-                    self._exceeded(monitor, channel, outcome)
-                else:
-                    outcome.events = (*outcome.events, *found.events)
-                    outcome.log = [*outcome.log, *found.log]
+                alone = judge([monitor]) if len(judging) > 1 else None
+                if alone is None:
+                    self._exceeded(monitor, lane.topic, outcome)
+                    continue
+                outcome.events = (*outcome.events, *alone.events)
+                outcome.log = [*outcome.log, *alone.log]
         for monitor in acting:
-            monitor.starting.discard(channel)
+            monitor.starting.discard(lane.topic)
         for monitor in judging:
             self._see(monitor, outcome.time)
         steps[0].monitor.touch()
         if heard or outcome.faults:
-            self._note_nodes(steps, heard, channel, outcome)
-        for step in steps:
-            if isinstance(step, Tap):
-                step.function(WireMessage(outcome.buffer, outcome.time, channel))
+            self._note_nodes(steps, heard, lane.topic, outcome)
+        for tap in (step for step in steps if isinstance(step, Tap)):
+            tap.function(WireMessage(outcome.buffer, outcome.time, lane.topic))
         return True
+
+    def _admitted(
+        self, monitors: Sequence[MonitorInstance], channel: str
+    ) -> tuple[list[MonitorInstance], list[tuple[MonitorInstance, Origin]]] | None:
+        """Return the monitors that judge a message, and those that awaited it; None if one drops it unjudged."""
+        node = self._node()
+        judging: list[MonitorInstance] = []
+        heard: list[tuple[MonitorInstance, Origin]] = []
+        for monitor in monitors:
+            source = monitor.sources.get(channel)
+            if source is not None and not (source.waits or source.speakers):
+                source = None
+            if source is not None and not source.hears(node):
+                continue
+            judges, reason = self._judges(monitor, channel)
+            if reason is not None:
+                return None
+            heard += [] if source is None else [(monitor, source)]
+            judging += [monitor] if judges else []
+        return judging, heard
 
     def _exceeded(self, monitor: MonitorInstance, channel: str, outcome: Outcome) -> None:
         """Note that a message of an observed topic, of which the monitor has seen nothing, is over its budget.

@@ -3,8 +3,8 @@
 The acts around the messages are random: two sets take the same ones, and one has a module.
 """
 
-import random
 from collections import Counter
+from random import Random
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -63,7 +63,8 @@ class Pair:
     def tell(self, topic: str, data: bytes, source: int, *, judged: bool) -> None:
         sender = MessageSender(source, 0, SEQ if topic == "/scan" else NO_NUMBER)
         outcomes = [
-            (one.judge if judged else one.process)(topic, bytearray(data), self.now, sender) for one in self.sets
+            (one.judge if judged else one.process)(topic, bytearray(data), self.now, sender)
+            for one in self.sets
         ]
         self.came[outcomes[0].reason or outcomes[0].result if not outcomes[0].faults else "fault"] += 1
         check_same(*outcomes)
@@ -94,7 +95,7 @@ def vars_of(source: object) -> list[object]:
     return [getattr(source, name) for name in ("first", "unreadable", "waits", "speakers", "known")]
 
 
-def act(pair: Pair, choice: random.Random) -> None:
+def act(pair: Pair, choice: Random) -> None:
     name = choice.choice(["begins", "speakers", "holds"])
     which = choice.randrange(12)
     pair.now += choice.choice([0, 1, 10**7, 10**8])
@@ -127,11 +128,13 @@ def act(pair: Pair, choice: random.Random) -> None:
             if how == 0:
                 one.succeed(old, pair.now)
             else:
-                one.recover(state if how == 1 else [], {} if how == 1 else {"": "lost"}, pair.now, restarted=True)
+                one.recover(
+                    state if how == 1 else [], {} if how == 1 else {"": "lost"}, pair.now, restarted=True
+                )
 
 
 def run(seed: int, *, shadows: bool) -> Counter[str]:
-    choice = random.Random(seed)
+    choice = Random(seed)  # noqa: S311  draws examples, not keys
     pair = Pair(shadows)
     for _ in range(40):
         act(pair, choice)
@@ -146,7 +149,7 @@ def test_the_module_admits_messages_as_the_interpreter_does(seed: int, shadows: 
 
 
 def test_the_acts_reach_every_outcome() -> None:
-    came = sum((run(seed, shadows=False) for seed in range(8)), Counter())
+    came = sum((run(seed, shadows=False) for seed in range(14)), Counter())
     assert {"passed", "dropped", "changed", "fault"} <= came.keys()
     assert any("until it is resumed" in one for one in came)
     assert any("until it has heard" in one for one in came)

@@ -1,4 +1,5 @@
-from itertools import count, product
+import itertools
+from itertools import product
 from typing import Any
 
 import pytest
@@ -101,7 +102,7 @@ def test_a_fault_on_a_command_sends_the_safe_message(text: str, data: bytes) -> 
 
 def test_time_that_one_monitor_used_up_is_given_again() -> None:
     monitors = load(FAULTY[1][0], y=guard(head="other()"))
-    monitors.limit_time(count(step=0.001).__next__, 0.05)
+    monitors.limit_time(itertools.count(step=0.001).__next__, 0.05)
     outcome = monitors.process("/cmd_vel", bytearray(command()), 1)
     assert ["processor time" in one.text for one in outcome.faults] == [True]
     assert bytes(outcome.buffer) == SAFE_BYTES

@@ -136,9 +136,7 @@ class TopicPipeline:
             if alone:
                 size = _unpack_length(progress.view, progress.position)[0]
                 time_budget = interceptor.time_budgets.of(self.point)
-                walked = lane.process_one(
-                    *given, time_budget.fuel(progress.time, interceptor.budget, size)
-                )
+                walked = lane.process_one(*given, time_budget.fuel(progress.time, interceptor.budget, size))
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, lane, progress.time)
             return "left"

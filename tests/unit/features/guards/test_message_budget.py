@@ -87,9 +87,13 @@ class Robot:
         return moves
 
     def replaced(self, *, lost: bool) -> None:
-        kept = [(one.names, one.layout, one.base(), one.cells() or None) for one in self.monitors.kept_groups()]
+        kept = [
+            (one.names, one.layout, one.base(), one.cells() or None) for one in self.monitors.kept_groups()
+        ]
         self.monitors = self.made(self.part)
-        self.monitors.recover([] if lost else kept, {"": "power cut"} if lost else {}, self.now, restarted=True)
+        self.monitors.recover(
+            [] if lost else kept, {"": "power cut"} if lost else {}, self.now, restarted=True
+        )
 
     def reloaded(self) -> None:
         after = self.made(self.part)

@@ -22,6 +22,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import MonitorExecution
 from rosmop.run.fast_path import BatchResult
 from rosmop.tests.acting import message
 from rosmop.tests.on_module import on_module
@@ -438,4 +439,27 @@ def test_only_the_named_monitor_is_resumed() -> None:
         monitored.set.hold(monitor, "its state is lost")
     assert monitored.interceptor.resume("a") == {"/a"}
     assert [monitor.name for monitor in monitored.set.monitors if monitor.held] == ["b"]
+    monitored.close()
+
+
+def test_an_awaited_message_changes_no_other_of_its_batch_and_no_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    text = """begin s() { double sum = 0; event e(std::vector<float> r) /scan sensor_msgs/LaserScan '{ranges:r}' {
+        for (int i = 0; i < r.size(); i++) { sum += r[i]; } } }"""
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    lane = monitored.set.lane("/scan")
+    assert lane is not None
+    monkeypatch.setattr(MonitorExecution, "message", None)  # the interpreter would be much too slow
+    frames = [encode_frame(message("sensor_msgs/LaserScan", ranges=[1.0] * rays)) for rays in (500, 1, 40)]
+    for _ in range(3):
+        monitored.set.resume("s")
+        monitored.set.monitor("s").sources["/scan"].begin_again()
+        monitored.interceptor.invalidate_prepared()
+        assert not lane.ready()
+        assert monitored.through(Traffic("/scan", b"".join(frames), 3))[:2] == (3, b"".join(frames))
+        assert lane.ready()
+    monitored.interceptor.tick()
+    assert monitored.set.value("s", "sum") == 3 * 541
+    assert [row.events for row in monitored.rows()] == [9]
     monitored.close()

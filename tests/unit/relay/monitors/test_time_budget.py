@@ -25,7 +25,11 @@ def test_one_costly_message_reduces_the_budget_for_four_seconds() -> None:
     budget = TimeBudget()
     for begin in (5 * _SECOND, 13 * _SECOND, 30 * _SECOND):
         budget.cut(begin, 100)
-        assert [budget.part(begin + after, 100) for after in (0, 4 * _SECOND - 1, 4 * _SECOND)] == [0.1, 0.1, 1]
+        assert [budget.part(begin + after, 100) for after in (0, 4 * _SECOND - 1, 4 * _SECOND)] == [
+            0.1,
+            0.1,
+            1,
+        ]
 
 
 def test_shorter_messages_keep_the_whole_budget() -> None:
