@@ -103,6 +103,8 @@ SPECIFICATIONS = {
     "OTHER-HELD": "hold " + OTHER.replace("{ }", "{ return; }"),
     "ELSEWHERE": GUARD.replace("guard", "other").replace("/chatter", "/elsewhere"),
     "COSTLY": COSTLY,
+    "QUADRATIC": """a() { int n = 0; event e(std::string s) /chatter std_msgs/String '{data:s}' {
+        for (int i = 0; i < s.size(); i++) { for (int j = 0; j < 100; j++) { n = (n + i * j) % 1000; } } } }""",
     "IN-PLACE": "a() { event e(std::string s) /chatter std_msgs/String '{data:s}' { s[0] = 'X'; s[1] = 'Y'; } }",
     "LONGER": "b() { event e(std::string s) /chatter std_msgs/String '{data:s}' { s += \"more\"; } }",
     "LAST": "c() { event e(std::string s) /chatter std_msgs/String '{data:s}' { return; } }",
