@@ -333,9 +333,9 @@ LIMITED_TOPIC = QuotaRow(
 RELAY_MESSAGE = QuotaRow(
     thing="microseconds of processor time that monitors take for one message, request or reply",
     bounds=Bounds(whole=10_000, host=10_000, unknown=0, kept=0),
-    at_limit="the monitor is stopped with a fault (`on_fault` decides whether the message is dropped; it passes if it is"
-    " only observed); for 4 s, up to 16 s if it happens again, messages of that publication of at least half the size have"
-    " a tenth of the time",
+    at_limit="the monitor is stopped with a fault (`on_fault` decides whether the message is dropped; it passes if it"
+    " is only observed); for 4 s, up to 16 s if it happens again, messages of that publication of at least half the"
+    " size have a tenth of the time",
     between="other messages of the host wait for its next turn",
     counting="all hosts that no rule or only `*` names count as one publication",
     alarm="`monitor fault`",

@@ -114,7 +114,7 @@ class ActionState:
             self.least, self.spent = INSTRUCTIONS_PER_SECOND * self.seconds * self.part, 0
 
     def late(self, more: int = 0) -> bool:
-        """Whether the time is over, or will be after so many more instructions."""
+        """Whether the time is over, or will be after `more` instructions."""
         if self.clock is None or self.spent + more < self.least:
             return False
         return self.clock() + more * _AT_ONCE > self.until

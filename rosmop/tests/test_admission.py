@@ -4,14 +4,17 @@ The acts around the messages are random: two sets take the same ones, and one ha
 """
 
 from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from random import Random
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import NO_NUMBER, SEQ, MessageSender
+from rosmop.run.outcomes import SEQ, MessageSender
 from rosmop.tests.acting import definitions, message
 from rosmop.tests.both_ways import state_of
 from rosmop.tests.interpreted import beside, check_same
@@ -41,105 +44,93 @@ SPECIFICATIONS = {
 }  # fmt: skip
 
 
-class Pair:
-    """The same monitors with and without a module."""
+def sets_of(compiled: Compiled, *, shadows: bool) -> list[MonitorSet]:
+    """Return the same monitors with and without a module."""
+    tried = ["steps"] if shadows else []
+    module = on_module(compiled, shadows=tried)
+    plain = MonitorSet.of(compiled, shadows=tried) if shadows else beside(module)
+    for one in (module, plain):
+        one.name_senders(lambda source: (f"10.0.0.{source}", f"/node{source}"))
+    return [module, plain]
 
-    def __init__(self, shadows: bool) -> None:
-        self.compiled = compiled_from(SPECIFICATIONS, definitions())
-        self.shadows = ["steps"] if shadows else []
-        self.sets: list[MonitorSet] = self.made()
-        for one in self.sets:
-            one.start(0)
-        self.now = 0
-        self.came: Counter[str] = Counter()
 
-    def made(self) -> list[MonitorSet]:
-        module = on_module(self.compiled, shadows=self.shadows)
-        plain = MonitorSet.of(self.compiled, shadows=self.shadows) if self.shadows else beside(module)
-        for one in (module, plain):
-            one.name_senders(lambda source: (f"10.0.0.{source}", f"/node{source}"))
-        return [module, plain]
+def tell(
+    sets: list[MonitorSet], topic: str, data: bytes, now: int, sender: MessageSender, *, judged: bool
+) -> str:
+    outcomes = [(one.judge if judged else one.process)(topic, bytearray(data), now, sender) for one in sets]
+    check_same(*outcomes)
+    copies = [[*one.tapped] for one in sets]
+    for one in sets:
+        one.tapped.clear()
+    assert [copy[1:] for copy in copies[0]] == [copy[1:] for copy in copies[1]]
+    for mine, other in zip(*copies, strict=True):
+        check_same(mine.give(sender), other.give(sender))
+    return outcomes[0].reason or ("fault" if outcomes[0].faults else outcomes[0].result)
 
-    def tell(self, topic: str, data: bytes, source: int, *, judged: bool) -> None:
-        sender = MessageSender(source, 0, SEQ if topic == "/scan" else NO_NUMBER)
-        outcomes = [
-            (one.judge if judged else one.process)(topic, bytearray(data), self.now, sender)
-            for one in self.sets
-        ]
-        self.came[outcomes[0].reason or outcomes[0].result if not outcomes[0].faults else "fault"] += 1
-        check_same(*outcomes)
-        copies = [[*one.tapped] for one in self.sets]
-        for one in self.sets:
-            one.tapped.clear()
-        assert [copy[1:] for copy in copies[0]] == [copy[1:] for copy in copies[1]]
-        for mine, other in zip(*copies, strict=True):
-            check_same(mine.give(sender), other.give(sender))
 
-    def check(self) -> None:
-        module, plain = ([*one.monitors, *one.shadowed] for one in self.sets)
-        for mine, other in zip(module, plain, strict=True):
-            told = [
-                (
-                    one.seen, one.held, one.broken, one.faults, one.enabled, one.awaits, one.starting, one.blocks,
-                    [(timer.due, timer.ticked) for timer in one.timers],
-                    [(vars_of(source)) for source in one.sources.values()],
-                )
-                for one in (mine, other)
-            ]  # fmt: skip
-            assert told[0] == told[1]
-        assert state_of(self.sets[0]) == state_of(self.sets[1])
-        assert self.sets[0].next_due == self.sets[1].next_due
+def check(sets: list[MonitorSet]) -> None:
+    module, plain = ([*one.monitors, *one.shadowed] for one in sets)
+    for pair in zip(module, plain, strict=True):
+        mine, other = (
+            (
+                one.seen, one.held, one.broken, one.faults, one.enabled, one.awaits, one.starting, one.blocks,
+                [(timer.due, timer.ticked) for timer in one.timers],
+                [(vars_of(source)) for source in one.sources.values()],
+            )
+            for one in pair
+        )  # fmt: skip
+        assert mine == other
+    assert state_of(sets[0]) == state_of(sets[1])
+    assert sets[0].next_due == sets[1].next_due
 
 
 def vars_of(source: object) -> list[object]:
     return [getattr(source, name) for name in ("first", "unreadable", "waits", "speakers", "known")]
 
 
-def act(pair: Pair, choice: Random) -> None:
+def act(sets: list[MonitorSet], made: Callable[[], list[MonitorSet]], now: int, choice: Random) -> str:
+    """Do something to both sets; return what became of a message."""
     name = choice.choice(["begins", "speakers", "holds"])
-    which = choice.randrange(12)
-    pair.now += choice.choice([0, 1, 10**7, 10**8])
+    which, judged = choice.randrange(12), choice.random() < 0.5
     if which < 5:
         ranges = [choice.choice([0.5, 2.0, 9.0]) for _ in range(choice.randrange(6))]
         data = message("sensor_msgs/LaserScan", ranges=ranges) if choice.random() < 0.9 else b"\1\2\3"
-        pair.tell("/scan", data, choice.choice([1, 1, 1, 2, 3]), judged=choice.random() < 0.5)
-    elif which < 8:
+        sender = MessageSender(choice.choice([1, 1, 1, 2, 3]), 0, SEQ)
+        return tell(sets, "/scan", data, now, sender, judged=judged)
+    if which < 8:
         data = message("geometry_msgs/Twist", linear__x=choice.choice([0.0, 0.5, 2.0, 4.0]))
-        pair.tell("/cmd_vel", data, 4, judged=choice.random() < 0.5)
-    elif which == 8:
-        for one in pair.sets:
+        return tell(sets, "/cmd_vel", data, now, MessageSender(4), judged=judged)
+    enabled, how = choice.random() < 0.6, choice.randrange(3)
+    after = made() if which == 11 else sets
+    for place, one in enumerate([*sets]):
+        if which == 8:
             one.hold(one.monitor(name), "test")
-    elif which == 9:
-        for one in pair.sets:
+        elif which == 9:
             one.resume(name)
-    elif which == 10:
-        enabled = choice.random() < 0.6
-        for one in pair.sets:
-            one.switch({name: enabled}, pair.now)
+        elif which == 10:
+            one.switch({name: enabled}, now)
             one.take_restarted()
-    else:
-        kept = [
-            [(group.names, group.layout, group.base(), group.cells() or None) for group in one.kept_groups()]
-            for one in pair.sets
-        ]
-        before, pair.sets = pair.sets, pair.made()
-        how = choice.randrange(3)
-        for one, old, state in zip(pair.sets, before, kept, strict=True):
-            if how == 0:
-                one.succeed(old, pair.now)
-            else:
-                one.recover(
-                    state if how == 1 else [], {} if how == 1 else {"": "lost"}, pair.now, restarted=True
-                )
+        elif how == 0:
+            after[place].succeed(one, now)
+        else:
+            groups = one.kept_groups() if how == 1 else []
+            kept = [(group.names, group.layout, group.base(), group.cells() or None) for group in groups]
+            after[place].recover(kept, {} if kept else {"": "lost"}, now, restarted=True)
+    sets[:] = after
+    return ""
 
 
 def run(seed: int, *, shadows: bool) -> Counter[str]:
-    choice = Random(seed)  # noqa: S311  draws examples, not keys
-    pair = Pair(shadows)
+    choice, now, came = Random(seed), 0, Counter[str]()  # noqa: S311  draws examples, not keys
+    made = partial(sets_of, compiled_from(SPECIFICATIONS, definitions()), shadows=shadows)
+    sets = made()
+    for one in sets:
+        one.start(0)
     for _ in range(40):
-        act(pair, choice)
-        pair.check()
-    return pair.came
+        now += choice.choice([0, 1, 10**7, 10**8])
+        came[act(sets, made, now, choice)] += 1
+        check(sets)
+    return came
 
 
 @settings(max_examples=15, deadline=None)

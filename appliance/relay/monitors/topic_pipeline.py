@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _unpack_length = struct.Struct("<I").unpack_from
 _NEVER = 1 << 63
 _UNPREPARED = -1
+_LIGHT = 512  # bytes of a message over whose elements the engine loops as fast as the module is called
 
 
 class TopicPipeline:
@@ -116,7 +117,8 @@ class TopicPipeline:
             elif lane is None:
                 self._one_by_one(monitors, progress, batch.messages)
             elif (tried := self._walk(monitors, lane, progress)) is not None:
-                self._one_by_one(monitors, progress, progress.turns() if lane.brief else 1, tried)
+                light = lane.brief or _unpack_length(progress.view, progress.position)[0] <= _LIGHT
+                self._one_by_one(monitors, progress, progress.turns() if light else 1, tried)
         interceptor.schedule()
         return progress.result()
 

@@ -49,6 +49,6 @@ def test_each_row_is_attacked_by_a_test_that_exists() -> None:
 
 def test_the_reduction_of_a_message_over_budget_is_that_of_the_relay() -> None:
     budget = TimeBudget()
-    budget.cut(0)
-    seconds = next(second for second in range(60) if budget.part(second * 10**9) == 1)
+    budget.cut(0, 1)
+    seconds = next(second for second in range(60) if budget.part(second * 10**9, 1) == 1)
     assert f"for {seconds} s, up to" in RELAY_MESSAGE.at_limit
