@@ -91,6 +91,8 @@ def _system(status: Status) -> Iterator[_Condition]:
         yield "alarm", "probe", "system", text
     if status.firewall.hold_lapsed:
         yield "alarm", "hold-lapsed", "system", status.firewall.hold_lapsed
+    if status.firewall.removed:
+        yield "alarm", "rules-removed", "system", status.firewall.removed
     relay = no_relay(status.relay)
     if relay is not None:
         yield "alarm", "relay", "system", f"{relay}, until it is back"

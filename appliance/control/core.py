@@ -93,6 +93,10 @@ class Links:
         """Finish work before an ordered end of the appliance."""
         self._lifeline.before_end(work)
 
+    def after_removal(self, work: Callable[[], None]) -> None:
+        """Call `work` when rules of the firewall are in force again that another program had removed."""
+        self._lifeline.after_removal.append(work)
+
     def processes(self) -> list[ProcessInfo]:
         return self._lifeline.surroundings.processes
 

@@ -7,6 +7,7 @@ from collections.abc import Coroutine
 import structlog
 
 from appliance.base.actors import DISK
+from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.admin import PolicyReload
 from appliance.channel.answers.status import ProcessInfo
@@ -40,6 +41,19 @@ def record_death(trail: AuditTrail, death: messages.ProcessDied) -> None:
     )
 
 
+def record_removal(trail: AuditTrail, message: messages.RulesRestored) -> None:
+    span = f"{'' if message.reported else 'at most '}{message.seconds:g} s"
+    trail.happened(
+        "firewall restored",
+        f"{message.by or 'another program'} removed {counted(len(message.rules), 'rule')} of the firewall, which are in"
+        f" force again after {span}; {counted(message.connections, 'connection')} of that time ended",
+        seconds=message.seconds,
+        by=message.by or None,
+        rules=message.rules,
+        connections=message.connections,
+    )
+
+
 class SupervisorMessages:
     """Passes the supervisor's links and reports to the parts of control."""
 
@@ -51,7 +65,7 @@ class SupervisorMessages:
         self._one_reload = asyncio.Lock()
         self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
 
-    def heard(self, message: object, descriptors: tuple[int, ...]) -> None:
+    def heard(self, message: object, descriptors: tuple[int, ...]) -> None:  # noqa: PLR0912  a case for each message
         match message:
             case messages.LinkOpened(role, index):
                 self._link(role, index, socket.socket(fileno=descriptors[0]))
@@ -72,6 +86,10 @@ class SupervisorMessages:
                 _log.info("addresses of the robot's machine", addresses=addresses)
                 self._parts.endpoints.addresses.forget_routes()
                 self._base.policies.hosts_changed()
+            case messages.RulesRestored():
+                record_removal(self._base.trail, message)
+                for work in self._base.lifeline.after_removal:
+                    work()
             case messages.ProbeFailed(reason):
                 self._base.listener_limits.probed(reason)
             case messages.ProbePassed():

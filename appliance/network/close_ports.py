@@ -184,6 +184,11 @@ def is_applied() -> bool:
     return f"table inet {TABLE}" in _nft(["list", "tables"], "").splitlines()
 
 
+def applied() -> str:
+    """Return the rules that are in force, as text for `nft -f`; empty without any. Raises `NetworkError`."""
+    return _nft(["-s", "list", "table", "inet", TABLE], "") if is_applied() else ""
+
+
 def _service(text: str) -> OpenService:
     found = _SERVICE.fullmatch(text)
     try:

@@ -22,14 +22,15 @@ import os
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from functools import partial
 from typing import NamedTuple
 
 from appliance.network.hang_detection import run_program
-from appliance.network.listening_sockets import TcpSocket, tcp_sockets
+from appliance.network.listening_sockets import TcpSocket, tcp_inodes, tcp_sockets
+from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import Namespace, NetworkError
-from appliance.network.socket_owners import SocketOwner, owners_of
+from appliance.network.socket_owners import NodeSockets, SocketOwner, is_node, owners_of
 
 REFUSED_SECONDS = 60
 _TABLE, _CLOSED = "inet rosrv-cut", "inet rosrv-closed"
@@ -40,6 +41,7 @@ _ANY_STATE, _NO_COOKIE = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF
 _HEAD = struct.Struct("=IHHII")  # struct nlmsghdr
 _ERROR = struct.Struct("=i")
 _SECONDS = 2.0
+_NO_INODE = "0"  # of a connection that its process has not accepted yet
 _GONE = (errno.ENOENT, errno.ECONNREFUSED)  # it ended before its removal
 
 
@@ -53,7 +55,7 @@ class RemotePort(NamedTuple):
 def end_connections(
     namespace: Namespace, wanted: Callable[[TcpSocket], bool], *, lasting: float = 0.0
 ) -> int:
-    """End the established connections that `wanted` selects; return their number. Raises `NetworkError`.
+    """End the connections that `wanted` selects, also half-open ones; return their number. Raises `NetworkError`.
 
     A connection that its ends close within `lasting` seconds is left alone, so that a call under way gets its answer.
     """
@@ -111,6 +113,84 @@ def refuse_no_port(namespace: Namespace) -> None:
     run_nft(namespace, f"add table {_TABLE}\ndelete table {_TABLE}\n")
 
 
+class DisturbedConnections:
+    """The connections of a machine that a removal of its rules has disturbed: those that began without the rules, and
+    those that the translation no longer carried.
+
+    Sockets have no time, so connections are compared with those of the last look but one: the last may have come after
+    the removal. A connection of a node that began since then is ended with them, and its node connects again.
+    """
+
+    def __init__(self, machine: Namespace, inside: Namespace, link: str) -> None:
+        self._machine, self._inside, self._link = machine, inside, link
+        self._before = self._last = frozenset[str]()
+
+    def remember(self) -> None:
+        self._before, self._last = self._last, self._machine.run(tcp_inodes) - {_NO_INODE}
+
+    def end(
+        self, forwarded: Collection[int], master: int | None, near: Collection[str], nodes: Collection[str]
+    ) -> int:
+        """End these; return the number of connections that began. Raises `NetworkError`.
+
+        1. Between nodes and other machines, if they began since. `nodes` has keys of nodes (`is_node`).
+        2. Of other machines, to a program of this one on a `forwarded` port.
+        3. To the robot's own `master`: its callers, also of this machine, shall find RVMaster.
+        4. From this machine to the appliance (`near`), if the appliance has lost its end: a rospy subscriber would wait
+           for ever.
+        """
+        sockets, own = self._machine.run(tcp_sockets), {*self._machine.run(machine_addresses), *near}
+        listening = {one.port for one in sockets if one.listens}
+        inside = {(one.port, one.peer_port) for one in self._inside.run(tcp_sockets)}
+
+        def is_foreign(one: TcpSocket) -> bool:
+            peer = one.peer_address
+            return not (peer in own or peer == one.local_address or ipaddress.ip_address(peer).is_loopback)
+
+        alive = [one for one in sockets if one.established or one.half_open]
+        foreign = {one for one in alive if is_foreign(one)}
+        begun = _of_nodes([one for one in foreign if one.inode not in self._before], sockets, nodes)
+        reached = {
+            one for one in alive if one.port in listening
+            and (one.peer_address not in near if one.port == master else one.port in forwarded and one in foreign)
+        }  # fmt: skip
+        lost = {
+            one for one in alive if one not in foreign and one.port not in listening
+            and one.peer_port in {*forwarded, master} and (one.peer_port, one.port) not in inside
+        }  # fmt: skip
+        callees = {
+            RemotePort(one.peer_address, one.peer_port) for one in begun
+            if one.port not in listening and ipaddress.ip_address(one.peer_address).version == 4
+        }  # fmt: skip
+        if callees:  # rospy would connect again
+            refuse_ports(self._machine, self._link, (), callees)
+        chosen = {one[:5]: one in foreign for one in {*begun, *reached, *lost}}
+        end_connections(self._machine, lambda one: one[:5] in chosen)
+        return sum(chosen.values())
+
+
+def _of_nodes(
+    connections: Collection[TcpSocket], sockets: Iterable[TcpSocket], known: Collection[str]
+) -> list[TcpSocket]:
+    """Return those of processes that look like nodes and listen on a port, as every node does.
+
+    A half-open one belongs to no process yet; it is returned if its port is a node's.
+    """
+    if not connections:
+        return []
+    listeners = [one for one in sockets if one.listens]
+    owners = owners_of(one.inode for one in (*connections, *listeners))
+    ports = {one.port: owners[one.inode].pid for one in listeners if one.inode in owners}
+
+    def pid(one: TcpSocket) -> int:
+        owner = owners.get(one.inode)
+        return ports.get(one.port, 0) if owner is None else owner.pid
+
+    found = {pid(one) for one in connections}.intersection(ports.values())
+    nodes = {one for one in found if is_node(NodeSockets(one, frozenset(), ""), known)}
+    return [one for one in connections if pid(one) in nodes]
+
+
 def close_port(namespace: Namespace, link: str, port: int) -> None:
     """Refuse new connections to a port of the namespace until `open_port`, unless they come from `link`."""
     lines = [
@@ -139,11 +219,11 @@ def run_nft(namespace: Namespace, text: str) -> None:
 
 
 def _end(wanted: Callable[[TcpSocket], bool], lasting: float) -> int:
-    chosen = [one for one in tcp_sockets() if one.established and wanted(one)]
+    chosen = [one for one in tcp_sockets() if (one.established or one.half_open) and wanted(one)]
     if chosen and lasting:
         threading.Event().wait(lasting)
-        still = {one.inode for one in tcp_sockets() if one.established}
-        chosen = [one for one in chosen if one.inode in still]
+        still = {one[:5] for one in tcp_sockets() if one.established or one.half_open}
+        chosen = [one for one in chosen if one[:5] in still]
     owners = owners_of(one.inode for one in chosen)
     left = [one for one in chosen if not _shut_down(one, owners.get(one.inode))]
     if not left:

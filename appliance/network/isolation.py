@@ -8,6 +8,8 @@
 3. Every change is recorded before it is made, so that `down`, or `up` after a crash, undoes it. A namespace or an
    interface of the same name without a record is an error.
 4. The lock of the appliance ends with its process, so a record without a lock is left from a crash.
+5. While rules were gone, other machines could reach the robot's own master. Once they are back, connections of that
+   time are ended, and none goes on: a rule drops packets to that master, also those of a connection that has begun.
 """
 
 import contextlib
@@ -15,17 +17,20 @@ import fcntl
 import ipaddress
 import itertools
 import json
+import math
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.status import FirewallRule
-from appliance.network import conntrack, interfaces, vendor_masters
-from appliance.network.cut import close_port, open_port, refuse_no_port
+from appliance.network import close_ports, conntrack, interfaces, vendor_masters
+from appliance.network.cut import DisturbedConnections, close_port, open_port, refuse_no_port, run_nft
 from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.firewall_rules import (
@@ -38,7 +43,8 @@ from appliance.network.firewall.firewall_rules import (
     PortRange,
     family_of,
 )
-from appliance.network.firewall.nft import NftBackend
+from appliance.network.firewall.nft import TABLE, NftBackend
+from appliance.network.firewall.rule_watch import RuleWatch
 from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
 from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
@@ -66,6 +72,7 @@ class IsolationSettings:
     holds: Callable[[], bool] = lambda: False  # whether nodes must not reach that master, even after a crash
     wants: Callable[[], bool] = lambda: False  # whether the graph of that master is to be taken over
     left_alone: Callable[[], tuple[str, ...]] = tuple  # control groups of the robot's own masters
+    nodes: Callable[[], tuple[str, ...]] = tuple  # keys of processes that were connected to a master
 
     def __post_init__(self) -> None:
         if not self.ports:
@@ -144,8 +151,13 @@ class Isolation:
         self._udp: tuple[PortRange, ...] = ()
         self._tcp: tuple[PortRange, ...] = ()
         self._serves_nodes = False
+        self._turn = threading.Lock()  # so that no rule is restored during a change, or after the removal
+        self.removed_at = -math.inf
+        self.installed_at = -math.inf
         self._routers: tuple[Family, ...] = ()
         self._forwarding = _IpForwarding(host)
+        self._disturbed = DisturbedConnections(host, self.namespace, settings.link)
+        self._protection = ""  # the rules of `rosrv protect` on this machine
         self._lock: int | None = None
 
     def up(self) -> None:
@@ -169,14 +181,16 @@ class Isolation:
     def down(self) -> None:
         if self._lock is None:
             return
+        with self._turn:
+            rules, self._rules = self._rules, ()
         try:
             self._close_master()
             self._clear_leftovers()
-            if self._rules:
+            if rules:
                 self._forget_tunnels()
         finally:
             self.ends.clear()
-            self._rules = ()
+            self.removed_at = -math.inf
             self._udp = self._tcp = ()
             self._serves_nodes = False
             os.close(self._lock)
@@ -272,6 +286,7 @@ class Isolation:
         """End what `forward_master` began: the port is again that of the robot's own master."""
         if self._serves_nodes:
             self._serves_nodes = False
+            self.removed_at = -math.inf
             self._install(self._wanted())
 
     def _own_master(self) -> tuple[PortRange, ...]:
@@ -282,22 +297,61 @@ class Isolation:
     def _wanted(self) -> tuple[PacketRule, ...]:
         master = (PortRange.one(self.settings.master),) if self.settings.master and self._serves_nodes else ()
         return isolation_rules(
-            self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp, master=master
-        )
+            self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp, master=master,
+            restored=self.removed_at > -math.inf,
+        )  # fmt: skip
 
-    def put_rules_back(self) -> None:
-        if self._rules:
-            self._install(self._rules)
+    def watch_rules(self) -> RuleWatch:
+        return RuleWatch(self._host, frozenset({TABLE, close_ports.TABLE}))
+
+    def put_rules_back(self) -> list[str]:
+        """Install the rules again if the kernel lacks some; return the purposes of these. Raises `NetworkError`.
+
+        If those of `rosrv protect` went with them, no operator meant that: they come back as well.
+        """
+        with self._turn:
+            missing = [rule.purpose for rule in self.rules() if not rule.in_force]
+            if missing:
+                self.removed_at = clock.now()
+                self._put(self._wanted())
+            protection = self._host.run(close_ports.applied) if self._rules else ""
+            if missing and self._protection and not protection:
+                run_nft(self._host, self._protection)
+                missing.append("rosrv protect")
+            else:
+                self._protection = protection
+        if missing:
+            self._forget_tunnels()
+        return missing
+
+    def remember_connections(self) -> None:
+        """Note the connections that exist while the rules are in force; call this each second."""
+        self._disturbed.remember()
+
+    def end_connections(self) -> int:
+        """End what a removal of the rules has disturbed; return the number of connections that began in that time.
+
+        Raises `NetworkError`.
+        """
+        spans = (*self.settings.ports, *self._tcp)
+        forwarded = {port for span in spans for port in range(span.first, span.last + 1)}
+        master = self.settings.master if self._serves_nodes else None
+        near = [end.appliance for end in self.ends.values()]
+        return self._disturbed.end(forwarded, master, near, self.settings.nodes())
 
     def rules(self) -> tuple[FirewallRule, ...]:
         return statuses(self._rules, self._backend.counters())
 
     def _install(self, rules: tuple[PacketRule, ...]) -> None:
+        with self._turn:
+            self._put(rules)
+        self._forget_tunnels()
+
+    def _put(self, rules: tuple[PacketRule, ...]) -> None:
         self._backend.install(rules)
-        self._rules = rules
+        self._rules, self.installed_at = rules, clock.now()
         if self.settings.takes_over():
             vendor_masters.leave_alone(self._host, self.settings.left_alone())
-        self._forget_tunnels()
 
     def _forget_tunnels(self) -> None:
         conntrack.forget(self._host, [port.first for port in _TUNNELS])
@@ -414,7 +468,9 @@ def isolation_rules(
     tcp: tuple[PortRange, ...] = (),
     udp: tuple[PortRange, ...] = (),
     master: tuple[PortRange, ...] = (),
+    restored: bool = False,
 ) -> tuple[PacketRule, ...]:
+    """Return the rules; `restored`: other machines may have begun connections to the robot's own master."""
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
     forwarded = partial(PacketRule, chain=Chain.FORWARD)
     leaving = partial(PacketRule, chain=Chain.LEAVING, leaves_on=inward)
@@ -441,6 +497,16 @@ def isolation_rules(
         ),
         leaving("the host's own packets: full TTL", PacketVerdict.FULL_HOPS, forwarded=False),
     ]
+    to_master = partial(PacketRule, chain=Chain.IN)
+    for ports in master if restored else ():
+        rules += [
+            to_master(
+                "own master: this machine may", PacketVerdict.RETURN, arrives_on=LOOPBACK, tcp_ports=ports
+            ),
+            to_master(
+                "own master: no other machine", PacketVerdict.DROP, arrives_on=outward, tcp_ports=ports
+            ),
+        ]
     for family, end in ends.items():
         if family not in routers:
             no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)

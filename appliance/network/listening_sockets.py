@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-_TCP_ESTABLISHED, _TCP_LISTEN = "01", "0A"
+_TCP_ESTABLISHED, _TCP_SYN_RECV, _TCP_LISTEN = "01", "03", "0A"
 
 
 def listening_addresses(port: int) -> tuple[str, ...]:
@@ -21,12 +21,20 @@ def listening_inodes(port: int) -> set[str]:
     return {row.inode for row in _listeners() if row.port == port}
 
 
+def tcp_inodes() -> frozenset[str]:
+    """Return the inodes of TCP sockets that a process has; cheap enough for each second."""
+    return frozenset(row.inode for row in _rows("tcp", "tcp6"))
+
+
 def udp_ports_in_use() -> set[int]:
     return {row.port for row in _rows("udp", "udp6")}
 
 
 class TcpSocket(NamedTuple):
-    """A TCP socket. `version` is that of its family, so a socket for both has an IPv4 address mapped into IPv6."""
+    """A TCP socket. `version` is that of its family, so a socket for both has an IPv4 address mapped into IPv6.
+
+    `half_open`: the peer has still to answer our SYN-ACK.
+    """
 
     version: int
     address: str
@@ -36,6 +44,7 @@ class TcpSocket(NamedTuple):
     listens: bool
     established: bool
     inode: str
+    half_open: bool = False
 
     @property
     def peer_address(self) -> str:
@@ -51,7 +60,7 @@ def tcp_sockets() -> list[TcpSocket]:
     return [
         TcpSocket(
             6 if name == "tcp6" else 4, _address(row.address), row.port, _address(peer), int(peer_port, 16),
-            row.state == _TCP_LISTEN, row.state == _TCP_ESTABLISHED, row.inode,
+            row.state == _TCP_LISTEN, row.state == _TCP_ESTABLISHED, row.inode, row.state == _TCP_SYN_RECV,
         )
         for name in ("tcp", "tcp6")
         for row in _rows(name)

@@ -5,7 +5,7 @@ All calls block, the probe for seconds, so a running supervisor makes them in a 
 1. No process starts before the firewall is in force.
 2. A hidden port counts as open if another local user can reach it, or if it cannot be probed.
 3. Missing rules are installed again and logged, but none after `remove`: it waits for a running call; later calls
-   fail.
+   fail. `restore` waits for no other work, and does nothing after `remove`.
 """
 
 import contextlib
@@ -13,11 +13,12 @@ import ipaddress
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.channel.answers.status import FirewallState
 from appliance.channel.rosout_address import ADDRESS as OWN_NODE_ADDRESS
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
@@ -35,6 +36,7 @@ from appliance.network.firewall.firewall_rules import (
     PeerAccess,
     PortRange,
 )
+from appliance.network.firewall.rule_watch import RuleWatch
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import (
     Namespace,
@@ -72,6 +74,13 @@ class AppliancePorts:
     own: int | None = None  # the port of the own node's master
     peer: PeerAccess | None = None  # on one of two appliances
     receivers: tuple[tuple[str, RemoteReceiver], ...] = ()  # of features' roles, by user
+
+
+class RestoredRules(NamedTuple):
+    """The purposes of rules that were missing, and the time at which all were in force."""
+
+    rules: list[str]
+    at: float
 
 
 class NoIsolation:
@@ -133,6 +142,24 @@ class NoIsolation:
     def carry_out(self, work: MachineWork, name: str, terms: Terms) -> Found:  # noqa: ARG002  the same everywhere
         """Carry out a feature's work on the robot's side of the isolation. Raises `NetworkError`, `ValueError`."""
         raise NetworkError(f"isolation {self.kind} has no robot's side: use isolation netns")
+
+    def watch_rules(self) -> list[RuleWatch]:
+        """Return watches of the namespaces that have rules. Raises `OSError`."""
+        return []
+
+    def restore(self) -> RestoredRules:
+        """Install rules again that another program removed. Raises `NetworkError`."""
+        return RestoredRules([], clock.now())
+
+    def remember_connections(self) -> None:
+        """Note the connections that exist while the rules are in force."""
+
+    def end_connections(self) -> int:
+        """End what a removal of the rules has disturbed; return the number of connections that began in that time.
+
+        Raises `NetworkError`.
+        """
+        return 0
 
     def report(self) -> FirewallState:
         return FirewallState()
@@ -299,6 +326,12 @@ class ContainerIsolation(NoIsolation):
             return replace(found, reason=reason)
         return found
 
+    def watch_rules(self) -> list[RuleWatch]:
+        return [RuleWatch(self._namespace)]
+
+    def restore(self) -> RestoredRules:
+        return RestoredRules([] if self.firewall is None else self.firewall.restore(), clock.now())
+
     def report(self) -> FirewallState:
         with self._standing():
             if self.firewall is None:
@@ -418,6 +451,7 @@ class NetnsIsolation(ContainerIsolation):
                 holds=work.holds,
                 wants=work.wants,
                 left_alone=work.left_alone,
+                nodes=work.nodes,
             ),
         )
         self._namespace = self._isolation.namespace
@@ -506,15 +540,26 @@ class NetnsIsolation(ContainerIsolation):
     def endpoint(self) -> PublicAddress:
         return self._isolation.endpoint()
 
+    def watch_rules(self) -> list[RuleWatch]:
+        return [self._isolation.watch_rules(), *super().watch_rules()]
+
+    def restore(self) -> RestoredRules:
+        there = self._isolation.put_rules_back()
+        here, at = super().restore()
+        return RestoredRules([*there, *here], self._isolation.installed_at if there and not here else at)
+
+    def remember_connections(self) -> None:
+        self._isolation.remember_connections()
+
+    def end_connections(self) -> int:
+        return self._isolation.end_connections()
+
     def report(self) -> FirewallState:
         with self._standing():
-            rules = self._isolation.rules()
-            gone = [rule.purpose for rule in rules if not rule.in_force]
+            gone = self._isolation.put_rules_back()
             if gone:
-                self._require_standing()
                 log.critical("rules on the host were missing and are installed again", rules=gone)
-                self._isolation.put_rules_back()
-                rules = self._isolation.rules()
+            rules = self._isolation.rules()
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:

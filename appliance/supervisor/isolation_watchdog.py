@@ -2,20 +2,28 @@
 
 Each call runs in a daemon thread, so a call that hangs does not keep the appliance from ending. Every exception
 becomes a finding, so an outdated good finding never hides a failure.
+
+The kernel reports each change of rules in nftables (`watch`); they are restored at once, without waiting for other
+work. The regular checks find what it does not report. Then connections that began without the rules are ended, more
+than once: a peer may be late.
 """
 
 import asyncio
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
+import msgspec
 import structlog
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState
+from appliance.network.firewall.rule_watch import RuleWatch
 from appliance.network.namespaces import NetworkError
 from appliance.network.port_holders import PortsInUseError
 from appliance.supervisor import signals
@@ -25,6 +33,10 @@ from appliance.supervisor.machine_work import MachineWork, Terms
 PROBE_SECONDS = 60.0
 FORMER_SECONDS = 10.0
 """For so long, another machine cannot use a former address of this one: control may still count it as the robot's."""
+REMOVED_SECONDS = 3600.0
+"""For so long, the state shows that another program had removed rules."""
+_REMEMBER_SECONDS = 1.0
+_LATER_SECONDS = (0.5, 2.0)
 _ROUTES_AT_ONCE = 4
 
 T = TypeVar("T")
@@ -33,17 +45,19 @@ log = structlog.get_logger()
 
 
 class IsolationWatchdog:
-    """Checks the isolation; `tell` sends a message to control."""
+    """Checks the isolation; `tell` sends a message to control, `record` also to one that starts later."""
 
     def __init__(
         self,
         isolation: NoIsolation,
         tell: Callable[[messages.Message], None],
+        record: Callable[[messages.RulesRestored], None] | None = None,
         *,
         every: float = PROBE_SECONDS,
     ) -> None:
         self.isolation = isolation
         self._tell = tell
+        self._record = record or tell
         self._every = every
         self._one_at_a_time = asyncio.Lock()
         self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # route queries change nothing
@@ -52,9 +66,21 @@ class IsolationWatchdog:
         self._taking_machine = False
         self._told_machine_at = -math.inf
         self._report = messages.FirewallReported(isolation=isolation.kind, report=FirewallState())
+        self._changed = asyncio.Event()
+        self._changes: list[tuple[float, str]] = []  # the times of changes, and their programs
+        self._intact_at = clock.now()
+        self._removed = -math.inf, ""
+        self._ending: set[asyncio.Task[None]] = set()
 
     def news(self) -> list[messages.Message]:
         return [self._report] if self._probe is None else [self._report, self._probe]
+
+    def _reported(self, report: FirewallState) -> messages.FirewallReported:
+        at, removed = self._removed
+        shown = removed if clock.now() - at < REMOVED_SECONDS else None
+        report = msgspec.structs.replace(report, removed=shown)
+        self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
+        return self._report
 
     def machine(self) -> messages.MachineAddresses:
         return messages.MachineAddresses(list(self._machine))
@@ -125,8 +151,7 @@ class IsolationWatchdog:
                 report = await in_thread(self.isolation.report)
         except Exception as error:  # noqa: BLE001  see the invariant
             return messages.TunnelsEnclosed(None, _words(error))
-        self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
-        self._tell(self._report)
+        self._tell(self._reported(report))
         log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
         return messages.TunnelsEnclosed(esp)
 
@@ -138,8 +163,7 @@ class IsolationWatchdog:
                 report = await in_thread(self.isolation.report)
         except Exception as error:  # noqa: BLE001  see the invariant
             return _words(error)
-        self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
-        self._tell(self._report)
+        self._tell(self._reported(report))
         return ""
 
     async def carry_out(
@@ -180,10 +204,91 @@ class IsolationWatchdog:
             await asyncio.sleep(self._every)
             await self.look()
 
+    async def watch(self) -> None:
+        """Restore rules as soon as the kernel reports that they have changed."""
+        try:
+            watches = await in_thread(self.isolation.watch_rules)
+        except Exception as error:  # noqa: BLE001  see the invariant
+            log.error("changes of the rules are found by the regular checks only", error=_words(error))
+            return
+        if not watches:
+            return
+        loop = asyncio.get_running_loop()
+        for one in watches:
+            loop.add_reader(one.fileno(), self._hear, one)
+        try:
+            while True:
+                try:
+                    async with asyncio.timeout(_REMEMBER_SECONDS):
+                        await self._changed.wait()
+                except TimeoutError:
+                    await self._remember()
+                else:
+                    self._changed.clear()
+                    await self._restore()
+        finally:
+            for one in watches:
+                loop.remove_reader(one.fileno())
+                one.close()
+
+    def _hear(self, watch: RuleWatch) -> None:
+        if programs := watch.changes():
+            self._changes.append((clock.now(), programs[-1]))
+            self._changed.set()
+
+    async def _remember(self) -> None:
+        if not self._ending:  # else a late connection would count as one of before
+            with suppress(Exception):  # those of the last second are known
+                await in_thread(self.isolation.remember_connections)
+
+    async def _restore(self) -> None:
+        """Install rules again that another program removed, and end the connections that began in the meantime."""
+        changes, self._changes = self._changes, []
+        try:
+            missing, restored_at = await in_thread(self.isolation.restore)
+        except Exception as error:  # noqa: BLE001  see the invariant
+            self._changes = changes + self._changes
+            self._found(f"removed rules of the firewall cannot be installed again: {_words(error)}")
+            await asyncio.sleep(_REMEMBER_SECONDS)
+            self._changed.set()
+            return
+        began, self._intact_at = self._intact_at, restored_at
+        if missing:
+            at, by = changes[0] if changes else (began, "")
+            await self._restored(missing, by, self._intact_at - at, reported=bool(changes))
+
+    async def _restored(self, missing: list[str], by: str, seconds: float, *, reported: bool) -> None:
+        log.critical("another program removed rules of the firewall, which are in force again",
+                     by=by, seconds=round(seconds, 3), rules=missing)  # fmt: skip
+        ended = await self._end_once()
+        later = asyncio.create_task(self._end_later())
+        self._ending.add(later)
+        later.add_done_callback(self._ending.discard)
+        since = f"for {seconds:.2g} s" if reported else f"for at most {math.ceil(seconds)} s"
+        self._removed = self._intact_at, (
+            f"{by or 'another program'} removed {counted(len(missing), 'rule')} of the firewall {since}, which are in"
+            f" force again; {counted(ended, 'connection')} of that time ended. Other machines could reach the robot:"
+            " let that program replace only its own tables (rosrv audit search --event 'firewall restored')"
+        )  # fmt: skip
+        self._record(messages.RulesRestored(missing, by, round(seconds, 3), reported, ended))
+        self._tell(self._reported(self._report.report))
+
+    async def _end_once(self) -> int:
+        try:
+            return await in_thread(self.isolation.end_connections)
+        except Exception as error:  # noqa: BLE001  see the invariant
+            log.error("connections that began without the rules may remain", error=_words(error))
+            return 0
+
+    async def _end_later(self) -> None:
+        for seconds in _LATER_SECONDS:
+            await asyncio.sleep(seconds)
+            await self._end_once()
+
     async def _find_fault(self) -> str | None:
         try:
-            report = await in_thread(self.isolation.report)
-            self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
+            await self._restore()
+            self._reported(await in_thread(self.isolation.report))
             return await in_thread(self.isolation.probe)
         except Exception as error:  # noqa: BLE001  see the invariant
             return f"the state of the firewall is unknown: {_words(error)}"

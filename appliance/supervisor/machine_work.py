@@ -25,6 +25,9 @@ class MachineWork(Protocol):
     def left_alone(self) -> tuple[str, ...]:
         """Return the control groups of the robot's own masters."""
 
+    def nodes(self) -> tuple[str, ...]:
+        """Return keys of processes that were connected to the robot's own master (`process_key`)."""
+
     def end(self) -> None:
         """Note that the appliance ends by an order, not because of a failure."""
 
@@ -45,6 +48,9 @@ class NoMachineWork:
         return False
 
     def left_alone(self) -> tuple[str, ...]:
+        return ()
+
+    def nodes(self) -> tuple[str, ...]:
         return ()
 
     def end(self) -> None:

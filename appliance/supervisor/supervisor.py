@@ -15,6 +15,7 @@ import asyncio
 import os
 import signal
 import socket
+from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -144,7 +145,9 @@ class Supervisor:
         self._gate = gate(RoleChanges(self._activate, self._passivate, self._suspend, self._resume))
         self._suspended_at = 0.0
         self._answers: asyncio.Task[None] | None = None  # to operators, instead of control
-        self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
+        self._watchdog = IsolationWatchdog(
+            isolation or NoIsolation(), self._tell_control, self._record_restored
+        )
         self.reports = ProcessCallbacks(self._received, self._violated, self.died)
         self._work = work or NoMachineWork()
         self._gives_back = gives_back
@@ -155,6 +158,7 @@ class Supervisor:
         self.failure: str | None = None
         self._serving: ProcessHandle | None = None  # the control that records what happens
         self._deaths: dict[tuple[str, int], messages.ProcessDied] = {}  # until control has got them
+        self._restored: deque[messages.RulesRestored] = deque(maxlen=100)  # as these
         self._asking: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._unanswered = 0
@@ -175,6 +179,7 @@ class Supervisor:
 
     async def _serve(self) -> None:
         self._spawn(self._watch())
+        self._spawn(self._watchdog.watch())
         try:
             await self._start()
             self._spawn(self._watchdog.run())
@@ -712,9 +717,14 @@ class Supervisor:
     def _tell_deaths(self) -> None:
         if self._serving is None:
             return
-        for death in self._deaths.values():
-            self._serving.send(death)
+        for message in (*self._deaths.values(), *self._restored):
+            self._serving.send(message)
         self._deaths.clear()
+        self._restored.clear()
+
+    def _record_restored(self, message: messages.RulesRestored) -> None:
+        self._restored.append(message)
+        self._tell_deaths()
 
     def _ended(self, slot: ProcessSlot) -> None:
         log.info("process ended", role=slot.role.name)

@@ -216,6 +216,11 @@ EVENTS: dict[str, str] = {
     "adopted": "A registration was taken over from the robot's own master by an operator's order (`rosrv adopt`).",
     "graph adopted": "The robot's graph was taken over from its own master; `detail` has the numbers.",
     "graph released": "The robot's graph was given back to its own master; `detail` has the numbers.",
+    "firewall restored": "Another program had removed rules of the appliance's firewall, which are in force again;"
+    " `detail` has the rules, the program `by`, the `seconds` without them, and how many `connections` of that time"
+    " were ended.",
+    "graph restored": "Other machines may have reached the robot's own master; what was registered there was"
+    " unregistered again; `detail` has it.",
     "adoption failed": "The robot's graph cannot be taken over or given back; `reason` says why. It is tried again.",
     "log failed": "The log could not be written for some time and is written again; `reason` says why.",
 }
@@ -245,6 +250,7 @@ SEVERITIES: dict[str, Severity] = {
         ),
         Severity.WARNING: (
             "authority refused", "motion not stopped", "bundle metadata rejected", "bundle refused",
+            "graph restored",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "ended by the clock",
             "enrolment refused",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
@@ -253,7 +259,8 @@ SEVERITIES: dict[str, Severity] = {
             "sign-on refused", "specifications refused", "switchover failed", "tunnel refused",
         ),
         Severity.ALARM: (
-            "adoption failed", "fleet not joined", "forwarding gap", "guard bypassed", "monitor not built",
+            "adoption failed", "firewall restored", "fleet not joined", "forwarding gap", "guard bypassed",
+            "monitor not built",
             "monitors restarted", "policy file refused", "probe failed", "process failing", "protection forgotten",
             "publication refused", "records lost",
             "topics held",

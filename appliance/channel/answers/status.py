@@ -63,6 +63,9 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
             "why the robot's own programs may have started without the appliance (`hold: own`), or others were not held"
         ),
     ] = None
+    removed: Annotated[
+        str | None, doc("what another program removed of these rules in the last hour, and for how long")
+    ] = None
 
 
 class PolicyState(msgspec.Struct, frozen=True):

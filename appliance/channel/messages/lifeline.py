@@ -141,6 +141,20 @@ class FirewallReported(Message):
     report: FirewallState
 
 
+class RulesRestored(Message):
+    """Another program had removed rules of the firewall, which are in force again.
+
+    `seconds` is the time from its change, or, if the kernel did not report it, since the last check. `connections`
+    began in that time and were ended.
+    """
+
+    rules: list[str]
+    by: str
+    seconds: float
+    reported: bool
+    connections: int
+
+
 class ServicePaused(Message):
     """The lease has lapsed and control is stopped, for the api; without `reason`, control continues."""
 
@@ -304,6 +318,7 @@ class Activated(Message):
 Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | ProcessDied | ClockRead | MachineAddresses | FirewallReported
+    | RulesRestored
     | ProbeFailed | ProbePassed | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
     | OwnNetworkWanted | OwnNetworkOpened

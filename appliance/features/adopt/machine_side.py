@@ -95,6 +95,9 @@ class AdoptWork:
         group = load_record(self._state).group
         return (group,) if group else ()
 
+    def nodes(self) -> tuple[str, ...]:
+        return load_record(self._state).nodes
+
     def end(self) -> None:
         self._ends = True
 
@@ -200,9 +203,16 @@ class AdoptWork:
         self._require(taking, "no graph is taken over")
         return record.phase
 
-    def _may_cut(self, phase: Phase) -> bool:
-        """Return whether connections may end now; False soon after the last cut of a graph that is taken."""
-        if phase is Phase.TAKEN and clock.now() - self._cut_at < _CUT_AGAIN_SECONDS:
+    def _may_cut(self, phase: Phase, removed_at: float) -> bool:
+        """Return whether connections may end now; False soon after the last cut of a graph that is taken.
+
+        After a removal of the rules at `removed_at` they may end once more.
+        """
+        if (
+            phase is Phase.TAKEN
+            and removed_at < self._cut_at
+            and clock.now() - self._cut_at < _CUT_AGAIN_SECONDS
+        ):
             return False
         if phase is Phase.TAKING:
             self._require(self._cuts < _MOST_CUTS, f"more than {_MOST_CUTS} cuts of one adoption")
@@ -224,7 +234,7 @@ class AdoptWork:
         known = self._known_nodes(found.values())
         others = {port: one.pid for port, one in found.items() if not is_node(one, known)}
         kept = {f"TCP {port}": f"process {pid}: {program_of(pid)}" for port, pid in sorted(others.items())}
-        if not self._may_cut(phase):
+        if not self._may_cut(phase, side.removed_at):
             return {"master": 0, "nodes": 0, "kept": kept}
         if others:
             log.warning("connections of processes that do not look like nodes are not cut", ports=kept)

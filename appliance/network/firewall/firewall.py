@@ -1,5 +1,6 @@
 """Run the firewall of the appliance's namespace with a back end that works."""
 
+import threading
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,32 +35,48 @@ class Firewall:
         self._backend: Backend | None = None
         self._rules: tuple[PacketRule, ...] = ()
         self._not_used: list[str] = []
+        self._turn = threading.Lock()  # so that no rule is restored during a change, or after the removal
 
     def install(self, settings: FirewallSettings) -> str:
         """Install the rules, after removing those of an earlier run. Raises `PrivilegeError`, `FirewallError`."""
         require_network_admin("the firewall")
-        if self._backend is None:
-            rules = appliance_rules(settings)
-            self._backend, self._rules = self._choose(rules), rules
-        else:
-            self.update(settings)
-        return self._backend.name
+        rules = appliance_rules(settings)
+        with self._turn:
+            if self._backend is None:
+                self._backend = self._choose(rules)
+            else:
+                self._backend.install(rules)
+            self._rules = rules
+            return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
         """Replace the rules. Raises `FirewallError`; the old rules then stay in force."""
-        if self._backend is None:
-            raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
-        self._backend.install(rules)
-        self._rules = rules
+        with self._turn:
+            if self._backend is None:
+                raise FirewallError("the firewall is not installed yet: call install first")
+            self._backend.install(rules)
+            self._rules = rules
+
+    def restore(self) -> list[str]:
+        """Install the rules again if the kernel lacks some; return the purposes of these. Raises `FirewallError`."""
+        with self._turn:
+            if self._backend is None:
+                return []
+            found = statuses(self._rules, self._backend.counters(), self._backend.families)
+            missing = [rule.purpose for rule in found if not rule.in_force]
+            if missing:
+                self._backend.install(self._rules)
+            return missing
 
     def remove(self) -> None:
-        for backend in self._all():
-            if self._backend is not None and backend.name == self._backend.name:
-                backend.remove()
-            else:
-                self._clear(backend)
-        self._backend, self._rules = None, ()
+        with self._turn:
+            for backend in self._all():
+                if self._backend is not None and backend.name == self._backend.name:
+                    backend.remove()
+                else:
+                    self._clear(backend)
+            self._backend, self._rules = None, ()
 
     def report(self) -> FirewallReport:
         backend, not_used = self._backend, tuple(self._not_used)

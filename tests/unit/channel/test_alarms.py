@@ -34,6 +34,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("audit.failed", "disk full", "audit-failed", "alarm", "audit"),
         ("relay", "1 of 2 are away", "relay", "alarm", "system"),
         ("firewall.hold_lapsed", "the robot did not wait", "hold-lapsed", "alarm", "system"),
+        ("firewall.removed", "nft removed 2 rules of the firewall", "rules-removed", "alarm", "system"),
         ("audit.replaced", "log a was replaced", "audit-replaced", "alarm", "audit"),
         ("audit.degraded", "fsync is slow", "audit-degraded", "warning", "audit"),
         ("policy.confirm_by", 1.0, "policy-unconfirmed", "warning", "policy"),

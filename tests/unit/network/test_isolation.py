@@ -33,6 +33,21 @@ def test_only_new_connections_to_the_master_are_forwarded() -> None:
     }
 
 
+def test_a_connection_to_the_own_master_that_began_without_the_rules_does_not_go_on() -> None:
+    """Only the machine itself and the appliance send packets to that master then, also within a connection."""
+    master = (PortRange.one(11312),)
+    added = [
+        rule
+        for rule in isolation_rules(SETTINGS, ENDS, (), master=master, restored=True)
+        if rule not in isolation_rules(SETTINGS, ENDS, (), master=master)
+    ]
+    assert [(str(rule.arrives_on), str(rule.tcp_ports), rule.verdict, rule.opening) for rule in added] == [
+        ("lo", "11312", PacketVerdict.RETURN, False),
+        (f"not {SETTINGS.link}", "11312", PacketVerdict.DROP, False),
+    ]
+    assert isolation_rules(SETTINGS, ENDS, (), restored=True) == isolation_rules(SETTINGS, ENDS, ())
+
+
 def test_tunnels_are_forwarded_on_request() -> None:
     udp = (PortRange.one(500), PortRange.one(4500))
     added = set(isolation_rules(SETTINGS, ENDS, (), udp=udp)) - set(isolation_rules(SETTINGS, ENDS, ()))

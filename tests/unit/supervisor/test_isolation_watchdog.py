@@ -1,11 +1,14 @@
 import asyncio
 import errno
+import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeVar, cast
 
 import pytest
 from structlog.testing import capture_logs
 
+from appliance.base import clock
 from appliance.channel.answers.status import FirewallState
 from appliance.channel.messages import (
     EndpointFound,
@@ -14,13 +17,18 @@ from appliance.channel.messages import (
     Message,
     ProbeFailed,
     ProbePassed,
+    RulesRestored,
 )
 from appliance.network.esp import Esp
-from appliance.network.namespaces import NetworkError
+from appliance.network.firewall.rule_watch import RuleWatch
+from appliance.network.namespaces import Namespace, NetworkError
 from appliance.supervisor import isolation_watchdog
-from appliance.supervisor.isolation_lifecycle import NoIsolation
+from appliance.supervisor.isolation_lifecycle import NoIsolation, RestoredRules
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
 from tests.support.determinism import may_depend_on_chance
+from tests.support.nftables_reports import CHAIN_REMOVED, generation, report
+
+T = TypeVar("T")
 
 pytestmark = pytest.mark.anyio
 
@@ -202,3 +210,113 @@ async def test_a_former_address_of_the_machine_stays_closed_until_control_has_fo
     await asyncio.sleep(isolation_watchdog.FORMER_SECONDS)
     await watchdog.look()
     assert trusted[-1] == ("10.0.0.2",)
+
+
+class Flushed(NoIsolation):
+    """Rules that another program removes; `heard` is the kernel's report."""
+
+    kind = "netns"
+
+    def __init__(self, heard: socket.socket) -> None:
+        self.heard = heard
+        self.missing: list[list[str]] = []
+        self.broken: list[Exception] = []
+        self.ended_at: list[float] = []
+        self.remembered = 0
+
+    def watch_rules(self) -> list[RuleWatch]:
+        heard = self.heard
+
+        class Host(Namespace):
+            def run(self, _function: Callable[[], T]) -> T:
+                return cast(T, heard)
+
+        return [RuleWatch(Host("host"), frozenset({"rosrv"}))]
+
+    def restore(self) -> RestoredRules:
+        if self.broken:
+            raise self.broken.pop()
+        return RestoredRules(self.missing.pop() if self.missing else [], clock.now())
+
+    def remember_connections(self) -> None:
+        self.remembered += 1
+
+    def end_connections(self) -> int:
+        self.ended_at.append(round(clock.now(), 1))
+        return 2
+
+
+@pytest.fixture
+def kernel(sockets: None) -> Iterator[tuple[Flushed, Callable[[str], None]]]:
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    here.setblocking(False)
+    flushed = Flushed(here)
+
+    def change(table: str) -> None:
+        flushed.missing.append(["forwarded ports"])
+        there.send(report(CHAIN_REMOVED, table) + generation("nft"))
+
+    with capture_logs(), here, there:
+        yield flushed, change
+
+
+@pytest.mark.usefixtures("guard_in_loop")
+async def test_rules_are_restored_as_soon_as_the_kernel_reports_their_removal(
+    kernel: tuple[Flushed, Callable[[str], None]],
+) -> None:
+    """Also while other work of the watchdog goes on. Connections that come late are ended, too."""
+    isolation, change = kernel
+    told: list[Message] = []
+    recorded: list[RulesRestored] = []
+    watchdog = IsolationWatchdog(isolation, told.append, recorded.append)
+    watching = asyncio.create_task(watchdog.watch())
+    await asyncio.sleep(3.5)
+    assert isolation.remembered == 3
+    began = clock.now()
+    async with watchdog._one_at_a_time:
+        for _ in range(2):
+            change("rosrv")
+            await asyncio.sleep(0.01)
+        change("other")
+        await asyncio.sleep(5)
+    watching.cancel()
+    assert [(one.rules, one.by, one.connections) for one in recorded] == 2 * [(["forwarded ports"], "nft", 2)]
+    assert max(one.seconds for one in recorded) < 0.1
+    assert sorted(isolation.ended_at) == pytest.approx(sorted(2 * [began, began + 0.5, began + 2.5]), abs=0.2)
+    shown = [one.report.removed for one in told if isinstance(one, FirewallReported)]
+    assert "nft removed 1 rule of the firewall" in str(shown[-1])
+
+
+@pytest.mark.usefixtures("guard_in_loop")
+async def test_a_restoration_that_fails_is_a_finding_and_is_repeated(
+    kernel: tuple[Flushed, Callable[[str], None]],
+) -> None:
+    isolation, change = kernel
+    isolation.broken = [NetworkError("nft hangs")]
+    told: list[Message] = []
+    watchdog = IsolationWatchdog(isolation, told.append)
+    watching = asyncio.create_task(watchdog.watch())
+    await asyncio.sleep(0.5)
+    change("rosrv")
+    await asyncio.sleep(3)
+    watching.cancel()
+    (failed,) = [one for one in told if isinstance(one, ProbeFailed)]
+    assert "nft hangs" in failed.reason
+    (restored,) = [one for one in told if isinstance(one, RulesRestored)]
+    assert restored.seconds == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.usefixtures("guard_in_loop")
+async def test_a_regular_check_restores_what_the_kernel_does_not_report(
+    kernel: tuple[Flushed, Callable[[str], None]],
+) -> None:
+    isolation, _change = kernel
+    told: list[Message] = []
+    running = asyncio.create_task(IsolationWatchdog(isolation, told.append, every=60.0).run())
+    await asyncio.sleep(90)
+    isolation.missing.append(["forwarded ports"])
+    await asyncio.sleep(60)
+    running.cancel()
+    (restored,) = [one for one in told if isinstance(one, RulesRestored)]
+    assert not restored.reported
+    assert restored.seconds == 60
