@@ -26,6 +26,7 @@ from appliance.policy.model import Address, address_of
 from appliance.rpc.master_reader import Entry, MasterReader
 from appliance.rpc.server import Peer
 from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
 from appliance.supervisor.machine_work import Found
 from roswire.errors import PeerError
 from roswire.names import ROSOUT
@@ -62,6 +63,7 @@ async def begin(core: Core) -> ControlPart:
         ))  # fmt: skip
     part = AdoptPart(core)
     core.links.before_end(part.before_end)
+    core.links.after_removal(part.after_removal)
     return ControlPart(
         (
             RequestMethod(AdoptStatus, part.status, order=False),
@@ -105,11 +107,13 @@ class AdoptPart:
             silence=registrar.silence,
             speak=registrar.speak,
             passed=self._passed,
+            stored=self._stored,
         )
         self._one = asyncio.Lock()
         self._facts: MachineFacts | None = None
         self._obstacle = ""
         self._settled = False
+        self._removed = asyncio.Event()
 
     # --- at the start, and while the appliance runs ---
 
@@ -121,7 +125,15 @@ class AdoptPart:
         while True:
             async with self._one:
                 await self._settle()
-            await asyncio.sleep(_AGAIN_SECONDS if self._obstacle else _LOOK_SECONDS)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_AGAIN_SECONDS if self._obstacle else _LOOK_SECONDS):
+                    await self._removed.wait()
+                    self._removed.clear()
+                    self._settled = False
+
+    def after_removal(self) -> None:
+        """Take the graph over once more: other machines could reach the robot's own master."""
+        self._removed.set()
 
     async def _settle(self) -> None:
         """Bring the graph to what the record wants; note the obstacle if that fails."""
@@ -245,6 +257,14 @@ class AdoptPart:
     async def _passed(self, step: str) -> None:
         log.info("adoption", step=step)
         self._save()
+
+    async def _stored(self) -> bool:
+        try:
+            await self._core.store.settled()
+        except StoreError as error:
+            log.warning("subscribers stay registered at the robot's own master", reason=str(error))
+            return False
+        return True
 
     # --- after a restart of control ---
 

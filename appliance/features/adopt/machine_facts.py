@@ -1,10 +1,12 @@
 """Describe the machine of an adoption, as the supervisor sees it."""
 
 import ipaddress
+from contextlib import suppress
 
 import msgspec
 
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase
+from roswire.uris import NodeUri
 
 FIRST_PORT = 1024
 """The first port that is cut: smaller ones belong to the machine, whatever a node says."""
@@ -53,3 +55,10 @@ class MachineFacts(msgspec.Struct, frozen=True):
 
     def is_here(self, address: str) -> bool:
         return ipaddress.ip_address(address).is_loopback or address in self.own
+
+    def has_node(self, uri: NodeUri) -> bool:
+        """Return whether a process of this machine listens at a node's URI."""
+        known = self.resolved.get(uri.host, [])
+        with suppress(ValueError):
+            known = [str(ipaddress.ip_address(uri.host))]
+        return uri.port in self.sockets and any(map(self.is_here, known))

@@ -11,14 +11,17 @@ starts in the meantime registers at the master that it still finds.
 3. Only ports of registered nodes are cut, and only ports on which the node's own process listens.
 4. The phase says that a graph is being taken before the first registration: from then on RVMaster may tell nodes its
    own lists, above all a control that starts again, so only giving back ends it.
+5. In the phase `taken`, and with the graph on the disk, the robot's own master loses the adopted subscriptions: it then
+   sends no list to a node, even if other machines reach it because a program flushed the rules. A subscription that is
+   absent there says nothing about its node. Giving back registers each again.
 
 Giving back: silence, a master, registrations, forward no more, registrations once more, tell subscribers, cut, forget.
 Another master than the recorded one gets nothing: nodes keep their topics by RVMaster's own lists.
 
-5. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
-6. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
+6. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
+7. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
    the earlier URI of a name.
-7. From the end of the forwarding on, nodes start at their own master. A name that came there since is neither ended nor
+8. From the end of the forwarding on, nodes start at their own master. A name that came there since is neither ended nor
    registered again, unless RVMaster's node of that name still answers. The same holds for a graph that was not yet
    taken over completely.
 
@@ -84,6 +87,7 @@ _BESIDES_SECONDS = 1.0  # for the lists before and after the last one
 _REMINDERS = 2
 _PAUSE_SECONDS = 0.02
 _AT_ONCE = 50  # registrations without a pause for other callers
+_MOST_SHOWN = 50  # registrations in a record
 _KEPT_PARAMETER = "run_id"
 _OWN_PARAMETERS = frozenset({"run_id", "rosdistro", "rosversion"})  # each master has its own, from roslaunch
 _REGISTER = {PUBLICATION: "registerPublisher", SUBSCRIPTION: "registerSubscriber", SERVICE: "registerService"}
@@ -125,6 +129,10 @@ class ParameterSide(Protocol):
 async def _nothing(_step: str) -> None: ...
 
 
+async def _stored() -> bool:
+    return True
+
+
 @dataclass
 class LastWord:
     """The last list of each subscriber, and the names of the nodes that did not take one."""
@@ -157,7 +165,8 @@ class LeftThere:
 class AdoptOperation:
     """The sequences. `waiting()` counts the calls that wait for nodes.
 
-    `forwards` is false if the nodes reach their own master already, because the appliance is dead.
+    `stored` waits until the graph is on the disk, and returns whether it is. `forwards` is false if the nodes reach
+    their own master already, because the appliance is dead.
     """
 
     machine: MachineOrders
@@ -170,8 +179,10 @@ class AdoptOperation:
     call: NodeCaller = call_node
     forwards: bool = True
     passed: Callable[[str], Awaitable[None]] = _nothing
+    stored: Callable[[], Awaitable[bool]] = _stored
     left: LeftThere = field(default_factory=LeftThere)
     _who: str = field(default="", init=False)
+    _hidden: bool = field(default=False, init=False)
 
     async def facts(self, nodes: Iterable[NodeUri] = ()) -> MachineFacts:
         uris = list(nodes)
@@ -191,6 +202,10 @@ class AdoptOperation:
             return await self.give()
         if wanted:
             await self._take_missing(facts)
+            if not self._hidden:
+                with suppress(MasterReadError):
+                    await self._clear_master(facts)
+                    await self._hide_subscribers(facts)
         return None
 
     # --- taking over ---
@@ -244,7 +259,7 @@ class AdoptOperation:
         graph, places, cut, readings, parameters_left = MasterGraph(), Places(), 0, 0, list[str]()
         reads = facts.master is not None and not warm
         if warm:
-            places = self._known_places()
+            places = await self._known_places(facts)
         else:
             if reads:
                 graph, places, parameters_left = await self._read_first(facts)
@@ -280,7 +295,7 @@ class AdoptOperation:
                 raise AdoptError(
                     f"the graph still changes after {readings} readings: wait until all nodes have started"
                 )
-        await self.machine("phase", phase=Phase.TAKEN)
+        await self._note_taken(facts)
         report = self._report(cut, readings, [*graph.left_out, *parameters_left], clock.now() - began)
         if reads:
             self._record(report)
@@ -307,8 +322,10 @@ class AdoptOperation:
         self.left.nodes = places.missing
         return graph, places
 
-    def _known_places(self) -> Places:
-        """Return the nodes that RVMaster has from before a restart."""
+    async def _known_places(self, facts: MachineFacts) -> Places:
+        """Return the nodes that RVMaster has from before a restart, or a removal of the firewall's rules."""
+        with suppress(MasterReadError):
+            await self._clear_master(facts)
         return Places({
             node.name: NodePlace(node.api_text, node.api, node.host)
             for node in self.graph.nodes() if node in self.graph.subscribers.unasked
@@ -372,7 +389,65 @@ class AdoptOperation:
         await self._tell(late)
         await self._cut(cuts)
         await self._tell(late, clock_too=True)
+        self._hidden = False
         await self.passed("missing nodes")
+
+    async def _note_taken(self, facts: MachineFacts) -> None:
+        await self.machine("phase", phase=Phase.TAKEN)
+        self._hidden = False
+        with suppress(MasterReadError):  # tried again by `settle`
+            await self._hide_subscribers(facts)
+
+    async def _clear_master(self, facts: MachineFacts) -> None:
+        """Undo what was registered at the robot's own master only: other machines may have reached it.
+
+        A node of this machine that started meanwhile is taken over. Parameters get the present values.
+        """
+        if facts.master is None or facts.foreign_master:
+            return
+        began, reader = clock.now(), self.reader(facts)
+        there = await reader.read()
+        begun = await self._take_begun(there)
+        held = dict(self.graph.held())
+        unknown = [entry for entry in there.in_order() if self._is_gone(entry, there, held)]
+        await reader.ask_all([_unregistration(entry, there) for entry in unknown])
+        await self._give_parameters(reader, complete=False)
+        if unknown or begun:
+            self.graph.trail.happened(
+                "graph restored",
+                f"{counted(len(unknown), 'registration')} that only the robot's own master had were unregistered there;"
+                f" {counted(len(begun), 'node')} of this machine taken over",
+                unregistered=[f"{' '.join(entry)} {there.nodes.get(entry[2], '')}" for entry in unknown[:_MOST_SHOWN]],
+                nodes=begun or None, seconds=round(clock.now() - began, 2),
+            )  # fmt: skip
+
+    async def _take_begun(self, there: MasterGraph) -> list[str]:
+        """Take over the nodes of this machine that registered at their own master only; return their names."""
+        held = {node.api_text for node in self.graph.nodes()}
+        uris, _invalid = parsed({
+            name: uri for name, uri in there.nodes.items()
+            if uri not in held and not self.graph.is_own(name) and self.graph.registry.occupant(name) is None
+        })  # fmt: skip
+        facts = await self.facts(uris.values())
+        begun = [name for name, uri in uris.items() if facts.has_node(uri)]
+        if begun:
+            self.left.nodes |= dict.fromkeys(begun, "it started while the firewall's rules were removed")
+            await self._take_missing(facts)
+        return [name for name in begun if name not in self.left.nodes]
+
+    async def _hide_subscribers(self, facts: MachineFacts) -> None:
+        """Unregister the adopted subscriptions at the robot's own master, once they are on the disk here."""
+        if facts.master is None or facts.foreign_master or not await self.stored():
+            return
+        reader, held = self.reader(facts), dict(self.graph.held())
+        there = await reader.read()
+        adopted = [
+            entry for entry in there.in_order()
+            if entry[0] == SUBSCRIPTION and entry in held and not self._is_gone(entry, there, held)
+        ]  # fmt: skip
+        await reader.ask_all([_unregistration(entry, there) for entry in adopted])
+        self._hidden = True
+        await self.passed("hidden")
 
     async def _cut(self, cuts: Mapping[str, object]) -> int:
         done = msgspec.convert(await self.machine("cut", **cuts), CutConnections)
@@ -589,10 +664,7 @@ class AdoptOperation:
         ]
         new = [entry for entry, node in held.items() if entry[2] not in newer and _is_new(entry, node, there)]
         new.sort(key=lambda entry: (ORDER.index(entry[0]), entry))
-        calls: list[MasterCall] = []
-        for kind, resource, name in gone:
-            detail = there.services.get(resource, "") if kind == SERVICE else there.nodes.get(name, "")
-            calls.append((_UNREGISTER[kind], name, (resource, detail)))
+        calls = [_unregistration(entry, there) for entry in gone]
         for entry in new:
             kind, resource, name = entry
             node = held[entry]
@@ -696,6 +768,12 @@ class AdoptOperation:
             if not missing or clock.now() >= until:
                 return
             await send_lists(self.call, _BESIDES_SECONDS, {row: last.lists[row] for row in missing})
+
+
+def _unregistration(entry: Entry, there: MasterGraph) -> MasterCall:
+    kind, resource, name = entry
+    detail = there.services.get(resource, "") if kind == SERVICE else there.nodes.get(name, "")
+    return _UNREGISTER[kind], name, (resource, detail)
 
 
 def _graph_of(nodes: list[HeldNode]) -> MasterGraph:

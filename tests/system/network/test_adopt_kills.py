@@ -36,7 +36,7 @@ ROUNDS = int(os.environ.get("ROSRV_ADOPT_KILLS", "2"))
 LATEST = 0.2  # seconds from a step to the kill
 STEPS = {
     "release": ("silence", "give", "withdraw", "give again", "tell", "given", "forget", "released"),
-    "adopt": ("read", "register", "forward", "connect", "tell", "cut", "read again", "taken"),
+    "adopt": ("read", "register", "forward", "connect", "tell", "cut", "read again", "hidden", "taken"),
 }
 ENDS = {"adopt": "taken", "release": "free"}
 

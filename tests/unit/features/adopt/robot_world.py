@@ -109,6 +109,7 @@ class ScriptedReader:
         self.tree: dict[str, Value] = {"run_id": "robot", "speed": 1.5}
         self.shutdowns: list[str] = []
         self.before: Callable[[], None] = lambda: None
+        self.calls_until_kill = 0
         self.alive = True
         self.uri = NodeUri("http", LINK, 11311, "/")
 
@@ -131,7 +132,13 @@ class ScriptedReader:
 
     async def ask_all(self, calls: list[MasterCall]) -> list[Value]:
         self._require()
-        return [self.carry_out(*call) for call in calls]
+        return [self._counted(call) for call in calls]
+
+    def _counted(self, call: MasterCall) -> Value:
+        self.calls_until_kill -= 1
+        if self.calls_until_kill == 0:
+            raise KilledError
+        return self.carry_out(*call)
 
     def carry_out(self, method: str, name: str, params: tuple[Value, ...]) -> Value:
         """Change the graph as `rosmaster` does."""

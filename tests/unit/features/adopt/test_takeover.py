@@ -17,7 +17,18 @@ from tests.support.engines import KilledError
 from tests.unit.features.adopt.robot_world import LINK, RobotWorld
 
 MANY = 10_000
-TAKE = ("read", "parameters", "register", "forward", "connect", "tell", "cut", "read again", "taken")
+TAKE = (
+    "read",
+    "parameters",
+    "register",
+    "forward",
+    "connect",
+    "tell",
+    "cut",
+    "read again",
+    "hidden",
+    "taken",
+)
 GIVE = ("silence", "stand in", "give", "withdraw", "give again", "tell", "given", "forget", "released")
 
 
@@ -766,5 +777,109 @@ def test_a_name_held_by_the_appliance_is_never_taken() -> None:
         await world.until_settled()
         assert all(not node.own for node in world.graph.nodes())
         assert not list(world.parts.registry.registered(Kind.PUBLICATION, "/rosout_agg"))
+
+    run(story)
+
+
+async def taken_again(world: RobotWorld) -> None:
+    """Do as control does after the firewall's rules came back."""
+    await world.operation.settle(await world.operation.facts(), settled=False)
+
+
+def test_the_own_master_of_a_taken_graph_knows_no_adopted_subscriber() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.add("/gone", 4004, publishes=("/gone",), subscribes=("/odom",), alive=False)
+        await world.until_settled()
+        left = {entry for entry in world.master.entries if entry[0] == "subscription"}
+        assert left == {("subscription", "/odom", "/gone")}, "that of a node that was not taken over"
+        assert {*world.truth()} - world.master.entries == {
+            entry for entry in world.truth() if entry[0] == "subscription"
+        }
+
+    run(story)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_subscriber_stays_with_the_own_master_until_it_is_on_the_disk(stored: bool) -> None:
+    async def story(world: RobotWorld) -> None:
+        answers = [stored, True]
+
+        async def is_stored() -> bool:
+            return answers.pop(0)
+
+        world.operation.stored = is_stored
+        await world.until_settled()
+        assert (world.truth() <= world.master.entries) is not stored
+        await world.operation.settle(await world.operation.facts(), settled=True)
+        assert not world.truth() <= world.master.entries
+
+    run(story)
+
+
+@pytest.mark.parametrize("wanted", [True, False], ids=["taking", "giving"])
+@pytest.mark.parametrize("calls", range(1, 8))
+def test_a_kill_between_two_calls_to_the_own_master_loses_nothing(calls: int, wanted: bool) -> None:
+    """Control dies while it unregisters subscribers there, or registers them again."""
+
+    async def story(world: RobotWorld) -> None:
+        if not wanted:
+            await world.until_settled()
+        world.record = msgspec.structs.replace(world.record, wanted=wanted)
+        world.master.calls_until_kill = calls
+        await world.until_settled()
+        if wanted:
+            require_taken(world)
+            world.record = msgspec.structs.replace(world.record, wanted=False)
+            await world.until_settled()
+        require_given(world)
+
+    run(story)
+
+
+def test_nothing_of_a_stranger_stays_at_the_own_master() -> None:
+    """Neither a new name, nor a name of the robot with another URI, nor a changed parameter."""
+
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        there, driver = world.master, world.robot["/teleop"]
+        for name, uri in (("/evil", "http://10.0.0.66:1/"), ("/teleop", "http://10.0.0.66:2/")):
+            there.carry_out("registerPublisher", name, ("/cmd_vel", "geometry_msgs/Twist", uri))
+        there.carry_out("registerService", "/evil", ("/reset", "rosrpc://10.0.0.66:3", "http://10.0.0.66:1/"))
+        there.tree["speed"] = 99.0
+        await taken_again(world)
+        require_taken(world)
+        assert there.tree["speed"] == 1.5
+        assert not [
+            uri for name, uri in there.nodes.items() if "10.0.0.66" in uri and name in str(there.entries)
+        ]
+        (record,) = [one for one in world.parts.records.records if one.event == "graph restored"]
+        assert "publication /cmd_vel /evil http://10.0.0.66:1/" in str(record.detail)
+        there.shutdowns.clear()
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        require_given(world)
+        assert there.nodes["/teleop"] == driver.uri
+
+    run(story)
+
+
+def test_a_node_that_starts_while_the_rules_are_removed_is_taken_over() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.add("/late", 4004, publishes=("/late",), subscribes=("/odom",))
+        await taken_again(world)
+        require_taken(world)
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        require_given(world)
+
+    run(story)
+
+
+def test_a_rest_without_strangers_is_no_record() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        await taken_again(world)
+        assert "graph restored" not in {one.event for one in world.parts.records.records}
 
     run(story)
