@@ -81,6 +81,8 @@ write_units() {
 [Unit]
 Description=Closes the ROS ports of this machine to all but the ROSRV appliance
 After=nftables.service netfilter-persistent.service ufw.service
+PartOf=nftables.service
+ReloadPropagatedFrom=nftables.service
 Before=network-pre.target
 Wants=network-pre.target
 
@@ -88,6 +90,7 @@ Wants=network-pre.target
 Type=oneshot
 RemainAfterExit=yes
 ExecStart=/usr/sbin/nft -f /etc/rosrv/protect.nft
+ExecReload=/usr/sbin/nft -f /etc/rosrv/protect.nft
 ExecStop=/usr/sbin/nft delete table inet rosrv_protect
 
 [Install]
