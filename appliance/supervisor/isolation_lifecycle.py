@@ -188,6 +188,7 @@ class ContainerIsolation(NoIsolation):
         self._own: str | None = None  # the appliance's address in the tunnels
         self._own_network: str | None = None
         self._own_ports: tuple[PortRange, ...] = ()  # of doors
+        self._found: list[str] = []  # rules that `report` has installed again, for the next `restore`
         self._owed = False  # whether the kernel rejected the last rules, so they must be installed again
         self._changing = threading.RLock()
         self._ending = False
@@ -330,7 +331,9 @@ class ContainerIsolation(NoIsolation):
         return [RuleWatch(self._namespace)]
 
     def restore(self) -> RestoredRules:
-        return RestoredRules([] if self.firewall is None else self.firewall.restore(), clock.now())
+        found = [] if self.firewall is None else self.firewall.restore()
+        found, self._found = self._found + found, []
+        return RestoredRules(found, clock.now())
 
     def report(self) -> FirewallState:
         with self._standing():
@@ -341,6 +344,7 @@ class ContainerIsolation(NoIsolation):
                 gone = [rule.purpose for rule in report.rules if not rule.in_force]
                 self._require_standing()
                 log.critical("firewall rules were missing and are installed again", rules=gone)
+                self._found += gone
                 self.firewall.install(self._settings())
                 self._owed = False
                 report = self.firewall.report()
@@ -559,6 +563,7 @@ class NetnsIsolation(ContainerIsolation):
             gone = self._isolation.put_rules_back()
             if gone:
                 log.critical("rules on the host were missing and are installed again", rules=gone)
+                self._found += gone
             rules = self._isolation.rules()
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 

@@ -183,6 +183,8 @@ def test_rules_on_the_host_are_restored(host: Host, tmp_path: Path) -> None:
         report = isolation.report()
         assert report.forwarding
         assert all(rule.in_force for rule in [*report.forwarding, *(report.rules or ())])
+        assert "forwarded ports" in isolation.restore().rules, "it is recorded once"
+        assert isolation.restore().rules == []
     finally:
         isolation.remove()
 
