@@ -88,6 +88,7 @@ _REMINDERS = 2
 _PAUSE_SECONDS = 0.02
 _AT_ONCE = 50  # registrations without a pause for other callers
 _MOST_SHOWN = 50  # registrations in a record
+_OWN_MASTER_SECONDS = 30.0
 _KEPT_PARAMETER = "run_id"
 _OWN_PARAMETERS = frozenset({"run_id", "rosdistro", "rosversion"})  # each master has its own, from roslaunch
 _REGISTER = {PUBLICATION: "registerPublisher", SUBSCRIPTION: "registerSubscriber", SERVICE: "registerService"}
@@ -203,9 +204,8 @@ class AdoptOperation:
         if wanted:
             await self._take_missing(facts)
             if not self._hidden:
-                with suppress(MasterReadError):
-                    await self._clear_master(facts)
-                    await self._hide_subscribers(facts)
+                await self._try(self._clear_master(facts))
+                await self._try(self._hide_subscribers(facts))
         return None
 
     # --- taking over ---
@@ -324,8 +324,7 @@ class AdoptOperation:
 
     async def _known_places(self, facts: MachineFacts) -> Places:
         """Return the nodes that RVMaster has from before a restart, or a removal of the firewall's rules."""
-        with suppress(MasterReadError):
-            await self._clear_master(facts)
+        await self._try(self._clear_master(facts))
         return Places({
             node.name: NodePlace(node.api_text, node.api, node.host)
             for node in self.graph.nodes() if node in self.graph.subscribers.unasked
@@ -395,8 +394,14 @@ class AdoptOperation:
     async def _note_taken(self, facts: MachineFacts) -> None:
         await self.machine("phase", phase=Phase.TAKEN)
         self._hidden = False
-        with suppress(MasterReadError):  # tried again by `settle`
-            await self._hide_subscribers(facts)
+        await self._try(self._hide_subscribers(facts))
+
+    @staticmethod
+    async def _try(work: Awaitable[None]) -> None:
+        """Do work at the robot's own master; if that does not answer, `settle` tries again."""
+        with suppress(MasterReadError, TimeoutError):
+            async with asyncio.timeout(_OWN_MASTER_SECONDS):
+                await work
 
     async def _clear_master(self, facts: MachineFacts) -> None:
         """Undo what was registered at the robot's own master only: other machines may have reached it.
