@@ -1,8 +1,9 @@
 """Read a graph from its ROS master and its nodes, with calls that register and change nothing.
 
 The answers come from programs that are not checked: each call has a time and a size, each list a most number, and the
-whole survey a time. The inventory names the parts that a limit leaves out. A node that does not answer costs only its
-own time.
+whole survey a time. The inventory names the parts that a limit leaves out. Any host may have registered names, so each
+host has a share of the time, and this machine's own nodes are asked first. Only hosts where a node answered are scanned
+for well-known ports: a registered URI makes no other host a target.
 """
 
 import asyncio
@@ -11,10 +12,12 @@ import itertools
 import socket
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 from appliance.base import clock
 from appliance.base.counted import counted
+from appliance.base.host_names import addresses_of
 from appliance.rpc.graph_inventory import (
     LISTENERS,
     MASTER_PORT,
@@ -25,6 +28,7 @@ from appliance.rpc.graph_inventory import (
     SurveyedService,
     SurveyedTopic,
 )
+from appliance.rpc.host_shares import HostShare, serve_by_host
 from appliance.rpc.xmlrpc_client import CallFailedError, XmlRpcClient
 from roswire.errors import InvalidUriError
 from roswire.uris import NodeUri, parse_node_uri
@@ -33,6 +37,8 @@ from roswire.xmlrpc import Value, XmlRpcLimits
 _CALLER = "/rosrv_survey"
 _LIMITS = XmlRpcLimits(body=16 << 20)
 _LONGEST = 256  # characters of a name or text
+_HOST_SHARE = 0.25  # of the whole time
+_PORT_SECONDS = 1.0  # of a well-known port
 
 
 class SurveyLimits(NamedTuple):
@@ -41,7 +47,7 @@ class SurveyLimits(NamedTuple):
     call: float = 3.0
     whole: float = 60.0
     at_once: int = 16
-    """Nodes that are asked at the same time."""
+    """Calls of the master, and nodes of one host, at the same time."""
     rows: int = 20_000
     """Nodes, topics, services or parameters, each; connections of a node."""
     sample: float = 1.0
@@ -59,6 +65,14 @@ async def survey(uri: str, limits: SurveyLimits) -> GraphInventory:
     except InvalidUriError as error:
         raise SurveyError(f"{error}: give it like --master http://robot:11311") from None
     return await _Survey(master, uri, limits).read()
+
+
+class _Asked(NamedTuple):
+    """What a node said; `problem` is why it could not be asked."""
+
+    problem: str = "it did not answer in the time of its host"
+    pid: int | None = None
+    connections: tuple[NodeConnection, ...] = ()
 
 
 class _Survey:
@@ -108,13 +122,15 @@ class _Survey:
             )
             for name in self._cut("topics", sorted({*publishers, *subscribers}))
         )
-        host = await self._address(self._master.host)
+        await self._resolve([self._master.host])
+        host = self._addresses[self._master.host]
         hosts = {node.host for node in nodes}
+        answering = {node.host for node in nodes if not node.problem}
         return GraphInventory(
             self._uri, host, nodes, topics, found, tuple(self._cut("parameters", sorted(parameters))),
-            await self._listeners({host, *hosts}), self._calls,
+            await self._listeners(host, answering), self._calls,
             round(clock.now() - self._began, 2), tuple(self._left_out),
-            tuple(sorted(filter(is_here, hosts))) if is_here(host) else (),
+            tuple(sorted(filter(is_here, {*hosts} - {""}))) if is_here(host) else (),
         )  # fmt: skip
 
     def _cut(self, what: str, names: Sequence[str]) -> Sequence[str]:
@@ -145,42 +161,68 @@ class _Survey:
         self, master: XmlRpcClient, names: Sequence[str]
     ) -> tuple[tuple[SurveyedNode, ...], dict[str, float]]:
         counts: list[dict[str, tuple[float, int]]] = []
-        nodes = tuple(await asyncio.gather(*(self._node(master, name, counts) for name in names)))
-        late = sum(node.problem.startswith("the survey takes longer") for node in nodes)
+        listed = await asyncio.gather(*(self._listed(master, name) for name in names))
+        await self._resolve(place.host for _node, place in listed if place is not None)
+        here = {host for host in {*self._addresses.values()} if host and is_here(host)}
+        asked: dict[NodeUri, str] = {}
+        for _node, place in listed:
+            if place is not None and (host := self._addresses[place.host]):
+                asked[place] = f"port {place.port}" if host in here else host
+        own_first = dict(sorted(asked.items(), key=lambda row: not row[1].startswith("port ")))
+        left = max(0.0, self._limits.whole - (clock.now() - self._began))
+        found = await serve_by_host(
+            own_first, lambda place: self._node(place, counts),
+            HostShare(min(left, _HOST_SHARE * self._limits.whole), left, self._limits.at_once),
+        )  # fmt: skip
+        nodes, late = list[SurveyedNode](), 0
+        for node, place in listed:
+            host = "" if place is None else self._addresses[place.host]
+            if place is None or not host:
+                nodes.append(node)
+                continue
+            late += place not in found
+            said = found.get(place, _Asked())
+            nodes.append(SurveyedNode(node.name, node.uri, host, said.pid, said.problem, said.connections))
         if late:
-            self._left_out.append(f"{late} of {counted(len(nodes), 'node')}: the time was over")
+            self._left_out.append(
+                f"{late} of {counted(len(nodes), 'node')}: the time of their hosts was over"
+            )
         rates: dict[str, float] = {}
         for sample in counts:
             for topic, (rate, _number) in sample.items():
                 rates[topic] = round(rates.get(topic, 0) + rate, 1)
-        return nodes, rates
+        return tuple(nodes), rates
 
-    async def _node(
-        self, master: XmlRpcClient, name: str, counts: list[dict[str, tuple[float, int]]]
-    ) -> SurveyedNode:
-        uri = host = ""
+    async def _listed(self, master: XmlRpcClient, name: str) -> tuple[SurveyedNode, NodeUri | None]:
+        """Return a node as the master lists it, and its place; without a valid one, None and the problem."""
+        uri = ""
         try:
             async with self._turns:
                 uri = _text(await self._asked(master, "lookupNode", name))
-                place = parse_node_uri(uri)
-                host = await self._address(place.host)
-                client = XmlRpcClient(place, timeout=self._limits.call, limits=_LIMITS)
-                pid = await self._asked(client, "getPid")
-                bus = _rows(await self._asked(client, "getBusInfo"), 5)[: self._limits.rows]
-                before, began = _sent(await self._counts(client)), clock.now()
+            place = parse_node_uri(uri)
+        except (CallFailedError, InvalidUriError) as error:
+            return SurveyedNode(name, uri, problem=str(error)), None
+        return SurveyedNode(name, uri, problem=f"{place.host} is not known on this machine"), place
+
+    async def _node(self, place: NodeUri, counts: list[dict[str, tuple[float, int]]]) -> _Asked:
+        client = XmlRpcClient(
+            replace(place, host=self._addresses[place.host]), timeout=self._limits.call, limits=_LIMITS
+        )
+        try:
+            pid = await self._asked(client, "getPid")
+            bus = _rows(await self._asked(client, "getBusInfo"), 5)[: self._limits.rows]
+            before, began = _sent(await self._counts(client)), clock.now()
             if before:
                 await asyncio.sleep(self._limits.sample)
-                async with self._turns:
-                    after = _sent(await self._counts(client))
+                after = _sent(await self._counts(client))
                 seconds = max(self._limits.sample, clock.now() - began)
                 counts.append({
                     topic: ((after[topic] - sent) / seconds, after[topic])
                     for topic, sent in before.items() if after.get(topic, 0) >= sent
                 })  # fmt: skip
-        except (CallFailedError, InvalidUriError) as error:
-            return SurveyedNode(name, uri, host, problem=str(error))
-        rows = tuple(map(_connection, bus))
-        return SurveyedNode(name, uri, host, pid if isinstance(pid, int) else None, "", rows)
+        except CallFailedError as error:
+            return _Asked(str(error))
+        return _Asked("", pid if isinstance(pid, int) else None, tuple(map(_connection, bus)))
 
     async def _services(
         self, master: XmlRpcClient, names: Iterable[str], providers: dict[str, tuple[str, ...]]
@@ -194,38 +236,39 @@ class _Survey:
 
         return tuple(await asyncio.gather(*map(one, names)))
 
-    async def _address(self, host: str) -> str:
-        if host not in self._addresses:
+    async def _resolve(self, hosts: Iterable[str]) -> None:
+        """Note an address of each host; empty for a name that is not known."""
+        names: list[str] = []
+        for host in hosts:
             try:
                 self._addresses[host] = str(ipaddress.ip_address(host))
             except ValueError:
-                self._addresses[host] = await self._resolved(host)
-        return self._addresses[host]
+                names.append(host)
+        new = [name for name in names if name not in self._addresses]
+        if new:
+            found = await asyncio.to_thread(addresses_of, new)
+            self._addresses |= {
+                name: next(iter(sorted(found[name], key=lambda one: ":" in one)), "") for name in new
+            }
 
-    async def _resolved(self, host: str) -> str:
-        with suppress(OSError, UnicodeError, TimeoutError):
-            async with asyncio.timeout(self._limits.call):
-                rows = await asyncio.get_running_loop().getaddrinfo(host, None, type=socket.SOCK_STREAM)
-                return str(rows[0][4][0])
-        return ""
+    async def _listeners(self, master: str, hosts: set[str]) -> tuple[OpenPort, ...]:
+        """Connect to well-known ports of these hosts, and close at once."""
 
-    async def _listeners(self, hosts: set[str]) -> tuple[OpenPort, ...]:
-        """Connect to well-known ports of the graph's own hosts, and close at once."""
-
-        async def one(host: str, port: int) -> OpenPort | None:
-            async with self._turns:
-                try:
-                    async with asyncio.timeout(min(1.0, self._limits.call)):
-                        _reader, writer = await asyncio.open_connection(host, port)
-                except (OSError, TimeoutError):
-                    return None
+        async def one(row: tuple[str, int]) -> OpenPort | None:
+            host, port = row
+            try:
+                async with asyncio.timeout(min(_PORT_SECONDS, self._limits.call)):
+                    _reader, writer = await asyncio.open_connection(host, port)
+            except (OSError, TimeoutError):
+                return None
             writer.close()
             return OpenPort(host, port, LISTENERS[port])
 
-        master = OpenPort(await self._address(self._master.host), self._master.port, LISTENERS[MASTER_PORT])
-        pairs = itertools.product(sorted(filter(None, hosts)), LISTENERS)
-        found = await asyncio.gather(*(one(host, port) for host, port in pairs))
-        return tuple(dict.fromkeys([master, *filter(None, found)]))
+        pairs = itertools.product(sorted({master, *hosts} - {""}), LISTENERS)
+        seconds = 2 * _PORT_SECONDS
+        found = await serve_by_host({row: row[0] for row in pairs}, one, HostShare(seconds, seconds))
+        own = OpenPort(master, self._master.port, LISTENERS[MASTER_PORT])
+        return tuple(dict.fromkeys([own, *filter(None, found.values())]))
 
 
 def is_here(address: str) -> bool:

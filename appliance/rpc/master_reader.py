@@ -1,12 +1,13 @@
 """Read the graph of a ROS master that is not the appliance's own, with calls that change nothing.
 
 The answers may come from any program that reached the master, so each call has a time and a size, each list a most
-number, and the whole reading a time. Names and URIs stay as they are: `rosmaster` ends a node whose URI returns in
-another spelling. They must be checked before use, like the parameters of a node's call.
+number, and the whole reading a time. Names are looked up in the master's order, that of the first registrations: those
+that a host adds later come last, and are left out if the time is over. Names and URIs stay as they are: `rosmaster`
+ends a node whose URI returns in another spelling. They must be checked before use, like the parameters of a call.
 """
 
 import asyncio
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from appliance.base import clock
@@ -17,6 +18,7 @@ from roswire.xmlrpc import Value, XmlRpcLimits
 READ_LIMITS = XmlRpcLimits(body=16 << 20)
 CALLER = "/rosrv"
 _AT_ONCE = 8
+_LOOKUPS = 0.6  # of the time of a reading, after which no further address is asked for
 _LONGEST = 1024  # characters of a name or URI
 
 Entry = tuple[str, str, str]
@@ -114,33 +116,40 @@ class MasterReader:
         if not (isinstance(state, list) and len(state) == len(ORDER)):
             raise CallFailedError("getSystemState was not answered with three lists")
         left_out: list[str] = []
-        entries: set[Entry] = set()
+        entries: dict[Entry, None] = {}
         for kind, rows in zip((PUBLICATION, SUBSCRIPTION, SERVICE), state, strict=True):
             found = list(_entries(kind, rows))
             if len(found) > self._rows:
                 left_out.append(f"{len(found) - self._rows} of {len(found)} {kind}s")
-            entries.update(found[: self._rows])
+            entries |= dict.fromkeys(found[: self._rows])
         types = value_of("getTopicTypes", await client.call("getTopicTypes", CALLER))
-        nodes = await self._addresses(client, "lookupNode", {entry[2] for entry in entries})
-        services = await self._addresses(
-            client, "lookupService", {entry[1] for entry in entries if entry[0] == SERVICE}
-        )
-        if clock.now() - began > self._whole:
-            raise TimeoutError
+        until = began + _LOOKUPS * self._whole
+        names = dict.fromkeys(entry[2] for entry in entries)
+        nodes = await self._addresses(client, "lookupNode", names, until, left_out)
+        names = dict.fromkeys(entry[1] for entry in entries if entry[0] == SERVICE)
+        services = await self._addresses(client, "lookupService", names, until, left_out)
         return MasterGraph(frozenset(entries), dict(_pairs(types)), nodes, services, tuple(left_out))
 
-    async def _addresses(self, client: XmlRpcClient, method: str, names: set[str]) -> dict[str, str]:
+    async def _addresses(
+        self, client: XmlRpcClient, method: str, names: Iterable[str], until: float, left_out: list[str]
+    ) -> dict[str, str]:
         turns = asyncio.Semaphore(_AT_ONCE)
+        late: list[str] = []
 
         async def one(name: str) -> tuple[str, str]:
             async with turns:
+                if clock.now() > until:
+                    late.append(name)
+                    return name, ""
                 answer = await client.call(method, CALLER, name)
             match answer:
                 case [1, _, str(uri)] if len(uri) <= _LONGEST:
                     return name, uri
             return name, ""  # it has ended since
 
-        found = await asyncio.gather(*map(one, sorted(names)))
+        found = await asyncio.gather(*map(one, names))
+        if late:
+            left_out.append(f"the addresses of {len(late)} of {len(found)} names ({method})")
         return {name: uri for name, uri in found if uri}
 
 

@@ -164,7 +164,6 @@ BY_HAND = {
     "appliance/rpc/connection_table.py::_stages": OPEN,
     "appliance/rpc/fair_queue.py::_taken": OPEN,
     "appliance/rpc/fair_queue.py::_taken_as": OPEN,
-    "appliance/rpc/graph_reader.py::_addresses": ANSWER,
     "appliance/specifications/episodes.py::_going": TEXT,  # monitors and topics in force
     "appliance/specifications/episodes.py::_known": "len(self._known) < _MOST else",
     "fleet/rosrv_fleet/bundles/keys.py::_signers": OURS_ONLY,

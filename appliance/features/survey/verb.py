@@ -37,9 +37,9 @@ def survey(
 ) -> None:
     """List the hosts, nodes, topics and services of a robot, and what looks wrong. Nothing is registered or changed.
 
-    It asks the ROS master and each node with calls that only read, and connects to ports 11311, 9090 and 8765 of the
-    graph's hosts. It needs no appliance: run it on the robot, or on a computer of its network. Exit status 1 if the
-    master does not answer.
+    It asks the ROS master and each node with calls that only read, and connects to ports 11311, 9090 and 8765 of hosts
+    where these answer. It needs no appliance: run it on the robot, or on a computer of its network. Exit status 1 if
+    the master does not answer.
 
     Example: rosrv survey --output survey.html --policy draft.ini
     """

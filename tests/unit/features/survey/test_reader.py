@@ -149,3 +149,42 @@ def test_the_addresses_of_the_machine_of_the_master_are_known_only_on_that_machi
 @pytest.mark.parametrize(("address", "here"), [("127.0.1.1", True), ("::1", True), ("192.0.2.99", False)])
 def test_an_address_of_another_machine_is_not_an_own_one(address: str, here: bool) -> None:
     assert reader.is_here(address) is here
+
+
+class Crowd(FakeClient):
+    """A master with 500 names of a host that never answers, before two nodes that do."""
+
+    def __init__(self, uri: NodeUri, **options: object) -> None:
+        super().__init__(uri, **options)
+        self._host = uri.host
+
+    async def call(self, method: str, *parameters: object) -> Any:
+        if self._host == "10.0.0.66":
+            await asyncio.sleep(3.0)
+            raise UnansweredError("late")
+        if method == "lookupNode":
+            name = str(parameters[1])
+            host = {"/base": "127.0.0.1", "/nuc": "192.168.50.2"}.get(name, "10.0.0.66")
+            return [1, "", f"http://{host}:{4000 + len(name)}/{name.strip('/')}"]
+        return await super().call(method, *parameters)
+
+
+def test_names_of_a_silent_host_keep_no_other_out_and_make_no_host_a_target(
+    run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "XmlRpcClient", Crowd)
+    scanned: list[str] = []
+
+    async def refused(host: str, _port: int) -> None:
+        scanned.append(host)
+        raise ConnectionRefusedError
+
+    monkeypatch.setattr(asyncio, "open_connection", refused)
+    monkeypatch.setattr(reader, "is_here", {"127.0.0.1"}.__contains__)
+    names = [f"/a{number}" for number in range(500)]
+    state = [[["/scan", [*names, "/nuc", "/base"]]], [], []]
+    found = run(SurveyLimits(whole=20.0, sample=0.001), getSystemState=state)
+    assert [node.name for node in found.nodes if not node.problem] == ["/base", "/nuc"]
+    assert found.seconds < 20
+    assert {*scanned} == {"127.0.0.1", "192.168.50.2"}, "a registered URI alone makes no host a target"
+    assert "the time of their hosts was over" in " ".join(found.left_out)
