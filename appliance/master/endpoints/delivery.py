@@ -62,10 +62,14 @@ class NodeApiClient:
         self._round: asyncio.TimerHandle | None = None
 
     def client(
-        self, incarnation: Incarnation, *, pool: int = 0, limits: XmlRpcLimits = ANSWER
+        self, incarnation: Incarnation, *, pool: int = 0, limits: XmlRpcLimits = ANSWER, patience: float = 1.0
     ) -> XmlRpcClient:
-        """Return a client for the node's address, which another process may use now."""
-        return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, pool=pool, limits=limits)
+        """Return a client for the node's address, which another process may use now.
+
+        `patience` multiplies the time of a call.
+        """
+        timeout = patience * self._timeout
+        return XmlRpcClient(incarnation.call_uri, timeout=timeout, pool=pool, limits=limits)
 
     async def call(self, incarnation: Incarnation, method: str, *params: Value) -> Value:
         """Call a node. Raises `CallFailedError`; `RefusedError` for a shutdown if another node has the address."""

@@ -27,7 +27,7 @@ from appliance.policy.model import Address, Category, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
 from appliance.policy.rights import asks_to_call
-from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
 from appliance.specifications.specification_files import CheckedSpecifications
 from appliance.store.state_file import PermissionRow
@@ -72,6 +72,7 @@ RELAY_NAME = "/rosrv"
 OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted | messages.RequestHeld
 OwnAnswer = messages.OwnServiceAnswered | messages.MonitorCallAnswered | messages.HeldRequestDecided
 _AGAIN_SECONDS = 0.1
+_PATIENCE = 4.0
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
 
@@ -395,13 +396,21 @@ class RelayControl:
             post.send(messages.UpstreamRefused(key, topic, "the node no longer publishes this topic"))
             return
         try:
-            answer = await self.nodes.call(incarnation, "requestTopic", RELAY_NAME, topic, [["TCPROS"]])
-            port = tcpros_port(answer)
+            port = tcpros_port(await self._request_topic(incarnation, topic))
         except CallFailedError as error:
             post.send(messages.UpstreamRefused(key, topic, str(error)))
             self.broken(incarnation)
             return
         post.send(messages.UpstreamFound(key, topic, str(incarnation.host), port))
+
+    async def _request_topic(self, incarnation: Incarnation, topic: str) -> Value:
+        """Ask for a publisher's address; a slow node gets longer, because a subscriber of ROS waits without a limit."""
+        try:
+            return await self.nodes.call(incarnation, "requestTopic", RELAY_NAME, topic, [["TCPROS"]])
+        except UnansweredError:
+            self.broken(incarnation)
+            client = self.nodes.client(incarnation, patience=_PATIENCE)
+            return await client.call("requestTopic", RELAY_NAME, topic, [["TCPROS"]])
 
 
 def _names(policy: Policy, host: Address) -> bool:
