@@ -1,6 +1,6 @@
 """Call nodes that did not ask for it: which parameters a node cached under another master is unknown.
 
-1. No other call to a node waits for these: they have connections and turns of their own.
+1. No other call to a node waits for these: they have connections and turns of their own, by host.
 2. A node gets only the newest call of a key, and a pause between two rounds of calls.
 3. A node that answers that it did not subscribe to a key gets none of that key any more (rospy). One that does not
    answer several times gets none at all: its client library has no such call. roscpp answers each.
@@ -13,11 +13,12 @@ from typing import Generic, Protocol, TypeVar
 
 import structlog
 
+from appliance.policy.model import Address
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import Value
 
 _APART_SECONDS = 0.2  # between two rounds of calls to a node
-_AT_ONCE = 8
+_AT_ONCE_OF_HOST = 8
 _MOST_UNANSWERED = 5  # in a row; a node that hangs for some seconds still gets the newest value
 _MOST_KEYS = 2_000  # of a node, that wait or are known not to be subscribed
 
@@ -32,6 +33,9 @@ class Named(Protocol):
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def host(self) -> Address: ...
 
 
 N = TypeVar("N", bound=Named)
@@ -52,7 +56,7 @@ class UnaskedCalls(Generic[N, C]):
     def __init__(self, call: Callable[[N, C], Awaitable[Value]]) -> None:
         self._call = call
         self._nodes: dict[str, _Node[C]] = {}
-        self._turns = asyncio.Semaphore(_AT_ONCE)
+        self._turns: dict[Address, asyncio.Semaphore] = {}
 
     def push(self, node: N, key: str, call: C) -> None:
         known = self._nodes.setdefault(node.key, _Node())
@@ -75,6 +79,7 @@ class UnaskedCalls(Generic[N, C]):
             if known.worker is not None:
                 known.worker.cancel()
         self._nodes.clear()
+        self._turns.clear()
 
     async def _work(self, node: N, known: _Node[C]) -> None:
         while known.waiting:
@@ -88,7 +93,7 @@ class UnaskedCalls(Generic[N, C]):
         known.worker = None
 
     async def _tell(self, node: N, known: _Node[C], key: str) -> None:
-        async with self._turns:
+        async with self._turns.setdefault(node.host, asyncio.Semaphore(_AT_ONCE_OF_HOST)):
             call = known.waiting.pop(key, None)
             if call is None:
                 return

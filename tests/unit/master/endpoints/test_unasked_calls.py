@@ -119,3 +119,19 @@ def test_nothing_is_sent_after_the_end() -> None:
         await asyncio.sleep(10)
 
     assert run(Robot(), story).got == []
+
+
+def test_nodes_of_a_host_that_never_answer_delay_no_node_of_another() -> None:
+    got: list[str] = []
+
+    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
+        for number in range(500):
+            calls.push(incarnation(f"/a{number}", host="10.0.0.66"), "/speed", ("/speed", 1))
+        calls.push(incarnation("/base"), "/speed", ("/speed", 1))
+        await asyncio.sleep(1)
+        got.extend(name for name, *_value in robot.got)
+        calls.clear()
+
+    robot = Robot(silent={f"/a{number}" for number in range(500)})
+    run(robot, story)
+    assert got == ["/base"]
