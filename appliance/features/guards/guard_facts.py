@@ -10,13 +10,14 @@ from appliance.features.guards.robot_graph import TopicFacts
 
 
 def facts_of(graph: Graph) -> list[TopicFacts]:
-    return [
-        TopicFacts(
-            one.name, one.type, tuple(each.node for each in one.publishers), tuple(one.subscribers),
-            sum(each.messages_per_second for each in one.publishers),
-        )
-        for one in graph.topics
-    ]  # fmt: skip
+    hosts = {node.name: node.host for node in graph.nodes}
+    found = []
+    for one in graph.topics:
+        publishers, subscribers = tuple(each.node for each in one.publishers), tuple(one.subscribers)
+        ends = tuple(sorted({hosts[node] for node in (*publishers, *subscribers) if node in hosts}))
+        rate = sum(each.messages_per_second for each in one.publishers)
+        found.append(TopicFacts(one.name, one.type, publishers, subscribers, rate, ends))
+    return found
 
 
 def preset_row(preset: Preset) -> PresetRow:

@@ -33,13 +33,14 @@ Namespace = tuple[str, ...]
 
 
 class TopicFacts(NamedTuple):
-    """A topic with its type, the nodes at both ends, and its messages per second."""
+    """A topic with its type, the nodes at both ends, its messages per second, and the hosts of these nodes."""
 
     name: str
     type: str
     publishers: tuple[str, ...]
     subscribers: tuple[str, ...]
     rate: float = 0.0
+    hosts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ left out, and a sentence names the alternatives.
 """
 
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -104,13 +105,28 @@ class Advice:
     left_out: list[str]
 
 
+def _by_host(topics: Iterable[TopicFacts]) -> list[TopicFacts]:
+    """Order topics by name, so that hosts alternate: the topics of one host crowd out none of another.
+
+    A topic of several hosts counts for the one with the fewest.
+    """
+    ordered = sorted(topics)
+    counts = Counter(host for topic in ordered for host in topic.hosts)
+    turns, placed = Counter[str](), list[tuple[int, TopicFacts]]()
+    for topic in ordered:
+        host = min(topic.hosts, key=lambda one: (counts[one], one), default="")
+        turns[host] += 1
+        placed.append((turns[host], topic))
+    return [topic for _turn, topic in sorted(placed, key=lambda row: row[0])]
+
+
 def advice(
     topics: Iterable[TopicFacts], loaded: Sequence[LoadedGuard] = (), names: Collection[str] = ()
 ) -> Advice:
     """Return guards for all topics that command a base or an arm. `names` are those of all monitors in use."""
     read = [
         topic
-        for topic in sorted(topics)
+        for topic in _by_host(topics)
         if topic.type in _READ
         or topic.type.endswith("Goal")
         or COMMAND.search(topic.name)

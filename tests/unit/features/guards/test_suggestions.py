@@ -271,3 +271,18 @@ def test_a_topic_that_comes_later_has_the_type_that_is_given() -> None:
     goal = "/arm_controller/follow_joint_trajectory/goal"
     answer = planned(PRESETS["answer"], "answer", {"command": goal}, graph_of("fetch"), {}, {})
     assert answer.topics["cancel"] == goal.replace("/goal", "/cancel")
+
+
+def test_topics_of_another_host_crowd_out_none_of_the_robot() -> None:
+    graph = [
+        TopicFacts(
+            "/cmd_vel", "geometry_msgs/Twist", ("/nav",), ("/base",), 10.0, ("10.0.0.66", "127.0.0.1")
+        ),
+        *(
+            TopicFacts(f"/a{number}/cmd_vel", "geometry_msgs/Twist", ("/a",), ("/b",), 10.0, ("10.0.0.66",))
+            for number in range(600)
+        ),
+    ]
+    assert "/cmd_vel" in {one.command for one in advice(graph).proposals} | {
+        topic for one in advice(graph).proposals for topic in one.topics.values()
+    }
