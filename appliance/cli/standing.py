@@ -1,31 +1,46 @@
 """Wait until a robot stands still: before its protection is changed, a person wants to see that it does not move.
 
-1. A robot stands if its last command was zero, and, where it measures its own speed, that was zero too, both for some
-   seconds. All commands and all odometry count.
-2. Silence is not standing: without a commanded zero, or while odometry is silent, the robot is not known to stand.
-3. The wait has an end, with a reason.
-4. Motions that no such topic reports are not seen: an arm, a base with other messages, and without odometry the real
+1. A robot stands if the last command of each of its command topics was zero, and, where it measures its own speed, that
+   was zero too, both for some seconds.
+2. Silence is not standing: without a commanded zero, or while odometry is silent, the robot is not known to stand. A
+   topic without a command is no obstacle beside another with a zero if each of its drivers measures zero; it is named.
+3. Only topics of the robot count: its nodes drive by them, or publish them to a driver elsewhere. Topics of other hosts
+   neither prevent nor prove anything; they are named.
+4. The wait has an end, with a reason.
+5. Motions that no such topic reports are not seen: an arm, a base with other messages, and without odometry the real
    speed. The answer names it.
 """
 
 import asyncio
 import functools
 import math
-from collections.abc import Collection, Iterable, Mapping
+import re
+import threading
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from dataclasses import dataclass, field
+from ipaddress import ip_address, ip_network
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.cli.connection.admin_client import AdminSocket
+from appliance.base.host_names import addresses_of
+from appliance.channel.admin import AdminRequest, GraphWanted, PolicyWanted
+from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.channel.operations import request_named
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import usage_error
 from appliance.network.interfaces import addresses_by_interface
 from appliance.network.namespaces import Namespace
+from appliance.rpc.graph_reader import is_here
 from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph, MasterReader, MasterReadError
 from rosmop.tool.terminal import printable, refused, say
 from roswire.definitions import Definitions
@@ -37,13 +52,16 @@ from roswire.node.tcpros_streams import NodeLimits
 from roswire.node.topics import Received
 from roswire.standard import standard_definitions
 from roswire.tcpros import Body
-from roswire.uris import parse_node_uri
+from roswire.uris import node_uri, parse_node_uri
 
+A = TypeVar("A")
 STILL_SECONDS = 3.0
 _NAME = "/rosrv_standing"
 _LINK = "veth-rosrv"
 _SPEED = 0.01  # m/s, rad/s
 _LOOK_SECONDS = 0.2
+_MOST_OF_LOOK = 20  # messages
+_COUNTED_SECONDS = 1.5  # after which the appliance's numbers have what passed
 _MOST = 16  # topics of each kind
 _SHOWN = 3
 WITHIN = 120.0
@@ -54,6 +72,9 @@ _COMMANDS: Mapping[str, tuple[str, ...]] = {
 }
 _ODOMETRY: Mapping[str, tuple[str, ...]] = {"nav_msgs/Odometry": ("twist", "twist")}
 """The fields above the twist, by the type of the topic."""
+_COMMAND_NAME = re.compile(r"cmd|command|setpoint|drive", re.IGNORECASE)
+_OBSERVER = re.compile(r"/(?:record_\d|rosbag|rqt|rviz|plotjuggler)[^/]*$")
+"""Nodes that record or show topics, and drive nothing."""
 _OTHER_COMMANDS = ("ackermann_msgs/", "control_msgs/", "mavros_msgs/", "std_msgs/Float64", "trajectory_msgs/")
 """The beginnings of types that command a motion in a way that is not read here."""
 
@@ -90,13 +111,26 @@ class NotStandingError(Exception):
     """The robot did not stop before the end of the wait, or its topics cannot be heard; the message says why."""
 
 
+@dataclass(frozen=True)
+class MotionTopics:
+    """The topics that tell of a robot's motions. `commands` has the odometry of the drivers of each command topic.
+
+    The odometry is empty if a driver measures none. `others` are command topics of other hosts.
+    """
+
+    commands: Mapping[str, frozenset[str]]
+    odometry: frozenset[str]
+    others: tuple[str, ...] = ()
+
+
 @dataclass
 class StandingJudge:
     """Decides whether a robot stands, by the speeds that its topics say. Times are in seconds of one clock."""
 
-    commands: frozenset[str]
-    odometry: frozenset[str]
+    topics: MotionTopics
     seconds: float = STILL_SECONDS
+    deaf: str = ""
+    """Why a topic cannot be heard."""
     _moved: dict[str, float] = field(default_factory=dict, init=False)
     _still_since: dict[str, float] = field(default_factory=dict, init=False)
     _heard: dict[str, float] = field(default_factory=dict, init=False)
@@ -109,20 +143,35 @@ class StandingJudge:
             self._moved[topic] = now
             self._still_since.pop(topic, None)
 
+    @property
+    def commanded(self) -> list[str]:
+        """The command topics whose last command was zero."""
+        return sorted(self.topics.commands.keys() & self._still_since)
+
+    @property
+    def silent(self) -> list[str]:
+        """The command topics without a command."""
+        return sorted(self.topics.commands.keys() - self._heard)
+
     def why_not(self, now: float) -> str:
         """Return why the robot is not known to stand; empty if it stands."""
-        if not self.commands:
-            return "no topic commands a base (geometry_msgs/Twist)"
-        for topic in sorted((self.commands | self.odometry) & self._moved.keys()):
+        commands, odometry = self.topics.commands, self.topics.odometry
+        if self.deaf:
+            return self.deaf
+        if not commands:
+            elsewhere = f"; of other hosts: {_some(self.topics.others)}" if self.topics.others else ""
+            return f"no topic commands a base of this robot (geometry_msgs/Twist){elsewhere}"
+        for topic in sorted((commands.keys() | odometry) & self._moved.keys()):
             if topic not in self._still_since:
                 return f"{topic} says that it moves"
-        commanded = [topic for topic in self.commands if topic in self._still_since]
-        if not commanded:
-            return f"no zero was commanded on {', '.join(sorted(self.commands))}"
-        for topic in sorted(self.odometry):
+        commanded = self.commanded
+        unknown = [topic for topic in self.silent if not commanded or not commands[topic]]
+        if unknown:
+            return f"no zero was commanded on {', '.join(unknown)}"
+        for topic in sorted(odometry):
             if now - self._heard.get(topic, -math.inf) > self.seconds:
                 return f"{topic} is silent"
-        still = max(self._still_since[topic] for topic in {*commanded, *self.odometry})
+        still = max(self._still_since[topic] for topic in {*commanded, *odometry})
         left = self.seconds - (now - still)
         return f"it stands for less than {self.seconds:g} s" if left > 0 else ""
 
@@ -134,8 +183,7 @@ def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
             "--when-standing listens to the robot's topics: run it on the appliance's machine", verb
         )
     try:
-        master, source = _master_of(appliance.way.state)
-        said = asyncio.run(wait_until_standing(master, within, source))
+        said = asyncio.run(wait_until_robot_stands(appliance, appliance.way.state, within))
     except NotStandingError as error:
         raise refused([printable(f"{verb}: {error}. Nothing was changed")]) from None
     if not appliance.as_json:
@@ -153,7 +201,61 @@ def _master_of(state: Path) -> tuple[str, str]:
         raise NotStandingError(
             f"no appliance has run in {state} ({why}): name its state directory with --state"
         ) from None
-    return f"http://127.0.0.1:{settings.listen_address[1]}", link_address() or "127.0.0.1"
+    host, port = settings.listen_address
+    if settings.isolation == "netns" or ip_address(host).is_unspecified:
+        host = "127.0.0.1"
+    return node_uri(host, port), link_address() or host
+
+
+def _asked(appliance: Appliance, request: AdminRequest[A]) -> A:
+    """Return the appliance's answer. Raises `NotStandingError`."""
+    try:
+        answer = appliance.ask(request)
+    except NotRunningError as error:
+        raise NotStandingError(str(error)) from None
+    if not answer.ok:
+        raise NotStandingError(answer.error)
+    return answer.given()
+
+
+def _graph_of(found: Graph) -> MasterGraph:
+    ends = [(PUBLICATION, topic.name, one.node) for topic in found.topics for one in topic.publishers]
+    ends += [(SUBSCRIPTION, topic.name, name) for topic in found.topics for name in topic.subscribers]
+    return MasterGraph(frozenset(ends), {topic.name: topic.type for topic in found.topics})
+
+
+def _robot_nodes(found: Graph, policy: PolicyInForce) -> frozenset[str]:
+    """Return the nodes of the robot's machine: those of the hosts that the policy calls `robot`.
+
+    Without one, as beside an appliance in a container, all nodes count.
+    """
+    networks = [ip_network(text, strict=False) for text in (*policy.robot, *policy.own)]
+
+    def is_robot(host: str) -> bool:
+        address = ip_address(host)
+        return address.is_loopback or any(address in network for network in networks)
+
+    here = frozenset(node.name for node in found.nodes if is_robot(node.host))
+    return here or frozenset(node.name for node in found.nodes)
+
+
+def _nodes_here(graph: MasterGraph) -> frozenset[str]:
+    """Return the nodes of this machine, by the addresses that they registered at their master."""
+    hosts: dict[str, str] = {}
+    for name, text in graph.nodes.items():
+        with suppress(RosError):
+            hosts[name] = parse_node_uri(text).host
+    names = {host for host in hosts.values() if not _is_address(host)}
+    found = addresses_of(names)
+    return frozenset(
+        name for name, host in hosts.items() if any(is_here(one) for one in found.get(host, [host]))
+    )
+
+
+def _is_address(text: str) -> bool:
+    with suppress(ValueError):
+        return bool(ip_address(text))
+    return False
 
 
 def link_address() -> str:
@@ -163,7 +265,7 @@ def link_address() -> str:
 
 
 async def wait_until_standing(master: str, longest: float, source: str = "127.0.0.1") -> str:
-    """Wait until the robot at this master stands; return the signs of it, and what is not seen.
+    """Wait until the robot at its own master stands; return the signs of it, and what is not seen.
 
     Raises `NotStandingError`, at the latest after `longest` s.
     `source` is an address of this machine that the robot's nodes reach.
@@ -172,67 +274,197 @@ async def wait_until_standing(master: str, longest: float, source: str = "127.0.
         graph = await MasterReader(parse_node_uri(master)).read()
     except (MasterReadError, RosError) as error:
         raise NotStandingError(f"the topics at {master} cannot be read: {error}") from None
-    commands = _topics(graph, _COMMANDS, SUBSCRIPTION)
-    odometry = _topics(graph, _ODOMETRY, PUBLICATION)
-    judge = StandingJudge(frozenset(commands), frozenset(odometry))
-    node = RosNode(_NAME, master, SourceNetwork(source), limits=NodeLimits(), shut_down=lambda _reason: None)
-    await node.start()
+    own = await asyncio.to_thread(_nodes_here, graph)
     try:
-        for topic in (*commands, *odometry):
-            await node.subscribe(topic, _listener(judge, topic, graph.types[topic]))
-        until = clock.now() + longest
-        while why := judge.why_not(clock.now()):
-            if clock.now() > until or not commands:
-                raise NotStandingError(f"the robot is not known to stand still: {why}")
-            await asyncio.sleep(_LOOK_SECONDS)
+        return await _wait(graph, motion_topics(graph, own), longest, _by_node(master, source))
     except RosError as error:
         raise NotStandingError(f"the topics cannot be heard: {error}") from None
-    finally:
-        await node.close()
-    seen = f" and {counted(len(odometry), 'odometry topic')}" if odometry else ""
-    stands = f"the robot stands still: zero for {judge.seconds:g} s on {', '.join(commands)}{seen}"
-    return f"{stands}. Not seen: {unseen(graph)}"
 
 
-def unseen(graph: MasterGraph) -> str:
+async def wait_until_robot_stands(appliance: Appliance, state: Path, longest: float) -> str:
+    """Do the same as `wait_until_standing` for the robot of the appliance on this machine.
+
+    Where the policy does not let this machine subscribe, as in a container, the appliance shows the messages.
+    """
+    master, source = _master_of(state)
+    found = _asked(appliance, GraphWanted())
+    graph = _graph_of(found)
+    topics = motion_topics(graph, _robot_nodes(found, _asked(appliance, PolicyWanted())))
+    try:
+        return await _wait(graph, topics, longest, _by_node(master, source))
+    except RosError:
+        return await _wait(graph, topics, longest, _by_looks(appliance, found))
+
+
+Unheard = Callable[[], Awaitable[str]]
+"""Returns the command topics of which a message passed unheard, and no later one was heard."""
+
+Hearing = Callable[[StandingJudge, Mapping[str, str]], AbstractAsyncContextManager[Unheard]]
+"""Tells a judge the speeds of topics with these types, until the end of the context."""
+
+
+async def _wait(graph: MasterGraph, topics: MotionTopics, longest: float, hearing: Hearing) -> str:
+    for found in (topics.commands, topics.odometry):
+        if len(found) > _MOST:
+            raise NotStandingError(
+                f"{counted(len(found), 'topic')} of a base are more than can be heard ({_MOST})"
+            )
+    judge, until = StandingJudge(topics), clock.now() + longest
+    types = {topic: graph.types[topic] for topic in sorted({*topics.commands, *topics.odometry})}
+    async with hearing(judge, types) as unheard:
+        while why := judge.why_not(clock.now()) or await unheard():
+            if clock.now() > until or judge.deaf or not topics.commands:
+                raise NotStandingError(f"the robot is not known to stand still: {why}")
+            await asyncio.sleep(_LOOK_SECONDS)
+    seen = f" and {counted(len(topics.odometry), 'odometry topic')}" if topics.odometry else ""
+    stands = f"the robot stands still: zero for {judge.seconds:g} s on {', '.join(judge.commanded)}{seen}"
+    return f"{stands}. Not seen: {unseen(graph, topics, judge.silent)}"
+
+
+def _by_node(master: str, source: str) -> Hearing:
+    """Hear as a node of the graph. The context raises `RosError` where a topic cannot be heard."""
+
+    async def nothing() -> str:
+        return ""
+
+    @asynccontextmanager
+    async def hear(judge: StandingJudge, types: Mapping[str, str]) -> AsyncIterator[Unheard]:
+        network = SourceNetwork(source)
+        node = RosNode(_NAME, master, network, limits=NodeLimits(), shut_down=lambda _reason: None)
+        try:
+            await node.start()
+            for topic, kind in types.items():
+                await node.subscribe(topic, _listener(judge, topic, kind))
+            yield nothing
+        finally:
+            await node.close()
+
+    return hear
+
+
+def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
+    """Hear by looks of the appliance, one after the other for each topic. Between two looks, a message may pass.
+
+    The appliance counts the messages of each publisher, and reports each second: a command that passed unheard, and was
+    followed by none that was heard, is found by the numbers.
+    """
+    look: Any = request_named("topic look")
+    before = _messages(began)
+
+    @asynccontextmanager
+    async def hear(judge: StandingJudge, types: Mapping[str, str]) -> AsyncIterator[Unheard]:
+        heard, last = Counter[str](), dict[str, float]()
+        loop, over = asyncio.get_running_loop(), threading.Event()
+
+        def follow(topic: str, kind: str) -> None:
+            try:
+                while not over.is_set():
+                    seen = _asked(appliance, look(topic, _MOST_OF_LOOK, 1.0)).messages
+                    loop.call_soon_threadsafe(note, topic, kind, seen)
+            except NotStandingError as error:
+                loop.call_soon_threadsafe(setattr, judge, "deaf", f"{topic} cannot be heard: {error}")
+
+        def note(topic: str, kind: str, seen: list[Any]) -> None:
+            for message in seen:
+                heard[topic] += 1
+                last[topic] = clock.now()
+                judge.hear(topic, math.inf if message.why else _speed(kind, message.fields), clock.now())
+
+        async def unheard() -> str:
+            await asyncio.sleep(_COUNTED_SECONDS)
+            now = _messages(await asyncio.to_thread(_asked, appliance, GraphWanted()))
+            quiet = [
+                topic
+                for topic in judge.topics.commands
+                if clock.now() - last.get(topic, -math.inf) > STILL_SECONDS
+            ]
+            missed = [topic for topic in sorted(quiet) if now[topic] - before[topic] > heard[topic]]
+            return f"a command on {_some(missed)} was not heard" if missed else ""
+
+        with ThreadPoolExecutor(max(1, len(types)), "looks") as threads:
+            for row in types.items():
+                threads.submit(follow, *row)
+            try:
+                yield unheard
+            finally:
+                over.set()
+
+    return hear
+
+
+def _messages(graph: Graph) -> Counter[str]:
+    return Counter({topic.name: sum(one.messages for one in topic.publishers) for topic in graph.topics})
+
+
+def unseen(graph: MasterGraph, topics: MotionTopics, silent: Collection[str] = ()) -> str:
     """Return in words what the topics of a graph do not tell about motions."""
-    parts = (
-        []
-        if _topics(graph, _ODOMETRY, PUBLICATION)
-        else ["the real speed, because no node publishes odometry"]
-    )
+    parts = [] if topics.odometry else ["the real speed, because no node publishes odometry"]
+    if silent:
+        parts.append(f"a command on {_some(silent)}")
     used = {resource for kind, resource, _name in graph.entries if kind == SUBSCRIPTION}
     others = sorted(topic for topic in used if graph.types.get(topic, "").startswith(_OTHER_COMMANDS))
     if others:
-        more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
-        parts.append(f"what {', '.join(others[:_SHOWN])}{more} may move")
+        parts.append(f"what {_some(others)} may move")
+    if topics.others:
+        parts.append(f"what {_some(topics.others)} of other hosts may move")
     parts.append("motions that no topic commands")
     return "; ".join(parts)
 
 
-def _topics(graph: MasterGraph, kinds: Collection[str], end: str) -> list[str]:
-    used = {resource for kind, resource, _name in graph.entries if kind == end}
-    found = sorted(topic for topic in used if graph.types.get(topic) in kinds)
-    if len(found) > _MOST:
-        raise NotStandingError(
-            f"{counted(len(found), 'topic')} of a base are more than can be heard ({_MOST})"
-        )
-    return found
+def _some(topics: Collection[str]) -> str:
+    listed = sorted(topics)
+    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    return f"{', '.join(listed[:_SHOWN])}{more}"
+
+
+def motion_topics(graph: MasterGraph, own: Collection[str]) -> MotionTopics:
+    """Return the topics that tell of the motions of a robot with these nodes.
+
+    A driver subscribes to a command, and passes it on to no other node of the robot, as a multiplexer does. A recorder
+    or a display is no driver.
+    """
+    ends: dict[str, dict[str, set[str]]] = {PUBLICATION: {}, SUBSCRIPTION: {}}
+    for kind, topic, name in graph.entries:
+        if kind in ends and not (kind == SUBSCRIPTION and _OBSERVER.search(name)):
+            ends[kind].setdefault(topic, set()).add(name)
+    publishers, subscribers = ends[PUBLICATION], ends[SUBSCRIPTION]
+    twists = [topic for topic in subscribers if graph.types.get(topic) in _COMMANDS]
+    measured = {topic: publishers[topic] for topic in publishers if graph.types.get(topic) in _ODOMETRY}
+    passing = {
+        name
+        for topic in twists
+        if _COMMAND_NAME.search(topic)
+        for name in publishers.get(topic, ())
+        if not subscribers[topic].isdisjoint({*own} - {name})
+    }
+    commands, others, driving = dict[str, frozenset[str]](), list[str](), set[str]()
+    for topic in sorted(twists):
+        drivers = subscribers[topic] - passing
+        if drivers.isdisjoint(own) and publishers.get(topic, set()).isdisjoint(own):
+            others += [topic] if drivers else []
+        elif drivers:
+            sources = [{one for one, names in measured.items() if name in names} for name in drivers]
+            commands[topic] = frozenset[str]().union(*sources) if all(sources) else frozenset()
+            driving |= drivers
+    odometry = {topic for topic, names in measured.items() if not names.isdisjoint(driving.union(own))}
+    return MotionTopics(commands, frozenset(odometry), tuple(others))
 
 
 def _listener(judge: StandingJudge, topic: str, kind: str) -> Received:
-    path = _COMMANDS.get(kind, _ODOMETRY.get(kind, ()))
-
     def heard(data: Body, _header: Mapping[str, str]) -> None:
-        judge.hear(topic, speed_in(kind, path, bytes(data)), clock.now())
+        judge.hear(topic, speed_in(kind, bytes(data)), clock.now())
 
     return heard
 
 
-def speed_in(kind: str, path: Iterable[str], data: bytes) -> float:
+def speed_in(kind: str, data: bytes) -> float:
     """Return the largest component of a message's twist; infinity for a message that cannot be read."""
-    fields: object = read_fields(_definitions(), kind, data)
-    for name in path:
+    return _speed(kind, read_fields(_definitions(), kind, data))
+
+
+def _speed(kind: str, message: object) -> float:
+    fields = message
+    for name in {**_COMMANDS, **_ODOMETRY}.get(kind, ()):
         fields = fields.get(name) if isinstance(fields, dict) else None
     if not isinstance(fields, dict):
         return math.inf

@@ -21,11 +21,12 @@ from appliance.cli.standing import (
     WhenStanding,
     Within,
     link_address,
+    wait_until_robot_stands,
     wait_until_standing,
 )
 from appliance.features.adopt.adopt_answers import AdoptState, TakeOverReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, check_lines
-from appliance.features.adopt.adopt_record import load_record, save_record
+from appliance.features.adopt.adopt_record import Phase, load_record, save_record
 from appliance.features.adopt.machine_side import wanted_record
 from appliance.features.adopt.operator_orders import ADOPT, ordered
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus
@@ -42,6 +43,7 @@ _VERB = "rosrv adopt"
 _START_SECONDS = 180.0
 _LOOK_SECONDS = 0.5
 _WAITS = "waits: "
+_SHOWN = 20  # nodes that are not adopted
 
 
 @speaks_here
@@ -95,7 +97,7 @@ def adopt(
         if audit_only:
             _first_audit_only(appliance, robot, None if settings is None else settings.policy)
         if when_standing:
-            _wait(robot.port, within)
+            _wait(appliance, state, robot, within)
         _adopt(appliance, state)
     except NetworkError as error:
         typer.echo(f"{_VERB}: {error}", err=True)
@@ -128,10 +130,14 @@ def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | 
         raise NetworkError(answer.error)
 
 
-def _wait(port: int, within: float) -> None:
-    source = link_address() or "127.0.0.1"
+def _wait(appliance: Appliance, state: Path, robot: CheckedRobot, within: float) -> None:
     try:
-        say(asyncio.run(wait_until_standing(f"http://127.0.0.1:{port}", within, source)))
+        if robot.record.phase is Phase.TAKEN:  # the port leads to RVMaster
+            said = asyncio.run(wait_until_robot_stands(appliance, state, within))
+        else:
+            master, source = f"http://127.0.0.1:{robot.port}", link_address() or "127.0.0.1"
+            said = asyncio.run(wait_until_standing(master, within, source))
+        say(said)
     except NotStandingError as error:
         raise NetworkError(f"{error}. Nothing was changed") from None
 
@@ -218,14 +224,14 @@ def _show_started(found: AdoptState, *, as_json: bool) -> None:
 def _show_left(found: TakeOverReport | AdoptState) -> None:
     for entry, why in found.denied.items():
         say(printable(f"denied: {entry}: {why}"))
-    for name, why in found.missing.items():
+    for name, why in [*found.missing.items()][:_SHOWN]:
         say(printable(f"not adopted: {name}: {why}"))
+    if len(found.missing) > _SHOWN:
+        say(f"not adopted: {len(found.missing) - _SHOWN} more nodes: --json lists them")
     for port, process in found.not_cut.items():
         say(printable(f"not cut: {port}: {process}"))
     if found.not_cut:
-        say(
-            "Restart these programs, which do not look like ROS nodes: what they publish bypasses the appliance"
-        )
+        say("Restart these programs: what they publish may bypass the appliance")
 
 
 def _show_status(appliance: Appliance) -> None:

@@ -16,15 +16,14 @@ from appliance.cli.output import say_json, usage_error
 from appliance.cli.standing import (
     WITHIN,
     NotStandingError,
-    link_address,
     longest_wait,
-    wait_until_standing,
+    wait_until_robot_stands,
 )
 from appliance.features.adopt.adopt_answers import GiveBackReport
 from appliance.features.adopt.dead_release import release_dead
 from appliance.features.adopt.operator_orders import RELEASE, ordered
 from appliance.features.adopt.requests import ReleaseOrder
-from appliance.features.adopt.robot_side import MASTER_PORT, remove_drop_ins, running_settings
+from appliance.features.adopt.robot_side import remove_drop_ins
 from appliance.network.namespaces import NetworkError
 from rosmop.tool.terminal import printable, say
 
@@ -115,14 +114,9 @@ def _stand(appliance: Appliance, within: float) -> None:
         return
     if not answer.ok or not answer.given().monitors.enabled:
         return
-    settings = running_settings(appliance.way.state) if isinstance(appliance.way, AdminSocket) else None
-    port = MASTER_PORT if settings is None else settings.listen_address[1]
+    assert isinstance(appliance.way, AdminSocket)  # noqa: S101  the verb is given on this machine
     try:
-        say(
-            asyncio.run(
-                wait_until_standing(f"http://127.0.0.1:{port}", within, link_address() or "127.0.0.1")
-            )
-        )
+        say(asyncio.run(wait_until_robot_stands(appliance, appliance.way.state, within)))
     except NotStandingError as error:
         raise NetworkError(
             f"monitors are enabled, and {error}. Nothing was changed; --force releases anyway"
