@@ -21,7 +21,7 @@ class AdoptState(msgspec.Struct, frozen=True):
     master: Annotated[str, doc("the robot's own master, which was recorded")]
     present: Annotated[bool, doc("whether that master runs; without it, a release starts another one")]
     obstacle: Annotated[str, doc("why the graph is not as wanted; empty if it is")]
-    nodes: Annotated[int, doc("nodes that were adopted")]
+    nodes: Annotated[int, doc("nodes of the robot that answer, with a registration")]
     not_started: Annotated[
         int, doc("adopted nodes that have not started since, so their start was never seen")
     ]
@@ -30,8 +30,8 @@ class AdoptState(msgspec.Struct, frozen=True):
     not_cut: Annotated[
         dict[str, str],
         doc(
-            "ports whose connections were not cut, because the process does not look like a ROS node; until it is"
-            " restarted, what it publishes bypasses the appliance"
+            "ports and nodes whose connections were not cut, or not known to have ended, with the reasons; until the"
+            " program is restarted, what it publishes may bypass the appliance"
         ),
     ] = {}
 

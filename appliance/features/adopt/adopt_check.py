@@ -28,6 +28,7 @@ from appliance.rpc.graph_inventory import GraphInventory, SurveyedNode, problems
 Level = Literal["ok", "warn", "stop"]
 _CGROUPS = Path("/sys/fs/cgroup/cgroup.controllers")
 _SHOWN = 5
+_MOST_PROBLEMS = 20
 _SYSTEMCTL_SECONDS = 5.0
 _SHELLS = {"sh", "dash", "bash", "zsh"}
 _DEPENDS = ("RequiredBy", "BoundBy", "ConsistsOf")
@@ -54,6 +55,8 @@ class CheckedRobot:
     policy: Policy | None
     robot: Address
     """The address of the robot in the policy's group `robot`."""
+    node_ports: frozenset[int] = frozenset()
+    """The ports of this machine's processes that look like nodes."""
 
     def is_here(self, node: SurveyedNode) -> bool:
         return bool(node.host) and (ip_address(node.host).is_loopback or node.host in self.own)
@@ -74,9 +77,12 @@ def graph_lines(state: CheckedRobot) -> Iterator[CheckLine]:
     yield from _nodes(state, state.inventory)
     yield from _policy(state, state.inventory)
     yield _cuts(state, state.inventory)
-    for problem in problems(state.inventory):
-        if " cannot be asked: " not in problem:
-            yield CheckLine("warn", "graph", problem)
+    found = [one for one in problems(state.inventory) if " cannot be asked: " not in one]
+    for problem in found[:_MOST_PROBLEMS]:
+        yield CheckLine("warn", "graph", problem)
+    if len(found) > _MOST_PROBLEMS:
+        text = f"{len(found) - _MOST_PROBLEMS} more problems of the graph: rosrv survey lists them"
+        yield CheckLine("warn", "graph", text)
 
 
 def _adopted(state: CheckedRobot) -> CheckLine:
@@ -97,28 +103,28 @@ def _master(state: CheckedRobot) -> Iterator[CheckLine]:
         )
         return
     found = state.inventory
-    hosts = ", ".join(sorted(filter(None, {node.host for node in found.nodes})))
+    hosts = _some(filter(None, {node.host for node in found.nodes}))
     numbers = ", ".join((
         counted(len(found.nodes), "node"), counted(len(found.topics), "topic"),
         counted(len(found.services), "service"), counted(len(found.parameters), "parameter"),
     ))  # fmt: skip
     yield CheckLine("ok", "master", f"{state.master}, {numbers}, hosts {hosts or 'none'}")
     for left in found.left_out:
-        yield CheckLine("stop", "master", f"the graph is too large to be read: {left}")
+        yield CheckLine("warn", "master", f"not all of the graph was read: {left}")
 
 
 def _nodes(state: CheckedRobot, inventory: GraphInventory) -> Iterator[CheckLine]:
     asked = [node for node in inventory.nodes if node.name != "/rosout"]
     unplaced = {node.name: _host_in(node.uri) for node in asked if node.uri and not node.host}
     unknown = list(unplaced)
-    loopback = [node.name for node in asked if state.is_here(node) and _only_on_loopback(node, state.sockets)]
+    loopback = _on_loopback(state, asked)
     gone = [node.name for node in asked if node.problem and node.name not in {*unknown, *loopback}]
     if unknown:
         yield CheckLine(
-            "stop",
+            "warn",
             "hosts",
-            f"{_some(unplaced.values())}, the host of {_some(unknown)}, is not known here: add its address"
-            " to /etc/hosts",
+            f"{_some(unplaced.values())}, the host of {_some(unknown)}, is not known here, and its nodes stay with"
+            " their own master: add its address to /etc/hosts if it belongs to the robot",
         )
     if loopback:
         text = (
@@ -134,20 +140,34 @@ def _nodes(state: CheckedRobot, inventory: GraphInventory) -> Iterator[CheckLine
     elsewhere = sorted({node.host for node in asked if node.host and not state.is_here(node)})
     if elsewhere:
         text = (
-            f"other computers: {', '.join(elsewhere)}. Connections among them are not cut, and their nodes' ports stay"
+            f"other computers: {_some(elsewhere)}. Connections among them are not cut, and their nodes' ports stay"
             " open to every host: `rosrv protect`"
         )
         yield CheckLine("warn", "hosts", text)
 
 
-def _only_on_loopback(node: SurveyedNode, sockets: Iterable[TcpSocket]) -> bool:
-    with suppress(ValueError):
-        port = int(node.uri.rstrip("/").rpartition(":")[2])
-        if node.uri.startswith(("http://localhost:", "http://127.")):
-            return True
-        bound = {one.local_address for one in sockets if one.listens and one.port == port}
-        return bool(bound) and all(ip_address(address).is_loopback for address in bound)
-    return False
+def _on_loopback(state: CheckedRobot, nodes: Iterable[SurveyedNode]) -> list[str]:
+    """Return the nodes of this machine that the appliance cannot call.
+
+    Any host may have registered a name with a port of this machine. So the process must look like a node, and none of
+    its names may have an address that the appliance can call.
+    """
+    bound: dict[int, set[str]] = {}
+    for one in state.sockets:
+        if one.listens:
+            bound.setdefault(one.port, set()).add(one.local_address)
+    found, callable_ports = dict[str, int](), set[int]()
+    for node in nodes:
+        with suppress(ValueError):
+            port = int(node.uri.rstrip("/").rpartition(":")[2])
+            if not state.is_here(node) or port not in state.node_ports & bound.keys():
+                continue
+            only = all(ip_address(address).is_loopback for address in bound[port])
+            if only or node.uri.startswith(("http://localhost:", "http://127.")):
+                found[node.name] = port
+            else:
+                callable_ports.add(port)
+    return [name for name, port in found.items() if port not in callable_ports]
 
 
 def denied_registrations(

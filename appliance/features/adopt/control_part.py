@@ -230,11 +230,11 @@ class AdoptPart:
             master=f"{record.program} ({record.unit or f'user {record.user}'})" if record.program else "",
             present=facts.master is not None,
             obstacle=self._obstacle or facts.foreign_master,
-            nodes=len(self._graph.nodes()),
+            nodes=len(self._graph.taken()),
             not_started=sum(node.life is Life.LIVE for node in unasked),
             denied={" ".join(entry): why for entry, why in sorted(self._graph.denied.items())},
             missing=self._operation.left.nodes,
-            not_cut=self._operation.left.connections,
+            not_cut=self._operation.left.not_cut,
         )
 
     # --- what the operation uses ---

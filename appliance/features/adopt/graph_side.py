@@ -107,24 +107,34 @@ class AdoptedGraph:
         self,
         names: Iterable[str],
         besides: Mapping[str, Iterable[str]] = MappingProxyType({}),
-        *,
-        clock_too: bool = False,
     ) -> None:
-        """Send the subscribers of adopted nodes their lists, with the URIs of the appliance.
+        """Send the subscribers of adopted nodes their lists, with the URIs of the appliance; not those of `CLOCK`.
 
-        `besides` has more URIs for topics. Subscribers of `CLOCK` get none unless `clock_too`.
+        `besides` has more URIs for topics.
         """
         for name in names:
             node = self.registry.holder(name)
             if node is None:
                 continue
             for topic in node.resources(Kind.SUBSCRIPTION):
-                if topic == CLOCK and not clock_too:
+                if topic == CLOCK:
                     continue
                 if topic in besides:
                     self.subscribers.remind_besides(node, topic, besides[topic])
                 else:
                     self.subscribers.remind(node, topic)
+
+    def clocks(self, names: Iterable[str]) -> dict[tuple[Incarnation, str], tuple[str, ...]]:
+        """Return the lists of the subscribers of `CLOCK` among adopted nodes."""
+        nodes = [node for name in names if (node := self.registry.holder(name)) is not None]
+        return {
+            (node, CLOCK): self.given(node, CLOCK)
+            for node in nodes
+            if CLOCK in node.resources(Kind.SUBSCRIPTION)
+        }
+
+    def remind(self, node: Incarnation, topic: str) -> None:
+        self.subscribers.remind(node, topic)
 
     def given(self, node: Incarnation, topic: str) -> tuple[str, ...]:
         """Return the appliance's URIs of a topic's publishers, as a subscriber has them."""
@@ -137,6 +147,10 @@ class AdoptedGraph:
     def nodes(self) -> list[Incarnation]:
         """Return the nodes of the robot, also those that the policy or a failure suspended."""
         return [node for node in self.registry.all() if not node.own and node.life is not Life.REPLACED]
+
+    def taken(self) -> list[Incarnation]:
+        """Return the nodes of the robot that answer, and have a registration."""
+        return [node for node in self.nodes() if node.life is Life.LIVE and node.registrations]
 
     def held(self) -> Iterator[tuple[Entry, Incarnation]]:
         """Yield all registrations. One that the policy withdrew still exists for its node, and a node that does not

@@ -14,12 +14,10 @@ import ipaddress
 import math
 import os
 import pwd
-import re
 import shutil
 import subprocess
 import threading
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,6 +25,7 @@ import msgspec
 import structlog
 
 from appliance.base import clock
+from appliance.base.host_names import addresses_of
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, load_record, save_record
 from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts, RobotMaster
 from appliance.features.adopt.operator_orders import ADOPT, RELEASE, take_order
@@ -51,9 +50,7 @@ from appliance.supervisor.users import account_of
 STAND_IN_UNIT = "rosrv-left-master"
 ROSMASTER = "/usr/bin/rosmaster"
 _SYSTEMD = Path("/run/systemd/system")
-_MOST_NAMES, _MOST_PORTS = 500, 20_000
-_NAME = re.compile(r"[A-Za-z0-9_.-]{1,253}")
-_NAME_SECONDS, _NAMES_SECONDS = 2.0, 10.0
+_MOST_NAMES = _MOST_PORTS = 20_000
 _LOOKUP_SECONDS = 0.1
 _CALL_SECONDS = 0.25  # of an ordinary service call under way, which is not cut
 _START_SECONDS = 10.0
@@ -133,7 +130,7 @@ class AdoptWork:
             master=master_of(side.host, _master_port(side)),
             reaches={port: one.master_address for port, one in found.items() if one.master_address},
             sockets={port: sorted(one.listening) for port, one in found.items()},
-            resolved=resolved(side.host, names),
+            resolved=addresses_of(names, side.host.popen),
         )
         return dict(msgspec.to_builtins(facts))
 
@@ -372,40 +369,6 @@ def _stand_in_user(recorded: str) -> tuple[str, int, int]:
             return recorded, entry.pw_uid, entry.pw_gid
     account = account_of("rosmaster")
     return account.name, account.uid, account.gid
-
-
-def resolved(host: Namespace, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the addresses of host names, as the machine resolves them; an unknown name has none.
-
-    The names come from nodes. The machine's own file comes first, so that no slow name of a hostile node delays a name
-    in it, and name servers get some seconds for all.
-    """
-    until = clock.now() + _NAMES_SECONDS
-
-    def addresses(name: str, *service: str) -> list[str]:
-        seconds = min(_NAME_SECONDS, until - clock.now())
-        if not _NAME.fullmatch(name) or seconds <= 0:
-            return []
-        with suppress(subprocess.TimeoutExpired, OSError):
-            with host.popen(
-                ["getent", *service, "ahosts", "--", name],
-                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-            ) as asked:  # fmt: skip
-                try:
-                    text, _ = asked.communicate(timeout=seconds)
-                finally:
-                    asked.kill()
-            return list(dict.fromkeys(line.split()[0] for line in text.splitlines() if line.split()))
-        return []
-
-    wanted = sorted(set(names))
-    with ThreadPoolExecutor(8, "resolver") as threads:
-        found = dict(
-            zip(wanted, threads.map(lambda name: addresses(name, "-s", "files"), wanted), strict=True)
-        )
-        others = [name for name in wanted if not found[name]]
-        found.update(zip(others, threads.map(addresses, others), strict=True))
-    return found
 
 
 def _master_port(side: Isolation) -> int:

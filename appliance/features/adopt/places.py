@@ -1,23 +1,33 @@
 """Find the host of each node of the robot's master: where its URI leads, and its port answers."""
 
-import asyncio
 import ipaddress
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from appliance.base import clock
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.policy.model import Address
+from appliance.rpc.host_shares import HostShare, serve_by_host
 from appliance.rpc.master_reader import CALLER
-from appliance.rpc.xmlrpc_client import CallFailedError, XmlRpcClient
+from appliance.rpc.xmlrpc_client import (
+    CallFailedError,
+    RefusedError,
+    UnansweredError,
+    UnreachedError,
+    XmlRpcClient,
+)
 from roswire.errors import InvalidUriError
 from roswire.uris import NodeUri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits
 
+TOPIC_SECONDS = 5.0
+"""The time of `requestTopic`: a node that needs four seconds for it is slow, and no reason to leave connections."""
+
 _SECONDS = 2.0
-_WHOLE_SECONDS = 30.0
-_AT_ONCE = 16
+_MOST_ADDRESSES = 8  # of one name
+_MOST_FAILED = 64  # of one host
+_SHARE = HostShare(host=3.0, whole=5.0)
 _LIMITS = XmlRpcLimits(body=256 << 10)
 
 
@@ -32,6 +42,13 @@ class NodePlace(NamedTuple):
     def call_uri(self) -> NodeUri:
         return NodeUri("http", str(self.host), self.uri.port, self.uri.path)
 
+    def is_here(self, facts: MachineFacts) -> bool:
+        return str(self.host) == facts.link or facts.is_here(str(self.host))
+
+    def share(self, facts: MachineFacts) -> str:
+        """Return the share by which it is asked: that of its port on this machine, or of its host."""
+        return f"port {self.uri.port}" if self.is_here(facts) else str(self.host)
+
 
 @dataclass(frozen=True)
 class Places:
@@ -39,6 +56,8 @@ class Places:
 
     found: dict[str, NodePlace] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
+    own: dict[str, str] = field(default_factory=dict)
+    """The missing nodes of this machine: their processes are connected to a master, and do not answer."""
 
 
 class NodeCaller(Protocol):
@@ -48,7 +67,8 @@ class NodeCaller(Protocol):
 
 
 async def call_node(uri: NodeUri, method: str, /, *params: Value) -> Value:
-    return await XmlRpcClient(uri, timeout=_SECONDS, limits=_LIMITS).call(method, CALLER, *params)
+    seconds = TOPIC_SECONDS if method == "requestTopic" else _SECONDS
+    return await XmlRpcClient(uri, timeout=seconds, limits=_LIMITS).call(method, CALLER, *params)
 
 
 def parsed(nodes: Mapping[str, str]) -> tuple[dict[str, NodeUri], dict[str, str]]:
@@ -63,51 +83,84 @@ def parsed(nodes: Mapping[str, str]) -> tuple[dict[str, NodeUri], dict[str, str]
 
 
 def names_to_resolve(uris: Iterable[NodeUri]) -> list[str]:
-    return sorted({uri.host for uri in uris if not _is_address(uri.host)})
+    return [*dict.fromkeys(uri.host for uri in uris if not _is_address(uri.host))]
 
 
 async def find_places(nodes: Mapping[str, str], facts: MachineFacts, call: NodeCaller = call_node) -> Places:
-    """Return the places of nodes. `facts` has the sockets of their ports and the addresses of their hosts."""
+    """Return the places of nodes. `facts` has the sockets of their ports and the addresses of their hosts.
+
+    Each place is asked once, whatever its names are. This machine's own places are asked first, and each of its ports
+    has a share of its own, so that no other host delays them. A host of which too many places fail is asked no further:
+    nobody can have its ports scanned by registering them.
+    """
     uris, missing = parsed(nodes)
-    turns, until = asyncio.Semaphore(_AT_ONCE), clock.now() + _WHOLE_SECONDS
-
-    async def one(name: str, uri: NodeUri) -> tuple[str, NodePlace | str]:
-        async with turns:
-            if clock.now() > until:
-                return (
-                    name,
-                    f"it was not asked within {_WHOLE_SECONDS:g} s, because too many nodes do not answer",
-                )
-            return name, await _place(nodes[name], uri, facts, call)
-
-    found: dict[str, NodePlace] = {}
-    for name, place in await asyncio.gather(*(one(*row) for row in uris.items())):
-        if isinstance(place, str):
-            missing[name] = place
+    places: dict[str, list[NodePlace]] = {}
+    for name, uri in uris.items():
+        possible = _possible(nodes[name], uri, facts)
+        if isinstance(possible, str):
+            missing[name] = possible
         else:
-            found[name] = place
-    return Places(found, missing)
+            places[name] = possible
+    each = sorted(
+        (place for rows in places.values() for place in rows), key=lambda place: not place.is_here(facts)
+    )
+    shares = {place.call_uri: place.share(facts) for place in each}
+
+    failed = Counter[str]()
+
+    async def ask(uri: NodeUri) -> CallFailedError | None:
+        if failed[shares[uri]] >= _MOST_FAILED:
+            return CallFailedError(
+                f"it was not asked, because {_MOST_FAILED} others of {uri.host} do not answer"
+            )
+        try:
+            await call(uri, "getPid")
+        except CallFailedError as error:
+            failed[shares[uri]] += 1
+            return error
+        return None
+
+    asked = await serve_by_host(shares, ask, _SHARE)
+    found: dict[str, NodePlace] = {}
+    silent: dict[str, NodePlace] = {}
+    for name, possible in places.items():
+        for place in possible:
+            outcome = asked.get(place.call_uri, _NOT_ASKED)
+            if outcome is None:
+                found[name] = place
+                missing.pop(name, None)
+                break
+            here = place.is_here(facts)
+            loopback = "; does it listen on loopback only (ROS_HOSTNAME, ROS_IP)?" if here else ""
+            missing[name] = f"{outcome}{loopback}"
+            if here and isinstance(outcome, RefusedError | UnreachedError | UnansweredError):
+                silent[name] = place
+    taken = {port for place in found.values() for port in _ports_of(place, facts)}
+    own = {
+        name: missing[name]
+        for name, place in silent.items()
+        if name in missing and place.uri.port in facts.reaches and place.uri.port not in taken
+    }
+    return Places(found, missing, own)
 
 
-async def _place(text: str, uri: NodeUri, facts: MachineFacts, call: NodeCaller) -> NodePlace | str:
+_NOT_ASKED = UnansweredError("it was not asked in time, because too many nodes of its host do not answer")
+
+
+def _possible(text: str, uri: NodeUri, facts: MachineFacts) -> list[NodePlace] | str:
+    """Return the places at which a node may be, or why there is none."""
     addresses = [uri.host] if _is_address(uri.host) else facts.resolved.get(uri.host, [])
     if not addresses:
         return f"{uri.host} is not known on this machine: add it to /etc/hosts"
-    reason = ""
-    for address in sorted(set(addresses), key=lambda one: (":" in one, one)):
-        host = _seen_at(address, uri.port, facts)
-        if host is None:
-            reason = reason or f"no process of this machine listens on port {uri.port}"
-            continue
-        place = NodePlace(text, uri, host)
-        try:
-            await call(place.call_uri, "getPid")
-        except CallFailedError as error:
-            loopback = facts.is_here(address) and "; does it listen on loopback only (ROS_HOSTNAME, ROS_IP)?"
-            reason = f"{error}{loopback or ''}"
-        else:
-            return place
-    return reason
+    ordered = sorted(set(addresses), key=lambda one: (":" in one, one))[:_MOST_ADDRESSES]
+    hosts = [host for one in ordered if (host := _seen_at(one, uri.port, facts)) is not None]
+    places = [NodePlace(text, uri, host) for host in dict.fromkeys(hosts)]
+    return places or f"no process of this machine listens on port {uri.port}"
+
+
+def _ports_of(place: NodePlace, facts: MachineFacts) -> list[int]:
+    """Return all ports of the process of a node on this machine."""
+    return facts.sockets.get(place.uri.port, []) if place.is_here(facts) else []
 
 
 def _seen_at(address: str, port: int, facts: MachineFacts) -> Address | None:

@@ -19,7 +19,9 @@ from appliance.features.adopt.adopt_check import CheckedRobot, sockets_of
 from appliance.features.adopt.adopt_record import AdoptRecord, load_record
 from appliance.features.adopt.machine_side import master_of
 from appliance.network import interfaces
+from appliance.network.listening_sockets import TcpSocket
 from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.socket_owners import is_node, node_sockets
 from appliance.network.vendor_masters import add_to_set
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -55,16 +57,23 @@ def robot_state(state: Path, settings: Settings | None, *, seconds: float = 20.0
     link = link_address() or "10.111.0.1"
     master = master_of(host, port)
     record = load_record(state)
+    sockets = sockets_of(host)
     return CheckedRobot(
         port=port,
         record=record,
         master=master,
         inventory=_inventory(port, seconds) if master is not None or record.wanted else None,
         own=own,
-        sockets=sockets_of(host),
+        sockets=sockets,
         policy=_policy(settings, link, own),
         robot=ip_address(link),
+        node_ports=_node_ports(host, sockets, port),
     )
+
+
+def _node_ports(host: Namespace, sockets: Iterable[TcpSocket], master_port: int) -> frozenset[int]:
+    found = node_sockets(host, {one.port for one in sockets if one.listens}, master_port)
+    return frozenset(port for port, process in found.items() if is_node(process))
 
 
 def _inventory(port: int, seconds: float) -> GraphInventory | None:

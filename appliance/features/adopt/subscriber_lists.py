@@ -6,12 +6,13 @@ later. So at a change of masters a node first gets a list with both, and only af
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 
 from appliance.base import clock
 from appliance.features.adopt.places import NodeCaller
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
+from appliance.rpc.host_shares import HostShare, serve_by_host
 from appliance.rpc.master_reader import PUBLICATION, MasterGraph
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import Value
@@ -19,7 +20,9 @@ from roswire.xmlrpc import Value
 _AT_ONCE_OF_HOST = 16
 _CONNECT_SECONDS = 1.5  # as long, at most, a node hears twice
 _STILL_SECONDS = 0.5
+_LOSE_SECONDS, _LOSE_SHARE = 2.5, HostShare(host=3.0, whole=3.0)
 _PAUSE_SECONDS = 0.02
+_LONGEST = 200  # characters of URIs that a node says
 
 Subscription = tuple[Incarnation, str]
 
@@ -94,6 +97,44 @@ async def until_connected(
 
     await until_least(number)
     return wanted
+
+
+async def reconnect(
+    call: NodeCaller,
+    lists: Mapping[Subscription, Collection[str]],
+    tell: Callable[[Subscription], Awaitable[object]],
+) -> dict[str, str]:
+    """Tell subscribers their lists, each once its connections to other publishers have ended.
+
+    After a cut, a node still reads what its kernel had received, and lists the connection until then. roscpp lists it
+    until a list lacks it. Return the subscriptions, by `NODE TOPIC`, that were told although their connections were not
+    known to have ended, with the reasons.
+    """
+
+    async def lose(row: Subscription) -> str:
+        (node, topic), wanted = row, {*lists[row]}
+        until, asked, why = clock.now() + _LOSE_SECONDS, False, ""
+        while clock.now() < until:
+            try:
+                present = _inbound(await call(node.call_uri, "getBusInfo")).get(topic, set())
+                if present <= wanted:
+                    await tell(row)
+                    return ""
+                why = f"it is still connected to {', '.join(sorted(present - wanted))[:_LONGEST]}"
+                if not asked:
+                    kept: list[Value] = [*sorted(present & wanted)]
+                    await call(node.call_uri, "publisherUpdate", topic, kept)
+                    asked = True
+            except CallFailedError as error:
+                why = str(error)
+            await asyncio.sleep(_PAUSE_SECONDS)
+        return why
+
+    lost = await serve_by_host({row: str(row[0].host) for row in lists}, lose, _LOSE_SHARE)
+    late = {row: why for row in lists if (why := lost.get(row, "not asked in time"))}
+    for row in late:
+        await tell(row)
+    return {f"{node.name} {topic}": why for (node, topic), why in late.items()}
 
 
 def _inbound(answer: Value) -> dict[str, set[str]]:

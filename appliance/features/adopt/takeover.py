@@ -46,6 +46,7 @@ from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.graph_side import CLOCK, AdoptedGraph, service_text
 from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts
 from appliance.features.adopt.places import (
+    TOPIC_SECONDS,
     NodeCaller,
     NodePlace,
     Places,
@@ -57,11 +58,13 @@ from appliance.features.adopt.places import (
 from appliance.features.adopt.subscriber_lists import (
     Subscription,
     lists_of,
+    reconnect,
     send_lists,
     until_connected,
     until_least,
 )
 from appliance.master.graph.registry import Incarnation
+from appliance.rpc.host_shares import HostShare, serve_by_host
 from appliance.rpc.master_reader import (
     ORDER,
     PUBLICATION,
@@ -75,6 +78,7 @@ from appliance.rpc.master_reader import (
 )
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.supervisor.machine_work import Found
+from roswire.names import ROSOUT
 from roswire.parameter_tree import same_value
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
@@ -86,6 +90,9 @@ _LISTS_SECONDS = 2.0
 _BESIDES_SECONDS = 1.0  # for the lists before and after the last one
 _REMINDERS = 2
 _PAUSE_SECONDS = 0.02
+_SHOWN = 3
+_TOPICS_ASKED = 5
+_NEWER_SECONDS = 3.0
 _AT_ONCE = 50  # registrations without a pause for other callers
 _MOST_SHOWN = 50  # registrations in a record
 _OWN_MASTER_SECONDS = 30.0
@@ -160,6 +167,12 @@ class LeftThere:
     nodes: dict[str, str] = field(default_factory=dict)
     parameters: set[str] = field(default_factory=set)
     connections: dict[str, str] = field(default_factory=dict)
+    untold: dict[str, str] = field(default_factory=dict)
+    """Nodes of other computers whose connections were not cut, because they do not tell the port of their topics."""
+
+    @property
+    def not_cut(self) -> dict[str, str]:
+        return dict(sorted((self.connections | self.untold).items()))
 
 
 @dataclass
@@ -203,6 +216,7 @@ class AdoptOperation:
             return await self.give()
         if wanted:
             await self._take_missing(facts)
+            await self._cut_untold()
             if not self._hidden:
                 await self._try(self._clear_master(facts))
                 await self._try(self._hide_subscribers(facts))
@@ -277,12 +291,13 @@ class AdoptOperation:
             await self._tell(places)
             await self.passed("tell")
             cut += await self._cut(cuts)
-            await self._tell(places, clock_too=True)
+            await self._tell(places)
+            await self._tell_clock(places)
             await self.passed("cut")
             readings += 1
             if not reads:
                 break
-            again, places = await self._read(facts)
+            again, places = await self._read(facts, (graph, places))
             same = again.registered == graph.registered
             if not same:
                 await self._register(again, places, graph)
@@ -307,28 +322,41 @@ class AdoptOperation:
         await self.passed("read")
         if facts.record.phase is not Phase.FREE:  # a kill came after RVMaster had the parameters
             return graph, places, []
+        if places.own and not self._who:
+            listed = "; ".join(f"{name}: {why}" for name, why in sorted(places.own.items())[:_SHOWN])
+            raise AdoptError(
+                f"{counted(len(places.own), 'node')} of this computer cannot be called: {listed}. The graph stays with"
+                " the robot's own master, and is read again in seconds; `rosrv adopt` takes the other nodes"
+            )
         left = await self._take_parameters(facts)
         await self.passed("parameters")
         return graph, places, left
 
-    async def _read(self, facts: MachineFacts) -> tuple[MasterGraph, Places]:
+    async def _read(
+        self, facts: MachineFacts, before: tuple[MasterGraph, Places] | None = None
+    ) -> tuple[MasterGraph, Places]:
+        """Return the graph, and the places of its nodes; those of the reading before are not asked again."""
         try:
             graph = await self.reader(facts).read()
         except MasterReadError as error:
             raise AdoptError(f"the robot's master cannot be read: {error}") from None
         nodes = {name: uri for name, uri in graph.nodes.items() if not self.graph.is_own(name)}
-        uris, _invalid = parsed(nodes)
-        places = await find_places(nodes, await self.facts(uris.values()), self.call)
+        earlier, known = before or (MasterGraph(), Places())
+        new = {name: uri for name, uri in nodes.items() if earlier.nodes.get(name) != uri}
+        uris, _invalid = parsed(new)
+        places = await find_places(new, await self.facts(uris.values()), self.call)
+        for name in nodes.keys() - new.keys():
+            if name in known.found:
+                places.found[name] = known.found[name]
+            else:
+                places.missing[name] = known.missing[name]
         self.left.nodes = places.missing
         return graph, places
 
     async def _known_places(self, facts: MachineFacts) -> Places:
         """Return the nodes that RVMaster has from before a restart, or a removal of the firewall's rules."""
         await self._try(self._clear_master(facts))
-        return Places({
-            node.name: NodePlace(node.api_text, node.api, node.host)
-            for node in self.graph.nodes() if node in self.graph.subscribers.unasked
-        })  # fmt: skip
+        return _places_of(node for node in self.graph.nodes() if node in self.graph.subscribers.unasked)
 
     async def _take_parameters(self, facts: MachineFacts) -> list[str]:
         try:
@@ -353,8 +381,17 @@ class AdoptOperation:
             if entry not in graph.entries and place is not None:
                 await self.graph.unregister(entry, place, before)
 
-    async def _tell(self, places: Places, *, clock_too: bool = False) -> None:
-        self.graph.tell(places.found, clock_too=clock_too)
+    async def _tell(self, places: Places) -> None:
+        self.graph.tell(places.found)
+        await self._until_told()
+
+    async def _tell_clock(self, places: Places) -> None:
+        """Give subscribers of simulated time their list once their earlier connections have ended."""
+
+        async def tell(row: Subscription) -> None:
+            self.graph.remind(*row)
+
+        self.left.connections |= await reconnect(self.call, self.graph.clocks(places.found), tell)
         await self._until_told()
 
     async def _until_told(self) -> None:
@@ -387,7 +424,8 @@ class AdoptOperation:
         await self._connect(graph, late)
         await self._tell(late)
         await self._cut(cuts)
-        await self._tell(late, clock_too=True)
+        await self._tell(late)
+        await self._tell_clock(late)
         self._hidden = False
         await self.passed("missing nodes")
 
@@ -454,6 +492,17 @@ class AdoptOperation:
         self._hidden = True
         await self.passed("hidden")
 
+    async def _cut_untold(self) -> None:
+        """Ask nodes again that did not tell the port of their topics, and cut these. Raises `AdoptError`."""
+        nodes = [node for node in self.graph.taken() if node.name in self.left.untold]
+        self.left.untold = {node.name: self.left.untold[node.name] for node in nodes}
+        if nodes:
+            places = _places_of(nodes)
+            cuts = await self._cuts(MasterGraph(), places)
+            await self._tell(places)
+            await self._cut(cuts)
+            await self._tell(places)
+
     async def _cut(self, cuts: Mapping[str, object]) -> int:
         done = msgspec.convert(await self.machine("cut", **cuts), CutConnections)
         self.left.connections.update(done.kept)
@@ -467,19 +516,30 @@ class AdoptOperation:
         await self.passed("connect")
 
     async def _cuts(self, graph: MasterGraph, places: Places) -> dict[str, object]:
-        """Return the ports to cut, found before subscribers get their lists: rospy hears twice until the cut."""
+        """Return the ports to cut, found before subscribers get their lists: rospy hears twice until the cut.
+
+        A node of this computer that does not tell the port of its topics loses its connections at all ports of its
+        process. One of another computer is named, and asked again with the missing nodes.
+        """
         nodes = {name: place for name, place in places.found.items() if self._registered(name, place)}
         facts = await self.facts(place.uri for place in nodes.values())
-        served = await self._served_ports(graph, nodes)
+        told = await self._topic_ports(graph, nodes, facts)
         apis, master = {place.uri.port for place in nodes.values()}, self.reader(facts).uri
         ports: set[int] = set()
         remote: set[tuple[str, int]] = set()
-        for name, offered in served.items():
+        for name, offered in self._service_ports(graph, nodes).items():
             place = nodes[name]
-            if facts.is_here(str(place.host)) or str(place.host) == facts.link:
-                ports |= (offered & set(facts.sockets.get(place.uri.port, []))) - apis
+            port = told.get(place.call_uri, 0)
+            self.left.untold.pop(name, None)
+            if place.is_here(facts):
+                listening = set(facts.sockets.get(place.uri.port, []))
+                ports |= (listening if port is None else listening & {*offered, port}) - apis
             elif place.host.version == 4:
-                remote |= {(str(place.host), port) for port in offered - {place.uri.port}}
+                remote |= {(str(place.host), one) for one in {*offered, port or 0} - {place.uri.port, 0}}
+                if port is None:
+                    self.left.untold[name] = (
+                        f"it did not tell the port of its topics within {TOPIC_SECONDS:g} s"
+                    )
         return {
             "ports": sorted(port for port in ports if port >= FIRST_PORT and port != master.port),
             "remote": sorted(row for row in remote if row[1] >= FIRST_PORT and row[1] != master.port),
@@ -489,29 +549,43 @@ class AdoptOperation:
         node = self.graph.node_at(name, place)
         return node is not None and bool(node.registrations)
 
-    async def _served_ports(self, graph: MasterGraph, nodes: Mapping[str, NodePlace]) -> dict[str, set[int]]:
-        """Return the ports of topics and services of each node."""
+    def _service_ports(self, graph: MasterGraph, nodes: Mapping[str, NodePlace]) -> dict[str, set[int]]:
         served: dict[str, set[int]] = {name: set() for name in nodes}
-        topics: dict[str, str] = {}
         for kind, resource, name in self._entries(graph):
-            if name not in nodes:
-                continue
-            if kind == PUBLICATION:
-                topics.setdefault(name, resource)
-            elif kind == SERVICE and (port := self._service_port(graph, resource, name)):
+            if name in nodes and kind == SERVICE and (port := self._service_port(graph, resource, name)):
                 served[name].add(port)
-
-        async def topic_port(name: str, topic: str) -> None:
-            try:
-                answer = await self.call(nodes[name].call_uri, "requestTopic", topic, [["TCPROS"]])
-            except CallFailedError:
-                return
-            match answer:
-                case [1, _, ["TCPROS", str(), int(port)]] if 0 < port < 65_536:
-                    served[name].add(port)
-
-        await asyncio.gather(*(topic_port(*row) for row in topics.items()))
         return served
+
+    async def _topic_ports(
+        self, graph: MasterGraph, nodes: Mapping[str, NodePlace], facts: MachineFacts
+    ) -> dict[NodeUri, int | None]:
+        """Return the port of the topics of each place with publications; None if it does not tell one.
+
+        Any host may have registered a topic that the node does not publish. So `/rosout`, which nearly each node
+        publishes, is asked for first, and then some others.
+        """
+        topics: dict[NodeUri, list[str]] = {}
+        shares: dict[NodeUri, str] = {}
+        for kind, resource, name in sorted(self._entries(graph), key=lambda entry: entry[1] != ROSOUT):
+            if name in nodes and kind == PUBLICATION:
+                place = nodes[name]
+                topics.setdefault(place.call_uri, []).append(resource)
+                shares[place.call_uri] = place.share(facts)
+
+        async def ask(uri: NodeUri) -> int | None:
+            for topic in topics[uri][:_TOPICS_ASKED]:
+                try:
+                    answer = await self.call(uri, "requestTopic", topic, [["TCPROS"]])
+                except CallFailedError:
+                    return None
+                match answer:
+                    case [1, _, ["TCPROS", str(), int(port)]] if 0 < port < 65_536:
+                        return port
+            return None
+
+        seconds = TOPIC_SECONDS + 1
+        asked = await serve_by_host(shares, ask, HostShare(seconds, seconds))
+        return {uri: asked.get(uri) for uri in shares}
 
     def _entries(self, graph: MasterGraph) -> Iterable[Entry]:
         return graph.entries or [entry for entry, _node in self.graph.held()]
@@ -525,14 +599,14 @@ class AdoptOperation:
         return int(tail) if tail.isascii() and tail.isdecimal() and int(tail) < 65_536 else 0
 
     def _report(self, cut: int, readings: int, left_out: list[str], seconds: float) -> TakeOverReport:
-        nodes = [node for node in self.graph.nodes() if node.registrations]
+        nodes = self.graph.taken()
         return TakeOverReport(
             nodes=len(nodes),
             hosts=sorted({str(node.host) for node in nodes}),
             registrations=sum(len(node.registrations) for node in nodes),
             denied={" ".join(entry): why for entry, why in sorted(self.graph.denied.items())},
             missing=dict(sorted(self.left.nodes.items())),
-            not_cut=dict(sorted(self.left.connections.items())),
+            not_cut=self.left.not_cut,
             cut=cut,
             readings=readings,
             left_out=left_out,
@@ -626,8 +700,15 @@ class AdoptOperation:
         await self.machine("phase", phase=Phase.GIVEN)
         await self.passed("given")
         await self.machine("leave")
-        await send_lists(self.call, _BESIDES_SECONDS, last.of_nodes_that_answer())
-        await self._remind(last, [row for row in last.of_nodes_that_answer() if row[1] == CLOCK])
+        lists = last.of_nodes_that_answer()
+        clocks = {row: lists.pop(row) for row in [*lists] if row[1] == CLOCK}
+        await send_lists(self.call, _BESIDES_SECONDS, lists)
+
+        async def tell(row: Subscription) -> None:
+            await send_lists(self.call, _BESIDES_SECONDS, {row: clocks[row]})
+
+        await reconnect(self.call, clocks, tell)
+        await self._remind(last, clocks)
         self.graph.forget()
         self.graph.denied.clear()
         self.left = LeftThere()
@@ -692,8 +773,6 @@ class AdoptOperation:
         nodes = {entry[2]: node for entry, node in held.items()}
 
         async def is_newer(name: str) -> bool:
-            if name not in nodes:
-                return True
             try:
                 await self.call(nodes[name].call_uri, "getPid")
             except CallFailedError:
@@ -705,8 +784,9 @@ class AdoptOperation:
             for name, uri in there.nodes.items()
             if known.nodes.get(name) != uri and (name not in nodes or nodes[name].api_text != uri)
         ]
-        found = await asyncio.gather(*map(is_newer, names))
-        return {name for name, newer in zip(names, found, strict=True) if newer}
+        hosts = {name: str(nodes[name].host) for name in names if name in nodes}
+        found = await serve_by_host(hosts, is_newer, HostShare(_NEWER_SECONDS, _NEWER_SECONDS))
+        return {name for name in names if found.get(name, True)}
 
     @staticmethod
     def _moved(name: str, there: MasterGraph, held: Mapping[Entry, Incarnation]) -> bool:
@@ -779,6 +859,10 @@ def _unregistration(entry: Entry, there: MasterGraph) -> MasterCall:
     kind, resource, name = entry
     detail = there.services.get(resource, "") if kind == SERVICE else there.nodes.get(name, "")
     return _UNREGISTER[kind], name, (resource, detail)
+
+
+def _places_of(nodes: Iterable[Incarnation]) -> Places:
+    return Places({node.name: NodePlace(node.api_text, node.api, node.host) for node in nodes})
 
 
 def _graph_of(nodes: list[HeldNode]) -> MasterGraph:

@@ -13,7 +13,7 @@ from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.requirements import needs
-from tests.support.rosmaster import PlainMaster
+from tests.support.rosmaster import PlainMaster, call_on
 from tests.support.waiting import eventually
 
 CYCLES = int(os.environ.get("ROSRV_ADOPT_CYCLES", "20"))
@@ -162,7 +162,9 @@ def test_a_kill_of_everything_in_the_middle_ends_as_ordered(robot: Robot, applia
 
 
 @pytest.mark.nightly
-def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appliance) -> None:
+def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appliance, lab: Lab) -> None:
+    """All of its command topics: a zero on one says nothing of another. Those of another host do not count."""
+
     def publish(topic: str, kind: str, value: str) -> Process:
         command = ["/usr/bin/rostopic", "pub", "--rate", "10", topic, kind, value]
         return robot.ros.start(command, label=f"{topic} {value}")
@@ -177,16 +179,38 @@ def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appli
     publish("/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.0}}")
     publish("/odom", "nav_msgs/Odometry", "{twist: {twist: {linear: {x: 0.0}}}}")
     eventually(lambda: "/odom" in str(robot.graph()), robot.ros.story)
+    second = publish("/second/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.3}}")
+    robot.ros.start(["/usr/bin/rostopic", "echo", "/second/cmd_vel"], label="second base")
+    eventually(lambda: "/second/cmd_vel" in str(robot.graph()[1]), robot.ros.story)
+    second.stop()
+    assert "no zero was commanded on /second/cmd_vel" in rosrv(robot, appliance, *ordered, check=False)
+    publish("/second/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.0}}")
+    guest = lab.host("guest", "10.77.0.66/24")
+    for number in range(17):
+        topic, uri = f"/guest{number}/cmd_vel", f"http://{guest.address}:4000/"
+        for method in ("registerPublisher", "registerSubscriber"):
+            call_on(
+                guest,
+                f"http://{robot.host.address}:11311",
+                method,
+                "/guest",
+                topic,
+                "geometry_msgs/Twist",
+                uri,
+            )
     said = rosrv(robot, appliance, "adopt", "--when-standing", "--within", "30s")
-    assert "the robot stands still: zero for 3 s on /cmd_vel and 1 odometry topic" in said
+    assert "the robot stands still: zero for 3 s on /cmd_vel, /second/cmd_vel and 1 odometry topic" in said
+    assert (
+        "what /guest0/cmd_vel, /guest1/cmd_vel, /guest10/cmd_vel and 14 more of other hosts may move" in said
+    )
     assert "noted" in said
     appliance.start()
     until_taken(robot, appliance)
     said = rosrv(robot, appliance, "policy", "enforce", "--when-standing", "--within", "30s")
-    assert (
-        "the robot stands still: zero for 3 s on /cmd_vel and 1 odometry topic. Not seen: motions that no"
-        in said
+    stands = (
+        "the robot stands still: zero for 3 s on /cmd_vel, /second/cmd_vel and 1 odometry topic. Not seen:"
     )
+    assert f"{stands} motions that no" in said
     assert "enforces [Publishers]" in said
 
 

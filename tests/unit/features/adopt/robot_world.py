@@ -24,7 +24,7 @@ from appliance.master.calls.parameter_calls import ParameterCalls, ParameterRigh
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
 from appliance.rpc.master_reader import Entry, MasterCall, MasterGraph, MasterReadError
-from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError
 from roswire.errors import EncodingError
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
@@ -64,6 +64,14 @@ class RobotNode:
     """The connections that it makes later."""
     most: dict[str, int] = field(default_factory=dict)
     """The most connections that a topic had at once."""
+    tells: str = "port"
+    """What it says to `requestTopic`: `port`, `refusal` to a topic that it does not publish, or `nothing`."""
+    lags: int = 0
+    """For so many looks after a cut it still reads, and lists, a connection that was cut."""
+    reads_on: dict[str, int] = field(default_factory=dict)
+    """The looks that are left, by the topic of such a connection."""
+    heard_both: set[str] = field(default_factory=set)
+    """Topics that it got a new publisher for while it still read."""
 
     @property
     def connected(self) -> dict[str, list[str]]:
@@ -185,6 +193,7 @@ class RobotWorld:
         self.limit = self.silent_host = ""
         self.left = False
         self.remote: list[tuple[str, int]] = []
+        self.connected: set[int] = set()  # the ports of nodes whose processes are connected to the master
         self.refused: set[int] = set()  # ports that were cut
         self.kept_left, self.kept_unasked = (
             LeftThere(),
@@ -308,24 +317,40 @@ class RobotWorld:
         return {}
 
     def _facts(self, ports: list[int]) -> MachineFacts:
-        alive = {node.port: node for node in self.robot.values() if node.alive}
         return MachineFacts(
             self.record, LINK, "10.111.0.2", own=["127.0.0.1", "192.168.50.1"], master=self.holder,
-            sockets={port: [port, port + 1000] for port in ports if port in alive}, resolved=self.resolved,
+            sockets={port: [*self._process_of(port)] for port in ports if self._process_of(port)},
+            reaches={port: "127.0.0.1" for port in ports if {*self._process_of(port)} & self.connected},
+            resolved=self.resolved,
         )  # fmt: skip
 
+    def _process_of(self, port: int) -> tuple[int, ...]:
+        """Return the ports of the process that listens on this one: a node's API, and its topics."""
+        found = (node.port for node in self.robot.values() if node.alive)
+        return next(((api, api + 1000) for api in found if port in (api, api + 1000)), ())
+
     async def _call(self, uri: NodeUri, method: str, /, *params: Value) -> Value:
+        if uri.host == self.silent_host and method == "getPid":
+            await asyncio.sleep(_NODE_SECONDS)
+            raise UnansweredError(f"{uri.host}:{uri.port} does not answer")
         if uri.host == self.silent_host:
             await asyncio.Event().wait()
         node = next((one for one in self.robot.values() if one.alive and one.port == uri.port), None)
+        if node is None and self._process_of(uri.port):
+            await asyncio.sleep(_NODE_SECONDS)
+            raise UnansweredError(f"{uri.host}:{uri.port} does not answer")
         if node is None or ipaddress.ip_address(uri.host).is_loopback:
             raise CallFailedError(f"{uri.host}:{uri.port} refuses")
         if node.hangs:
             if method == "publisherUpdate":
                 self.give_list(node, str(params[0]), _texts(params[1]))
             await asyncio.sleep(_NODE_SECONDS)
-            raise CallFailedError(f"{uri.host}:{uri.port} does not answer")
+            raise UnansweredError(f"{uri.host}:{uri.port} does not answer")
         if method == "requestTopic":
+            if node.tells == "nothing":
+                raise UnansweredError(f"{uri.host}:{uri.port} does not answer")
+            if node.tells == "refusal" and params[0] not in node.publishes:
+                return [0, "not a publisher", 0]
             return [1, "", ["TCPROS", "base", uri.port + 1000]]
         if method == "publisherUpdate":
             node.earlier.append((str(params[0]), _texts(params[1])))
@@ -334,6 +359,8 @@ class RobotWorld:
             rows = [
                 (topic, one) for topic, links in node.links.items() for one in links
             ]  # also those that ended
+            rows += [(topic, "http://earlier:1/") for topic, looks in node.reads_on.items() if looks]
+            node.reads_on = {topic: max(0, looks - 1) for topic, looks in node.reads_on.items()}
             return [1, "", [[0, one, "i", "TCPROS", topic, True] for topic, one in rows]]
         return [1, "", node.port]
 
@@ -341,6 +368,8 @@ class RobotWorld:
         if node.hangs:
             node.held.append((topic, uris))
             return
+        if node.reads_on.get(topic) and uris:
+            node.heard_both.add(topic)
         node.lists[topic] = uris
         node.take_list(topic, uris)
         if not node.slow:
@@ -365,6 +394,8 @@ class RobotWorld:
         for node in self.robot.values():
             for links in node.links.values():
                 links.update(dict.fromkeys(filter(ends, links), False))
+            if node.lags:
+                node.reads_on = {topic: node.lags for topic, links in node.links.items() if links}
 
     def _waiting(self) -> int:
         self.hear()

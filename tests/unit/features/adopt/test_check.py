@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from appliance.base.shipped import SHIPPED
@@ -38,7 +39,7 @@ def robot(policy: str = DEFAULT, *nodes: SurveyedNode, sockets: tuple[TcpSocket,
     )  # fmt: skip
     return CheckedRobot(
         11311, AdoptRecord(), MASTER, inventory, frozenset({"192.168.50.1"}), (socket(4001), *sockets),
-        compile_policy(policy, file="policy.ini", robot=[LINK]), LINK,
+        compile_policy(policy, file="policy.ini", robot=[LINK]), LINK, frozenset({4001, 4002}),
     )  # fmt: skip
 
 
@@ -91,7 +92,7 @@ def test_a_roscore_that_no_drop_in_can_help_must_not_restart(
 @pytest.mark.parametrize(
     ("node", "listeners", "about", "level"),
     [
-        (SurveyedNode("/far", "http://nuc:4002/"), (), "hosts", "stop"),
+        (SurveyedNode("/far", "http://nuc:4002/"), (), "hosts", "warn"),
         (SurveyedNode("/lo", "http://localhost:4002/", "127.0.0.1"), (socket(4002),), "nodes", "stop"),
         (
             SurveyedNode("/lo", "http://base:4002/", "127.0.1.1"),
@@ -109,6 +110,30 @@ def test_a_node_that_cannot_be_moved_is_named(
     found = lines(robot(DEFAULT, node, sockets=listeners))[about]
     assert found.level == level
     assert node.name in found.text or node.host in found.text
+
+
+def test_names_of_a_stranger_stop_no_adoption() -> None:
+    """Neither unknown hosts, nor ports of other programs of this machine, nor more names than can be read."""
+    strangers = (
+        *(SurveyedNode(f"/a{number}", f"http://a{number}.invalid:4000/") for number in range(520)),
+        *(
+            SurveyedNode(f"/b{number}", f"http://10.0.0.66:{number}/", "10.0.0.66", problem="late")
+            for number in range(300)
+        ),
+        SurveyedNode("/loopback", "http://localhost:631/", "127.0.0.1"),
+        SurveyedNode("/of_a_node", "http://localhost:4001/", "127.0.0.1"),
+        SurveyedNode("/nothing", "http://localhost:4999/", "127.0.0.1"),
+        SurveyedNode("/odd%s", "odd", problem="not a URI"),
+    )
+    own = SurveyedNode("/base", "http://base:4001/", "192.168.50.1")
+    state = robot(DEFAULT, own, *strangers, sockets=(socket(631, "127.0.0.1"),))
+    assert state.inventory is not None
+    crowd = tuple(SurveyedTopic(f"/x{number}", "x/X", ("/base", "/b1")) for number in range(300))
+    inventory = msgspec.structs.replace(state.inventory, topics=crowd, left_out=("300 of 20300 nodes",))
+    found = [*graph_lines(replace(state, inventory=inventory))]
+    assert {line.level for line in found} == {"ok", "warn"}
+    assert len(found) < 40
+    assert max(len(line.text) for line in found) < 600
 
 
 def test_denied_registrations_are_counted_and_named() -> None:

@@ -1,0 +1,142 @@
+"""A stranger filled the robot's own master with names before an adoption, and before a start of an adopted robot."""
+
+import json
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from examples.landshark.lab import Host, Lab
+from tests.support.adopted_robot import POLICY, Robot, rosrv, until_taken
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.rosmaster import PlainMaster
+
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(900)]
+
+_SILENT, _UNKNOWN = 300, 520
+_SECONDS = 20.0
+"""The most time of an adoption, in seconds."""
+_STRANGER = """
+import socket, sys, xmlrpc.client
+master, own, robot = xmlrpc.client.ServerProxy(sys.argv[1]), sys.argv[2], sys.argv[3]
+silent = []
+for number in range(int(sys.argv[4])):
+    one = socket.create_server((own, 20000 + number), backlog=64)
+    silent.append(one)
+uris = [f"http://{own}:{20000 + number}/" for number in range(len(silent))]
+uris += [f"http://a{number}.stranger.invalid:4000/" for number in range(int(sys.argv[5]))]
+uris += [f"http://{own}:1/%s", f"http://{own}:20000/%d%", f"http://{robot}:22/", f"http://{robot}:11311/", "odd",
+         f"http://localhost:{20000}/", "http://[::1]:1/", "http://203.0.113.9:80/"]
+for number, uri in enumerate(uris):
+    master.registerPublisher(f"/a%{number}", f"/a%s/{number}", "std_msgs/String", uri)
+    master.registerSubscriber(f"/a%{number}", "/cmd_vel", "geometry_msgs/Twist", uri)
+print("registered", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
+    """A robot whose only honest companion is a second computer."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    host, nuc = lab.host("robot", "10.77.0.10/24"), lab.host("nuc", "10.77.0.11/24")
+    with (
+        PlainMaster(tmp_path, host),
+        RosSession("http://localhost:11311", tmp_path, host) as ros,
+        RosSession(f"http://{host.address}:11311", tmp_path, nuc) as there,
+    ):
+        for client in ("rospy", "roscpp"):
+            ros.talker(client, f"/{client}", "--rate", "50", name=f"{client}_talker")
+            ros.service_server(client, f"/{client}_go", name=f"{client}_server")
+        there.talker("roscpp", "/nuc", "--rate", "50", name="nuc_talker")
+        listeners = {
+            f"{client} of {topic}": ros.listener(client, f"/{topic}", name=f"{client}_of_{topic}")
+            for client in ("rospy", "roscpp")
+            for topic in ("rospy", "roscpp", "nuc")
+        }
+        callers = {
+            service: ros.node("rospy", "service_caller", f"/{service}_go", name=f"caller_{service}")
+            for service in ("rospy", "roscpp")
+        }
+        yield Robot(host, ros, listeners, callers)
+
+
+@pytest.fixture
+def appliance(robot: Robot) -> Iterator[Appliance]:
+    appliance = Appliance(robot.host, isolation="netns", policy=POLICY)
+    try:
+        yield appliance
+    finally:
+        appliance.stop()
+        appliance.close()
+
+
+@contextmanager
+def _filled(stranger: Host, robot: Robot) -> Iterator[None]:
+    """Register the names; their ports accept connections, and never answer."""
+    command = [
+        "/usr/bin/python3", "-c", _STRANGER, f"http://{robot.host.address}:11311", stranger.address,
+        robot.host.address, str(_SILENT), str(_UNKNOWN),
+    ]  # fmt: skip
+    with stranger.popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "registered\n"
+            yield
+        finally:
+            process.kill()
+
+
+def _require_served(robot: Robot, appliance: Appliance) -> None:
+    """All honest nodes are taken in time, their topics and services work, and the stranger's names are named."""
+    found = json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))
+    took = float(
+        re.findall(r'"seconds": ([0-9.]+), "event": "the robot\'s graph is adopted"', appliance.story())[-1]
+    )
+    print(f"adopted in {took} s: {found['nodes']} nodes; {len(found['missing'])} left")  # noqa: T201  shown by pytest -s
+    missing = [name for name in found["missing"] if name.startswith("/a%")]
+    assert len(missing) == len(found["missing"]) > _SILENT + _UNKNOWN
+    names = {name for part in robot.graph() for _resource, nodes in part for name in nodes}
+    assert {"/rospy_talker", "/roscpp_talker", "/nuc_talker", "/rospy_server", "/rospy_of_nuc"} <= names
+    robot.hears()
+    before = robot.calls()
+    robot.hears()
+    for name, (good, bad) in robot.calls().items():
+        assert good > before[name][0], name
+        assert bad == before[name][1], name
+    assert took < _SECONDS
+
+
+def test_names_of_a_stranger_keep_no_node_of_the_robot_out(
+    robot: Robot, appliance: Appliance, lab: Lab
+) -> None:
+    """At a start that takes the graph over, and at an order while the appliance runs."""
+    stranger = lab.host("stranger", "10.77.0.66/24")
+    robot.hears()
+    with _filled(stranger, robot):
+        began = time.monotonic()
+        checked = rosrv(robot, appliance, "adopt", "--check")
+        print(f"check: {time.monotonic() - began:.1f} s")  # noqa: T201  shown by pytest -s
+        assert "stop" not in checked
+        surveyed = json.loads(robot.ros.run(ROSRV, "survey", "--within", "10s", "--json").stdout)
+        assert {node["name"] for node in surveyed["nodes"] if not node["problem"]} >= {
+            "/rospy_talker",
+            "/nuc_talker",
+        }
+        assert surveyed["seconds"] < 12
+        assert stranger.address not in {port["host"] for port in surveyed["listeners"]}
+        rosrv(robot, appliance, "adopt")
+        appliance.start()
+        until_taken(robot, appliance)
+        _require_served(robot, appliance)
+        rosrv(robot, appliance, "release")
+    with _filled(stranger, robot):
+        rosrv(robot, appliance, "adopt")
+        _require_served(robot, appliance)
