@@ -12,6 +12,9 @@ from typing import Annotated
 import typer
 
 from appliance import __version__
+from appliance.base.counted import counted
+from appliance.base.engine_thread import InCaller
+from appliance.base.log_output import replace_stderr
 from appliance.base.user_errors import UserError, with_remedy
 from appliance.cli.first_contact import first_contact
 from appliance.cli.lazy import application
@@ -69,6 +72,7 @@ app = application(
 
 def main() -> None:
     _open_closed_streams()
+    replace_stderr(_lost, InCaller, waits=True)  # a note must not end a verb between two of its effects
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     if not sys.argv[1:] and sys.stdin.isatty() and sys.stdout.isatty():
         sys.exit(first_contact())
@@ -87,6 +91,10 @@ def main() -> None:
             f"rosrv: a defect in rosrv, please report it: {type(error).__name__}: {error} ({where})\n"
         )
         sys.exit(70)
+
+
+def _lost(lines: int, _since: str) -> str:
+    return f"rosrv: {counted(lines, 'line')} of this output were lost\n"
 
 
 def _open_closed_streams() -> None:

@@ -12,6 +12,7 @@ the first change that is torn, damaged, or follows a missing one; no caller has 
 import contextlib
 import errno
 import os
+import re
 import sqlite3
 import struct
 import threading
@@ -39,6 +40,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "BLOB": (bytes,),
 }
 _INTEGERS = 1 << 63
+_SURROGATE = re.compile("[\ud800-\udfff]")
 
 _HEAD = struct.Struct(">II")  # length with the mark, checksum
 _NUMBERS = struct.Struct(">QQ")  # number of the change, number of the change before it in this file
@@ -76,6 +78,8 @@ class _Column(NamedTuple):
             return "" if self.nullable else "must have a value"
         if not isinstance(value, self.types):
             return f"cannot be of type {type(value).__name__}"
+        if isinstance(value, str) and _SURROGATE.search(value):
+            return "has a character that UTF-8 lacks"
         if isinstance(value, int) and not -_INTEGERS <= value < _INTEGERS:
             return "is outside the range of 64 bits"
         return "is not a number" if value != value else ""  # noqa: PLR0124  NaN, which SQLite stores as NULL

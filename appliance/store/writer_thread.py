@@ -298,10 +298,17 @@ class Database:
         try:
             due = self._turn(now)
         except BaseException as error:
-            # A defect: callers that wait get the error, and orders are refused. The next start applies the changes.
+            # A defect: callers that wait get the error, and orders are refused, until a turn succeeds. Otherwise the
+            # next start applies the changes.
             self._failing = f"{self._path}: writing ended: {type(error).__name__}: {error}"
+            if self._closed or not isinstance(error, Exception):
+                self._fail(self._failing)
+                raise
+            if self._failing not in self._told:
+                _log.error("fault in the writer of the state, which tries again", exc_info=error)
             self._fail(self._failing)
-            raise
+            self._roll_back()
+            due = self._retry_at = now + _RETRY_SECONDS
         finally:
             self._ended = due is None
         return due
@@ -334,8 +341,7 @@ class Database:
             statements = [statement(change) for item in queued for change in item.changes]
             self._execute(statements, self.history, last)
         except sqlite3.Error as error:
-            if self._connection.in_transaction:
-                self._connection.execute("ROLLBACK")
+            self._roll_back()
             self._failing = f"{self._path}: {error}"
             self._fail(self._failing)
             return False
@@ -349,6 +355,11 @@ class Database:
             _log.warning("state is written again", file=str(self._path))
             self._told.clear()
         return True
+
+    def _roll_back(self) -> None:
+        if self._connection.in_transaction:
+            with contextlib.suppress(sqlite3.Error):  # the next BEGIN reports it
+                self._connection.execute("ROLLBACK")
 
     def _sync(self) -> str:
         """Flush to the disk; return why this failed. The kernel may then have dropped data that it could not write."""

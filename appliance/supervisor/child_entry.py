@@ -146,6 +146,7 @@ def _call(role: str, plan: LaunchPlan, secret: int | None) -> None:
     from appliance.supervisor.logs import configure_logs  # noqa: PLC0415  not for an external program
 
     configure_logs(role)
+    sys.stdout = sys.stderr
     entry = pkgutil.resolve_name(plan.entry)  # a child imports only the modules of its role
     gc.freeze()  # imported modules live as long as the process, so the collector can skip them
     if plan.lender is not None:

@@ -4,6 +4,9 @@ import logging
 import sys
 from typing import Any, TextIO, cast
 
+from appliance.base.counted import counted
+from appliance.base.log_output import replace_stderr
+
 _rich = sys.modules.pop("rich", None)
 sys.modules["rich"] = cast(Any, None)  # otherwise structlog would load rich for its tracebacks
 import structlog  # noqa: E402  see above
@@ -17,6 +20,7 @@ _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 
 def configure_logs(process: str) -> None:
+    """Send the log, and everything else that is written to `sys.stderr`, through a `LogOutput`."""
     human = sys.stderr.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,
@@ -28,7 +32,15 @@ def configure_logs(process: str) -> None:
         if human
         else [structlog.processors.ExceptionRenderer(_transform), structlog.processors.JSONRenderer()]
     )
-    handler = logging.StreamHandler(sys.stderr)
+
+    def lost(lines: int, since: str) -> str:
+        event: Any = {"event": f"{counted(lines, 'line')} of the log were lost since {since}", "lost": lines}
+        for step in (*shared, *renderer):
+            event = step(None, "warning", event)
+        return f"{event}\n"
+
+    output = replace_stderr(lost)
+    handler = logging.StreamHandler(output)
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared,
@@ -38,7 +50,7 @@ def configure_logs(process: str) -> None:
     logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
     structlog.configure(
         processors=[*shared, *renderer],
-        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
+        logger_factory=structlog.WriteLoggerFactory(output),
         cache_logger_on_first_use=False,
     )
     structlog.contextvars.bind_contextvars(process=process)

@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager, suppress
 
 _WITHOUT_WATCHDOG = 30.0
 _MORE = "EXTEND_TIMEOUT_USEC=120000000\n"
+_READY = "READY=1\n"
 
 
 class ServiceManager:
@@ -39,7 +40,7 @@ class ServiceManager:
 
     def ready(self, status: str) -> None:
         self._starting = False
-        self._say(f"READY=1\nSTATUS={status}")
+        self._say(f"{_READY}STATUS={status}")
 
     def stopping(self) -> None:
         self._say("STOPPING=1\nSTATUS=stopping its processes, then removing its firewall")
@@ -56,16 +57,17 @@ class ServiceManager:
 
     async def _live(self) -> None:
         while True:
-            self._say(f"{_MORE if self._starting else ''}WATCHDOG=1")
+            # READY again, because systemd may not have read the first
+            self._say(f"{_MORE if self._starting else _READY}WATCHDOG=1")
             await asyncio.sleep((self.watchdog_seconds or _WITHOUT_WATCHDOG) / 2)
 
     def _say(self, text: str) -> None:
         if self._address is None:
             return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
-            # Without this message, systemd would treat the service as hanging.
+        # A lost message is less than a supervisor that waits for systemd, or whose watchdog task has ended.
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
             notify.connect(self._address)
-            notify.send(text.encode())
+            notify.send(text.encode(), socket.MSG_DONTWAIT)
 
 
 def _seconds(said: Mapping[str, str | None]) -> float | None:

@@ -13,6 +13,7 @@ import structlog
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from appliance.base.log_output import keep_from_blocking
 from rosrv_fleet.access import IS_ROBOT, PEER_CERTIFICATE
 from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
@@ -140,6 +141,7 @@ class _Server(uvicorn.Server):
 
 
 def serve(collector: Collector) -> None:
+    keep_from_blocking(2)
     config = collector.config
     tls = ServerTls(str(config.certificate), str(config.key), collector.robots)
     tls.reload()

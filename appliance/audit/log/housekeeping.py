@@ -93,8 +93,9 @@ class Housekeeping:
             return
         try:
             step(writer)
-        except WRITE_ERRORS as error:
-            self._failing = f"{writer.path}: {error}"
+        except Exception as error:  # noqa: BLE001  a defect of a step must not stop the writing of records
+            known = isinstance(error, WRITE_ERRORS)
+            self._failing = f"{writer.path}: {error if known else f'{type(error).__name__}: {error}'}"
             self._paused_until = self._now() + _HOUSE_SECONDS
         else:
             self._failing = None

@@ -228,9 +228,12 @@ class AuditLog:
         try:
             due = self._turn(now)
         except BaseException as error:
-            # A defect: the owner must see that records are no longer written, and deny requests.
+            # A defect: the owner must see that records are not written, and deny requests, until a turn succeeds.
             self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
-            raise
+            if self._closing or not isinstance(error, Exception):
+                raise
+            self._fail(error)
+            due = self._retry_at = now + _RETRY_SECONDS
         finally:
             if due is None:
                 self._ended = True
@@ -316,13 +319,14 @@ class AuditLog:
             if self._writer is None:
                 self._open()
             self._write()
-        except WRITE_ERRORS as error:
+        except Exception as error:  # noqa: BLE001  after a defect too, records wait for the next attempt
             self._fail(error)
             return False
         return True
 
     def _fail(self, error: Exception) -> None:
-        reason = str(error)
+        known = isinstance(error, WRITE_ERRORS)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
         if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
             # This process is in the list because its own connection is still open.
             others = [pid for pid in holders(self.path) if pid != os.getpid()]
@@ -332,7 +336,9 @@ class AuditLog:
         self._failed = reason if str(self.path) in reason else f"{self.path}: {reason}"
         if self._failed_since == 0:
             self._failed_since = self._clock()
-            _logger.error("the audit log cannot be written", reason=self._failed)
+            _logger.error(
+                "the audit log cannot be written", reason=self._failed, exc_info=None if known else error
+            )
         if self._writer is not None:
             writer, self._writer = self._writer, None
             with contextlib.suppress(sqlite3.Error):

@@ -48,7 +48,7 @@ def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
         assert manager.watchdog_seconds == 0.02
         starting, running = asyncio.run(live(manager, heard))
     assert starting == b"EXTEND_TIMEOUT_USEC=120000000\nWATCHDOG=1"
-    assert running == b"WATCHDOG=1"
+    assert running == b"READY=1\nWATCHDOG=1"
     assert environment == {}, "a child must not speak in its place"
 
 

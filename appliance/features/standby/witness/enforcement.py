@@ -1,7 +1,8 @@
 """The enforcement of the lease on one computer: its firewall, its connections, regular checks, and a bounded log."""
 
+import contextlib
+import os
 import select
-import sys
 import threading
 import time
 from typing import Any, Callable, Iterable, List, Optional, Tuple
@@ -83,8 +84,9 @@ class BoundedLog:
 
 
 def write_error(text: str) -> None:
-    sys.stderr.write(text)
-    sys.stderr.flush()  # before Python 3.9 a pipe gets the text only when the buffer is full
+    """Write to standard error; a text that cannot be written is lost, because it must not end the enforcement."""
+    with contextlib.suppress(OSError):
+        os.write(2, text.encode("utf-8", "backslashreplace"))
 
 
 class LeaseEnforcement:

@@ -26,6 +26,7 @@ give the appliances no IPv6 address that the robot reaches.
 """
 
 import argparse
+import os
 import platform
 import select
 import shutil
@@ -96,6 +97,8 @@ def main(arguments: List[str]) -> int:
             _shut(settings, backend)
             return 0
         _require_place(settings, chosen.command)
+        if not os.isatty(2):
+            os.set_blocking(2, False)  # a reader of the log that has stopped must not hold the lease
         with lease:
             if chosen.command == "begin":
                 begin(settings, lease, [name for name in chosen.in_sync.split(",") if name], chosen.epoch)

@@ -16,7 +16,7 @@ import structlog
 
 from appliance.audit.log import log as log_module
 from appliance.audit.log import log_database
-from appliance.audit.log.folding import FoldSettings
+from appliance.audit.log.folding import FoldSettings, RecordFolder
 from appliance.audit.log.log import AuditLog, Durability
 from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.proof.verification import verify
@@ -89,23 +89,25 @@ def test_a_turn_writes_one_batch(path: Path, time: VirtualClock) -> None:
     assert log.close() is None
 
 
-def test_a_defect_is_a_failure(path: Path, time: VirtualClock, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("part", [(ChainWriter, "append"), (RecordFolder, "expire")])
+def test_a_defect_is_a_failure_until_it_has_passed(
+    path: Path, time: VirtualClock, monkeypatch: pytest.MonkeyPatch, part: tuple[type, str]
+) -> None:
     log = AuditLog(path, drive=ByHand)
 
     def defect(*_: object) -> NoReturn:
         raise RuntimeError("unforeseen")
 
     with monkeypatch.context() as broken:
-        broken.setattr(ChainWriter, "append", defect)
+        broken.setattr(*part, defect)
         log.record(decision(log))
-        with pytest.raises(RuntimeError, match="unforeseen"):
-            log.turn(time.now_ns() / 1e9)
-    reason = f"{path}: writing ended: RuntimeError: unforeseen"
-    assert log.failed == reason
-    log.record(decision(log))
-    assert settle(log) == reason
-    assert log.lag.records == 1  # the one that was being written
-    assert log.close() == reason
+        assert log.turn(time.now_ns() / 1e9) is not None, "the thread must not end"
+        assert "RuntimeError: unforeseen" in str(log.failed)
+        assert log.lag.records == 1
+    let_pass(log, 1)
+    assert (log.failed, settle(log), events(path)["decision"]) == (None, None, 1)
+    assert events(path)["log failed"] == 1
+    assert log.close() is None
 
 
 def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
