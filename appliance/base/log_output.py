@@ -119,10 +119,12 @@ def replace_stderr(
     Unless it `waits`, no write to standard output or error waits for a reader. A `sys.stderr` that is not the
     process's own stays.
     """
-    if not (sys.stderr is sys.__stderr__ or isinstance(sys.stderr, LogOutput)):
-        return sys.stderr
+    present = sys.stderr
+    is_own = present is sys.__stderr__
+    if not (is_own or isinstance(present, LogOutput)):
+        return present
     with suppress(OSError):
-        sys.stderr.flush()
+        present.flush()
     if not waits:
         for descriptor in (1, 2):
             keep_from_blocking(descriptor)

@@ -142,9 +142,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         "api": api,
         "api_tls": api_tls,
     }
+    configure_logs("supervisor")  # first: an error must not wait for a reader either
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")
-    configure_logs("supervisor")
     pairing = pairing_in(settings.state)
     node_ports = read_inputs(settings, None if pairing is None else pairing.robot)
     run_appliance(
