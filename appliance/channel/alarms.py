@@ -62,7 +62,8 @@ def activity(status: Status) -> list[Alarm]:
         for name, drops in sorted(recent.drops.items())
     ]
     if recent.denials >= recent.attention_at:
-        text = f"{counted(recent.denials, 'denial')} in the last minute; rosrv audit summary --since 1m"
+        most = f" ({recent.most_denied})" if recent.most_denied else ""
+        text = f"{counted(recent.denials, 'denial')} in the last minute{most}; rosrv audit summary --since 1m"
         found.insert(0, Alarm(kind="denials", severity="warning", text=text, about="audit"))
     return list(_handled(status, found))
 

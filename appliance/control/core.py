@@ -39,7 +39,7 @@ from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight
-from appliance.policy.model import Address, Request
+from appliance.policy.model import Address, CallHold, Request
 from appliance.policy.policy import Policy
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.ends import EndTable
@@ -205,12 +205,12 @@ class RelayOrders:
 
     def hold(
         self,
-        call: Callable[[Request], str],
+        call: Callable[[Request], CallHold],
         request: Callable[[messages.RequestHeld], Awaitable[messages.HeldRequestDecided]],
     ) -> None:
         """Take all calls that need an approval.
 
-        `call` holds a call of the Master API, and returns the text for the denied caller. `request` decides about one
+        `call` holds a call of the Master API, and returns the text for the caller. `request` decides about one
         request to a service.
         """
         self._holder.held.provide(HeldCalls(call, request))

@@ -4,7 +4,7 @@ import enum
 import ipaddress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
@@ -120,7 +120,7 @@ class Decision:
     `rule` is None if no rule matches. `told` is the reason without names and addresses of other hosts; None if
     `reason` contains none. In audit-only mode, `would_deny` is true if the rules deny the request, and `allowed` is
     true. `needs` names the additional right that decided, if any. `asks` is the request that needs an operator's
-    approval, even while it has one.
+    approval, even while it has one. `held`: it waits for that approval, so it is not allowed and not denied.
     """
 
     allowed: bool
@@ -130,6 +130,7 @@ class Decision:
     told: str | None = None
     needs: str = ""
     asks: Request | None = None
+    held: bool = False
 
     @property
     def rank(self) -> int:
@@ -141,8 +142,17 @@ class Decision:
         return "ask" if self.rank == 1 else self.word
 
     @property
-    def word(self) -> Literal["allow", "deny", "would deny"]:
-        return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
+    def word(self) -> Literal["allow", "deny", "would deny", "ask"]:
+        return (
+            "would deny" if self.would_deny else "allow" if self.allowed else "ask" if self.held else "deny"
+        )
+
+
+class CallHold(NamedTuple):
+    """The answer to a call that needs an approval: its text, and whether it waits for an operator."""
+
+    text: str
+    waits: bool
 
 
 TELLS = ("rule", "full", "id")

@@ -12,7 +12,9 @@ from typing import NamedTuple
 from appliance.audit.log.events import SEVERITIES
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
+from appliance.audit.log.repetition import repetitions
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.base.metric import BOUNDS
 from appliance.policy.model import Decision, Rule
 from appliance.quotas.pool import QuotaClass
@@ -21,23 +23,31 @@ from appliance.quotas.pool import QuotaClass
 NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can"
 
 _SECONDS = 60
+MOST_REQUESTS = 64
+_LONGEST_RESOURCE = 200
+_NO_ADDRESS = "a caller without an address"
+OTHERS = "other"
+"""The category of denials that have none, such as a connection without a request."""
 
 
 class LastMinute:
     """Counts of the last 60 seconds, one for each second and name; `clock` returns seconds and is never set back.
 
-    The caller limits the number of names.
+    The caller limits the number of names, or gives the `most` names in a second; others are then left out.
     """
 
-    def __init__(self, clock: Callable[[], float] = clock.now) -> None:
+    def __init__(self, clock: Callable[[], float] = clock.now, most: int | None = None) -> None:
         self._clock = clock
+        self._most = most
         self._seconds: deque[tuple[int, Counter[str]]] = deque(maxlen=_SECONDS)
 
     def add(self, name: str, number: int = 1) -> None:
         second = int(self._clock())
         if not self._seconds or self._seconds[-1][0] != second:
             self._seconds.append((second, Counter()))
-        self._seconds[-1][1][name] += number
+        counts = self._seconds[-1][1]
+        if self._most is None or name in counts or len(counts) < self._most:
+            counts[name] += number
 
     def counts(self) -> dict[str, int]:
         """Return the counts, without names that had no event."""
@@ -67,7 +77,8 @@ class Histogram:
 class Meter:
     """The counters of RVMaster's events since its start, and of the last minute.
 
-    `denied_hosts` has the unknown hosts together, as "".
+    `denied_hosts` has the unknown hosts together, as "". `denied_requests` has each denied host and request, of at
+    most `MOST_REQUESTS` in a second.
     """
 
     def __init__(self) -> None:
@@ -76,14 +87,33 @@ class Meter:
         self.calls: dict[str, Histogram] = {}
         self.denied = LastMinute()
         self.denied_hosts = LastMinute()
+        self.denied_requests = LastMinute(most=MOST_REQUESTS)
         self.dropped = LastMinute()
 
-    def decided(self, category: str, outcome: str, seconds: float, host: str) -> None:
-        self.decisions[category, outcome] += 1
-        if outcome == "deny":
-            self.denied.add(category)
-            self.denied_hosts.add(host)
-        self.decision_seconds.observe(seconds)
+    def recorded(self, record: AuditRecord) -> None:
+        """Count the decision of a record. `AuditTrail` calls this for every record, so that none is left out."""
+        if record.decision is None or (record.decision == "allow" and record.event != "decision"):
+            return  # not a decision of the policy, such as a call of REST
+        number, category = repetitions(record.detail), record.category or OTHERS
+        self.decisions[category, record.decision] += number
+        if record.decision == "deny":
+            self.denied.add(category, number)
+            self.denied_hosts.add("" if record.unknown else record.host or "", number)
+            asked = f"{category} {(record.resource or '')[:_LONGEST_RESOURCE]}".rstrip()
+            self.denied_requests.add(f"{record.host or _NO_ADDRESS}\n{asked}", number)
+
+    def most_denied(self) -> str:
+        """Return in words which host was denied most in the last minute, and what; "" if none was."""
+        hosts, requests = Counter[str](), dict[str, Counter[str]]()
+        for name, number in self.denied_requests.counts().items():
+            host, _, asked = name.partition("\n")
+            hosts[host] += number
+            requests.setdefault(host, Counter())[asked] += number
+        for host, number in hosts.most_common(1):
+            ((asked, _times),) = requests[host].most_common(1)
+            more = " and more" if len(requests[host]) > 1 else ""
+            return f"{host} was denied {asked}{more}, {counted(number, 'time')}"
+        return ""
 
     def called(self, call: str, seconds: float) -> None:
         """Count a call; `call` is a name of the call table, never text from a client."""
@@ -204,8 +234,8 @@ class AuditTrail:
             detail=detail,
             folds=reads and word == "allow",
         )
-        self.meter.decided(category, word, taken / 1e9, "" if unknown else asker.host)
-        return self.audit.record(record)
+        self.meter.decision_seconds.observe(taken / 1e9)
+        return self._record(record)
 
     def happened(
         self,
@@ -233,7 +263,7 @@ class AuditTrail:
         for details in self._completing(decision, severity):
             detail |= details(event, decision, severity, host, now)
         unknown = self._marked(host, decision, detail)
-        return self.audit.record(
+        return self._record(
             AuditRecord(
                 id=self._ids.next(),
                 time=now,
@@ -252,6 +282,10 @@ class AuditTrail:
                 folds=reads or not (whole or decision or host is None or not self.owing(host)),
             )
         )
+
+    def _record(self, record: AuditRecord) -> str:
+        self.meter.recorded(record)
+        return self.audit.record(record)
 
     def _completing(self, decision: str | None, severity: Severity) -> Sequence[RecordDetails]:
         return self._details if decision == "deny" or severity not in _ORDINARY else ()

@@ -15,6 +15,7 @@ from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
+from appliance.policy.model import CallHold
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import QuotaClass
 from appliance.rpc.fair_queue import LargeWrites, bulk_turns
@@ -76,7 +77,7 @@ class MasterApi:
             liveness=self.liveness,
             parameters=parameters,
             redecide_for=self.redecide_for,
-            hold_call=lambda request: f"held: {request.resource}",
+            hold_call=lambda request: CallHold(f"held: {request.resource}", waits=True),
             large=self.offload,
             large_writes=LargeWrites(self.offload, lambda _host: QuotaClass.REGISTERED),
         )

@@ -3,7 +3,7 @@
 from appliance.audit.log.record import Severity
 
 EVENTS: dict[str, str] = {
-    "decision": "A request was decided by the policy (allow, deny, would deny).",
+    "decision": "A request was decided by the policy (allow, deny, would deny, ask).",
     "registered": "A node registered a publication, subscription, service or parameter subscription.",
     "unregistered": "A node withdrew a registration.",
     "revoked": "A registration, grant or connection was revoked because the policy no longer allows it.",

@@ -36,6 +36,9 @@ from appliance.quotas.table import AUDIT_KINDS, AUDIT_READ_KINDS
 _DENIALS = frozenset({"connection refused", "limit exceeded", "malformed", "rate limited"})
 """The events that are folded like denials."""
 
+_FOLDED = frozenset({"deny", "ask"})
+"""The decisions of which repetitions count in one summary."""
+
 _Holder = tuple[str | None, QuotaClass]
 
 
@@ -88,7 +91,7 @@ class RecordFolder:
 
     def in_full(self, record: AuditRecord) -> str:
         """Return the id of the record that a denial repeats, or else its own id; empty for a collective kind."""
-        if record.decision != "deny" or not self._settings.seconds:
+        if record.decision not in _FOLDED or not self._settings.seconds:
             return record.id
         plain = storable(record)
         key = narrow = kind_of(plain)
@@ -113,7 +116,7 @@ class RecordFolder:
         if not self._settings.seconds:
             yield record
             return
-        denial = record.decision == "deny" or record.event in _DENIALS
+        denial = record.decision in _FOLDED or record.event in _DENIALS
         # Most records contradict no kind: a robot is seldom denied anything.
         contrary = self._reads.total if denial else record.decision == "allow" and self._denials.total
         if not (denial or record.folds or contrary):

@@ -143,7 +143,9 @@ def kind_of(record: AuditRecord) -> Key:
         record.event,
         record.decision,
         record.revision,
-        record.reason if record.event == "decision" else _plain_words(record.reason),
+        _plain_words(record.reason)
+        if record.event != "decision" or record.decision == "ask"
+        else record.reason,
         *where,
     )
 
@@ -173,7 +175,7 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     detail |= state.tallies
     if recovered:
         detail["recovered"] = True
-    passed = state.folds
+    passed = state.folds or state.decision == "ask"
     what = "further record{} of a host beyond its quota" if passed else "further denial{} of many kinds"
     return AuditRecord(
         id=record_id, time=time, event="repetitions folded" if passed else "denials folded", severity=state.severity,

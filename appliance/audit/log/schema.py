@@ -12,7 +12,7 @@ FIELDS: dict[str, tuple[dict[str, Any], str]] = {
     "sequence": ({"type": "integer"}, "place in the log; never goes back, has no gaps"),
     "event": ({"type": "string"}, "what happened: a name of the list below"),
     "severity": ({"enum": [severity.value for severity in Severity]}, "how much a person should care"),
-    "decision": ({"enum": ["allow", "deny", "would deny"]}, "absent where nothing was decided"),
+    "decision": ({"enum": ["allow", "deny", "would deny", "ask"]}, "absent where nothing was decided"),
     "host": (_TEXT_OR_NULL, "address of the peer"),
     "caller_id": (_TEXT_OR_NULL, "the name the peer gave: a claim"),
     "category": (_TEXT_OR_NULL, "what kind of request"),

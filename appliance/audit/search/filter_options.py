@@ -27,6 +27,9 @@ def filter_given(
     would_deny: Annotated[
         bool, typer.Option("--would-deny", help="Only requests that an audit-only policy would have denied")
     ] = False,
+    ask: Annotated[
+        bool, typer.Option("--ask", help="Only requests that waited for an operator's approval")
+    ] = False,
     since: Since = None,
     until: Until = None,
     topic: Annotated[
@@ -73,7 +76,7 @@ def filter_given(
     ] = None,
 ) -> Filter:
     """Return the filter that the options define. Raises `TimestampError`."""
-    wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
+    wanted = {"deny": deny, "allow": allow, "would deny": would_deny, "ask": ask}
     begin, end = times_given(since, until)
     return Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),

@@ -203,9 +203,12 @@ class BlocksState(msgspec.Struct, frozen=True):
 class MinuteState(msgspec.Struct, frozen=True):
     """The last minute's denials and drops. From `attention_at` denials on, an operator should check them."""
 
-    denials: Annotated[int, doc("decisions to deny; `would deny` is not counted")]
+    denials: Annotated[
+        int, doc("denials, also of unknown and blocked hosts; `would deny` and `ask` are not counted")
+    ]
     drops: Annotated[dict[str, int], doc("messages that monitors dropped, by monitor")]
     attention_at: Annotated[int, doc("the least number of denials that needs attention")] = 10
+    most_denied: Annotated[str, doc("the host that was denied most, what, and how often; or empty")] = ""
 
 
 class HandledAlarm(msgspec.Struct, frozen=True):

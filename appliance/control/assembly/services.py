@@ -7,7 +7,7 @@ from functools import reduce
 from appliance.channel import messages
 from appliance.control.assembly.current import Provided
 from appliance.policy.judgement import PolicyContext
-from appliance.policy.model import Request
+from appliance.policy.model import CallHold, Request
 
 OwnServiceAnswer = Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
 
@@ -36,11 +36,11 @@ class PolicyServices:
 class HeldCalls:
     """Answers for calls that need an approval.
 
-    `call` holds a call of the Master API, and returns the text for the denied caller. `request` decides about one
+    `call` holds a call of the Master API, and returns the text for the caller. `request` decides about one
     request to a service.
     """
 
-    call: Callable[[Request], str]
+    call: Callable[[Request], CallHold]
     request: Callable[[messages.RequestHeld], Awaitable[messages.HeldRequestDecided]]
 
 
@@ -53,9 +53,9 @@ class CallHolder:
     def __init__(self) -> None:
         self.held: Provided[HeldCalls] = Provided()
 
-    def call(self, request: Request) -> str:
+    def call(self, request: Request) -> CallHold:
         held = self.held()
-        return _NOT_HELD if held is None else held.call(request)
+        return CallHold(_NOT_HELD, waits=False) if held is None else held.call(request)
 
     async def request(self, wanted: messages.RequestHeld) -> messages.HeldRequestDecided:
         held = self.held()

@@ -19,7 +19,7 @@ MOST_DELAYED = 200  # the most topics that have their own histogram
 _Labels = tuple[str, str]
 _Number = TypeVar("_Number", int, float)
 _DECISIONS = tuple(
-    (category.value, outcome) for category in Category for outcome in ("allow", "deny", "would deny")
+    (category.value, outcome) for category in Category for outcome in ("allow", "deny", "would deny", "ask")
 )
 
 

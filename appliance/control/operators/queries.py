@@ -133,7 +133,9 @@ class Queries:
             clock=self.clock(),
             switched_off=self.switched_off(),
             blocks=self.blocks(),
-            last_minute=MinuteState(sum(meter.denied.counts().values()), meter.dropped.counts()),
+            last_minute=MinuteState(
+                sum(meter.denied.counts().values()), meter.dropped.counts(), most_denied=meter.most_denied()
+            ),
             **states_in(states, "status"),
         )
 

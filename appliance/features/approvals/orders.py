@@ -30,7 +30,7 @@ from appliance.features.approvals.approval_table import (
 from appliance.features.approvals.view import ApprovalCounts
 from appliance.master.calls.call import denial_text
 from appliance.master.endpoints.host_signs import HostSigns
-from appliance.policy.model import Address, Category, Decision, Request, address_of
+from appliance.policy.model import Address, CallHold, Category, Decision, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rights import Right, decide_right
 from appliance.store.ends import EndTable
@@ -85,7 +85,7 @@ class ApprovalOrders:
 
     # --- calls ---
 
-    def hold_call(self, request: Request) -> str:
+    def hold_call(self, request: Request) -> CallHold:
         call = HeldCall(request.host, request.category, request.resource)
         return self._held(call, request.caller_id)
 
@@ -113,8 +113,9 @@ class ApprovalOrders:
             self._end(entry, reason)
             approved = False
         if entry is None or not approved:
-            told = self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size)
-            return replace(decision, allowed=False, reason=f"{told}: {decision.reason}")
+            hold = self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size)
+            reason = f"{hold.text}: {decision.reason}"
+            return replace(decision, allowed=False, held=hold.waits, reason=reason)
         if entry.once:
             self._table.end(entry)
             self._record("approval used", entry, f"used approval {entry.number}")
@@ -122,7 +123,7 @@ class ApprovalOrders:
 
     def _held(
         self, call: HeldCall, caller_id: str, type_: str = "", arguments: bytes = b"", size: int = 0
-    ) -> str:
+    ) -> CallHold:
         now = clock.now()
         entry = self._table.find(call)
         if entry is None:
@@ -136,13 +137,15 @@ class ApprovalOrders:
                 size=size,
             )
             if isinstance(held, str):
-                return f"not held: {held}; ask the operator about those first"
+                return CallHold(f"not held: {held}; ask the operator about those first", waits=False)
             entry = held
             self._record("approval wanted", entry, f"waits for approval {entry.number}")
         left = max(1, round(self._table.seconds_left(entry)))
         if entry.state is ApprovalState.REFUSED:
-            return f"an operator refused approval {entry.number}; ask again in {left} s"
-        return f"held for approval {entry.number}; ask the operator, then repeat; expires in {left} s"
+            refused = f"an operator refused approval {entry.number}; ask again in {left} s"
+            return CallHold(refused, waits=False)
+        text = f"held for approval {entry.number}; ask the operator, then repeat; expires in {left} s"
+        return CallHold(text, waits=True)
 
     # --- operators ---
 

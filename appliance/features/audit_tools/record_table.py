@@ -17,7 +17,7 @@ from appliance.base.timestamps import local_text
 from appliance.cli.audit.verification_text import write
 from appliance.policy.host_names import HostInWords
 
-_STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
+_STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow", "ask": "yellow"}
 _SECONDS, _MILLISECONDS = 19, 23  # characters of a time
 _DATE = 11
 _LEAST_WHY = 40  # characters; with less room for the reasons in a column, they are below the records

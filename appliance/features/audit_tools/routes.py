@@ -71,7 +71,7 @@ class LogCheckpoints(msgspec.Struct, frozen=True):
 
 def _wanted(
     *,
-    decision: Annotated[list[Literal["allow", "deny", "would deny"]] | None, Query()] = None,
+    decision: Annotated[list[Literal["allow", "deny", "would deny", "ask"]] | None, Query()] = None,
     since: Annotated[str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")] = None,
     until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
     host: Annotated[

@@ -4,6 +4,7 @@ All denials of the robot's own nodes count, but only a few of every other host, 
 purpose.
 """
 
+import contextlib
 import ipaddress
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -31,12 +32,18 @@ def counted_denials(
     """
     own, others = 0, Counter[str]()
     for host, number in by_host.items():
-        address = ipaddress.ip_address(host) if host else None
+        address = _address(host)
         if address is not None and any(address in network for network in policy.robot):
             own += number
         elif address is None or not deprived(address):
             others["" if address is None else policy.alike(address)] += number
     return own + min(_OF_OTHER_HOSTS, sum(min(_OF_ONE_HOST, number) for number in others.values()))
+
+
+def _address(host: str) -> Address | None:
+    with contextlib.suppress(ValueError):  # an unknown host, or a caller without an address
+        return ipaddress.ip_address(host)
+    return None
 
 
 class RobotHealth(NamedTuple):

@@ -10,7 +10,12 @@ from appliance.features.views import STATES
 METRICS = (
     gauge("rosrv_info", "1, with the version that runs, and the robot's name", "version", "name"),
     gauge("rosrv_start_time_seconds", "when RVMaster started, seconds since the epoch"),
-    counter("rosrv_decisions_total", "decisions: allow, deny or would deny", "category", "outcome"),
+    counter(
+        "rosrv_decisions_total",
+        "decisions: allow, would deny, ask (waits for an approval), deny (also of unknown and blocked hosts)",
+        "category",
+        "outcome",
+    ),
     histogram("rosrv_decision_seconds", "time from a request's arrival to its decision"),
     histogram("rosrv_master_call_seconds", "time from a request's arrival to its answer", "call"),
     gauge("rosrv_probe_failed", "1 while the ROS master is reachable without the appliance"),

@@ -168,7 +168,7 @@ def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
     """Yield the decided requests, except those of folded records, which do not name their requests."""
-    decided = Filter(decision=("allow", "deny", "would deny"))
+    decided = Filter(decision=("allow", "deny", "would deny", "ask"))
     try:
         for entry in audit_of(appliance.way).export(decided):
             record = entry.record

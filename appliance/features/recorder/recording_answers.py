@@ -139,7 +139,7 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
     record: Annotated[str, doc("id of the audit record")]
     event: Annotated[str, doc("its stable name")]
     severity: Annotated[str, doc("severity of the audit record")]
-    decision: Annotated[str | None, doc("allow, deny or would deny, or null if nothing was decided")]
+    decision: Annotated[str | None, doc("allow, deny, would deny or ask, or null if nothing was decided")]
     host: Annotated[str | None, doc("the host that the record is about")]
     caller_id: Annotated[str | None, doc("the name the node gave: a claim")]
     resource: Annotated[str | None, doc("topic, service, call or monitor")]

@@ -36,7 +36,7 @@ from appliance.master.graph.registry import HostFullError, Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
 from appliance.master.reconcile.liveness import Liveness, Probe
 from appliance.master.rosmaster import Answer
-from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.model import Address, CallHold, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.rpc.fair_queue import Bulk, LargeWrites, weigh
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -140,7 +140,7 @@ class Execution:
     liveness: Liveness
     parameters: ParameterCalls
     redecide_for: Callable[[Address, str], None]
-    hold_call: Callable[[Request], str]
+    hold_call: Callable[[Request], CallHold]
     large: int
     large_writes: LargeWrites
     _names: KeyTurns = field(default_factory=KeyTurns, init=False)
@@ -285,7 +285,8 @@ class Execution:
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
         request, call = attempt.request, attempt.call
         if decision.asks is not None and not decision.allowed:
-            decision = replace(decision, reason=f"{self.hold_call(decision.asks)}: {decision.reason}")
+            hold = self.hold_call(decision.asks)
+            decision = replace(decision, held=hold.waits, reason=f"{hold.text}: {decision.reason}")
         record = self.trail.decided(
             attempt.caller.asker,
             call.name,

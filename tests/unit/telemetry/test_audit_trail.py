@@ -1,16 +1,23 @@
 import asyncio
+import inspect
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
+import appliance
 from appliance.audit.log.budget import Budget
+from appliance.audit.log.events import EVENTS
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.record import Severity
+from appliance.policy.model import Decision
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
-from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail
+from appliance.telemetry.audit_trail import MOST_REQUESTS, NOT_RECORDED, Asker, AuditTrail
 from tests.support.core import MemoryLog
 
+PACKAGE = Path(appliance.__file__).parent
 GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"
 
 
@@ -113,3 +120,56 @@ def test_records_that_are_written_are_owed() -> None:
     while not one.owing(GUEST):
         one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
     assert "bytes of audit records" in asyncio.run(one.still_owing(GUEST))
+
+
+@pytest.mark.parametrize("event", [*EVENTS, "decision"])
+@pytest.mark.parametrize("host", [None, GUEST, UNKNOWN, "not an address"])
+def test_each_record_of_a_denial_is_counted_and_no_other(event: str, host: str | None) -> None:
+    """A record of several denials, such as a relay's, counts all of them."""
+    log = log_of()
+    one = trail(log, deny=True)
+    for number, decision in enumerate((None, "allow", "would deny", "ask", "deny"), 1):
+        before = one.meter.denied.counts()
+        one.happened(event, "why", decision=decision, host=host, resource="/t", count=number)
+        assert (one.meter.denied.counts() != before) == (decision == "deny")
+    denied = {key: count for key, count in one.meter.decisions.items() if key[1] == "deny"}
+    assert denied == {("other", "deny"): 5}
+    assert one.meter.denied_hosts.counts() == {"" if host in {None, UNKNOWN} else host: 5}
+    assert one.meter.most_denied() == f"{host or 'a caller without an address'} was denied other /t, 5 times"
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_call_that_waits_for_an_approval_is_no_denial(*, held: bool) -> None:
+    log = log_of()
+    one = trail(log, deny=True)
+    one.decided(Asker(GUEST, "/n", 0), "c", "call", "/home", Decision(False, None, "why", held=held))
+    word = "ask" if held else "deny"
+    assert log.records[0].decision == word
+    assert one.meter.decisions == {("call", word): 1}
+    assert one.meter.denied.counts() == ({} if held else {"call": 1})
+
+
+def test_a_flood_of_requests_holds_few_names() -> None:
+    one = trail(log_of(), deny=True)
+    for number in range(10 * MOST_REQUESTS):
+        one.happened(
+            "decision", "why", decision="deny", host=UNKNOWN, category="publish", resource=f"/{number}"
+        )
+    assert (
+        len(one.meter.denied_requests.counts()) <= 2 * MOST_REQUESTS
+    )  # of two seconds, if the second changed
+    assert sum(one.meter.denied.counts().values()) == 10 * MOST_REQUESTS
+    assert re.match(f"{UNKNOWN} was denied publish /0 and more, [0-9]+ times$", one.meter.most_denied())
+
+
+def test_only_the_trail_makes_records_with_a_decision() -> None:
+    """So no denial is recorded without being counted. The audit log itself makes summaries, and copies of records."""
+    made = {
+        str(file.relative_to(PACKAGE))
+        for file in PACKAGE.rglob("*.py")
+        if re.search(r"\bAuditRecord\(", file.read_text(encoding="utf-8"))
+    }
+    assert {name for name in made if not name.startswith("audit/log/")} == {"telemetry/audit_trail.py"}
+    own = inspect.getsource(AuditTrail)
+    assert own.count("self.audit.record(") == 1, "every record passes `_record`, which counts it"
+    assert "self.meter.recorded(record)" in inspect.getsource(AuditTrail._record)

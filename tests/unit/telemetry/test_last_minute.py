@@ -1,3 +1,4 @@
+from appliance.audit.log.record import AuditRecord, Severity
 from appliance.telemetry.audit_trail import LastMinute, Meter
 
 
@@ -28,6 +29,9 @@ def test_a_flood_holds_a_minute_of_seconds() -> None:
 
 def test_only_denials_count_as_denied() -> None:
     meter = Meter()
-    for outcome in ("deny", "allow", "would deny", "deny"):
-        meter.decided("publish", outcome, 0.001, "10.0.0.1")
+    for word in ("deny", "allow", "would deny", "ask", "deny"):
+        record = AuditRecord(
+            id="1", time=0, event="decision", severity=Severity.INFO, decision=word, category="publish"
+        )
+        meter.recorded(record)
     assert meter.denied.counts() == {"publish": 2}

@@ -116,7 +116,7 @@ class Site:
         return (
             ""
             if decision.allowed
-            else self.orders.hold_call(decision.asks or Request(AGENT, "", category, ""))
+            else self.orders.hold_call(decision.asks or Request(AGENT, "", category, "")).text
         )
 
     async def held(self) -> list[Approval]:
@@ -268,7 +268,7 @@ async def test_a_namespace_is_approved_although_only_what_is_below_it_asks(site:
     below = Right(Request(AGENT, "/it", Category.WRITE, "/arm"), namespace=True)
     asked = decide_right(site.policy, below).asks
     assert asked is not None
-    await site.orders.approve(ApproveCall(number_in(site.orders.hold_call(asked)), 10.0), "ann")
+    await site.orders.approve(ApproveCall(number_in(site.orders.hold_call(asked).text), 10.0), "ann")
     await site.pass_time(9)
     assert decide_right(site.policy, below).allowed
 

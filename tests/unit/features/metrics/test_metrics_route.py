@@ -19,8 +19,9 @@ def body(
     processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},),
 ) -> Measures:
     meter = Meter()
-    meter.decided("publish", "deny", 0.0003, "10.0.0.1")
-    meter.decided("publish", "deny", 99.0, "10.0.0.1")
+    for seconds in (0.0003, 99.0):
+        meter.decisions["publish", "deny"] += 1
+        meter.decision_seconds.observe(seconds)
     meter.called("getPid", 0.002)
     return example(
         Measures,

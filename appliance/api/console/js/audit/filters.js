@@ -9,7 +9,7 @@ import { go } from "../router.js";
 export const NAMES = ["text", "decision", "since", "until", "host", "caller_id", "resource", "category", "event", "severity", "rule", "who", "looks"];
 const FEW = ["text", "decision", "since"];
 const SINCE = /** @type {[string, string][]} */ ([["", "Any time"], ["15m", "Last 15 minutes"], ["1h", "Last hour"], ["1d", "Last day"], ["1w", "Last week"]]);
-const DECISIONS = /** @type {[string, string][]} */ ([["", "Any decision"], ["deny", "Deny"], ["would deny", "Would deny"], ["allow", "Allow"]]);
+const DECISIONS = /** @type {[string, string][]} */ ([["", "Any decision"], ["deny", "Deny"], ["would deny", "Would deny"], ["ask", "Waits for an approval"], ["allow", "Allow"]]);
 const SEVERITIES = /** @type {[string, string][]} */ ([["", "Any"], ["debug", "Debug and up"], ["info", "Info and up"], ["notice", "Notice and up"], ["warning", "Warning and up"], ["alarm", "Alarm"]]);
 const LOOKS = /** @type {[string, string][]} */ ([["", "Hidden"], ["1", "Shown"]]);
 const LABELS = { text: "Text", decision: "Decision", since: "Since", until: "Until", host: "Host", caller_id: "Node", resource: "Resource", category: "Category", event: "Event", severity: "Severity", rule: "Rule", who: "Who", looks: "REST queries" };

@@ -4,7 +4,7 @@ import { html } from "../html.js";
 import { Given } from "./given.js";
 
 const TONES = {
-  allow: "allow", deny: "deny", "would deny": "warn",
+  allow: "allow", deny: "deny", "would deny": "warn", ask: "warn",
   alarm: "deny", warning: "warn", notice: "note", info: "", debug: "",
   up: "allow", live: "allow", enabled: "allow", down: "warn", lost: "warn", revoked: "", failing: "deny", held: "deny", "shadow mode": "note", disabled: "",
 };
