@@ -4,7 +4,6 @@ import logging
 import sys
 from typing import Any, TextIO, cast
 
-from appliance.base.counted import counted
 from appliance.base.log_output import replace_stderr
 
 _rich = sys.modules.pop("rich", None)
@@ -32,14 +31,7 @@ def configure_logs(process: str) -> None:
         if human
         else [structlog.processors.ExceptionRenderer(_transform), structlog.processors.JSONRenderer()]
     )
-
-    def lost(lines: int, since: str) -> str:
-        event: Any = {"event": f"{counted(lines, 'line')} of the log were lost since {since}", "lost": lines}
-        for step in (*shared, *renderer):
-            event = step(None, "warning", event)
-        return f"{event}\n"
-
-    output = replace_stderr(lost)
+    output = replace_stderr(_lost)
     handler = logging.StreamHandler(output)
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
@@ -54,6 +46,12 @@ def configure_logs(process: str) -> None:
         cache_logger_on_first_use=False,
     )
     structlog.contextvars.bind_contextvars(process=process)
+
+
+def _lost(lines: int, since: str) -> str:
+    """Return a line of the log, which the caller writes."""
+    log = structlog.wrap_logger(structlog.ReturnLogger())
+    return f"{log.warning(f'lines of the log were lost since {since}', lines=lines)}\n"
 
 
 def write_line(text: str, stream: TextIO) -> None:

@@ -26,6 +26,7 @@ _SECONDS = 60
 MOST_REQUESTS = 64
 _LONGEST_RESOURCE = 200
 _NO_ADDRESS = "a caller without an address"
+_REST = "rest"
 OTHERS = "other"
 """The category of denials that have none, such as a connection without a request."""
 
@@ -77,8 +78,8 @@ class Histogram:
 class Meter:
     """The counters of RVMaster's events since its start, and of the last minute.
 
-    `denied_hosts` has the unknown hosts together, as "". `denied_requests` has each denied host and request, of at
-    most `MOST_REQUESTS` in a second.
+    `denied_hosts` has the denials of nodes, those of unknown hosts together, as "". `denied_requests` has each denied
+    host and request, of at most `MOST_REQUESTS` in a second.
     """
 
     def __init__(self) -> None:
@@ -98,7 +99,8 @@ class Meter:
         self.decisions[category, record.decision] += number
         if record.decision == "deny":
             self.denied.add(category, number)
-            self.denied_hosts.add("" if record.unknown else record.host or "", number)
+            if category != _REST:  # not of a node
+                self.denied_hosts.add("" if record.unknown else record.host or "", number)
             asked = f"{category} {(record.resource or '')[:_LONGEST_RESOURCE]}".rstrip()
             self.denied_requests.add(f"{record.host or _NO_ADDRESS}\n{asked}", number)
 

@@ -7,9 +7,11 @@ import os
 import subprocess
 import threading
 import xmlrpc.client
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -22,96 +24,78 @@ SETTINGS = """\
 recorder: {enabled: true, memory: 16MiB, disk: 64MiB, triggers: []}
 audit: {syslog: {to: "udp://127.0.0.1:9"}}
 """
+Broken = Callable[[], AbstractContextManager[None]]
+Said = Callable[[], str]
+LogPlace = tuple[int, Broken, Said]
+"""A descriptor for standard error; a block in which it cannot be written; and what was written."""
+Kind = Callable[[Path], LogPlace]
 CHANGED = OPEN_POLICY.replace("[Publishers]\n", "[Publishers]\n/cmd_vel = 127.0.0.1\n")
 
 
-class Stderr(ThisMachine):
-    """A machine whose programs have one standard error, which a test breaks and repairs."""
-
-    path: ClassVar[str] = "/dev/null"
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.descriptor = os.open(self.path, os.O_WRONLY)
-
-    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        process = super().popen(args, **options | {"stderr": self.descriptor})
-        os.close(self.descriptor)
-        process.stderr = io.StringIO()
-        return process
+def of_a_full_disk(disk: Path) -> LogPlace:
+    file = disk / "log"
 
     @contextlib.contextmanager
-    def broken(self) -> Iterator[None]:
-        yield
-
-    def said(self) -> str:
-        """Return what was written after the repair, or nothing where it is never repaired."""
-        return ""
-
-
-class Full(Stderr):
-    path = "/dev/full"
-
-
-class ReaderGone(Stderr):
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        reader, self.descriptor = os.pipe()
-        os.close(reader)
-
-
-class ReaderStopped(Stderr):
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.reader, self.descriptor = os.pipe()
-        fcntl.fcntl(self.reader, fcntl.F_SETPIPE_SZ, 4096)
-        os.write(self.descriptor, b"x" * 4096)
-        self.text = b""
-
-    @contextlib.contextmanager
-    def broken(self) -> Iterator[None]:
-        yield
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        while part := os.read(self.reader, 4096):
-            self.text += part
-
-    def said(self) -> str:
-        return self.text.decode()
-
-
-class DiskFull(Stderr):
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.file = folder / "log"
-        self.descriptor = os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-
-    @contextlib.contextmanager
-    def broken(self) -> Iterator[None]:
-        with filled(self.folder):
-            with contextlib.suppress(OSError), self.file.open("ab", buffering=0) as log:
+    def broken() -> Iterator[None]:
+        with filled(disk):
+            with contextlib.suppress(OSError), file.open("ab", buffering=0) as log:
                 while True:  # the last block of the log has room
                     log.write(b"x\n")
             yield
 
-    def said(self) -> str:
-        return self.file.read_text()
+    return os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND), broken, file.read_text
 
 
-KINDS = [DiskFull, Full, ReaderGone, ReaderStopped]
+def full(_disk: Path) -> LogPlace:
+    return os.open("/dev/full", os.O_WRONLY), contextlib.nullcontext, str
+
+
+def without_a_reader(_disk: Path) -> LogPlace:
+    reader, writer = os.pipe()
+    os.close(reader)
+    return writer, contextlib.nullcontext, str
+
+
+def with_a_stopped_reader(_disk: Path) -> LogPlace:
+    reader, writer = os.pipe()
+    fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(writer, b"x" * 4096)
+    parts: list[bytes] = []
+
+    def read() -> None:
+        while part := os.read(reader, 4096):
+            parts.append(part)
+
+    @contextlib.contextmanager
+    def broken() -> Iterator[None]:
+        yield
+        threading.Thread(target=read, daemon=True).start()
+
+    return writer, broken, lambda: b"".join(parts).decode()
+
+
+KINDS = [of_a_full_disk, full, without_a_reader, with_a_stopped_reader]
+REPAIRED = {of_a_full_disk, with_a_stopped_reader}
 
 
 @contextlib.contextmanager
-def started(kind: type[Stderr], settings: str = "") -> Iterator[tuple[Appliance, Stderr]]:
+def started(kind: Kind, settings: str = "") -> Iterator[tuple[Appliance, Path, Broken, Said]]:
     """An appliance with its state on a small disk, which is also the disk of the log if it is on one."""
     appliance = Appliance(settings=settings, options=("--api", "127.0.0.1:0"))
+
+    def popen(_self: ThisMachine, args: Sequence[str], **options: Any) -> Any:
+        process: Any = subprocess.Popen(list(args), **{**options, "stderr": descriptor})
+        process.stderr = io.StringIO()
+        return process
+
     try:
         with small_disk(appliance.directory / "disk", "64m", "mode=755") as disk:
             appliance.state = disk / "state"
-            appliance.host = machine = kind(disk)
-            appliance.start()
-            yield appliance, machine
+            descriptor, broken, said = kind(disk)
+            with mock.patch.object(ThisMachine, "popen", popen):
+                appliance.start()
+            os.close(descriptor)
+            yield appliance, disk, broken, said
             appliance.stop()
     finally:
         appliance.close()
@@ -123,30 +107,30 @@ def registered(appliance: Appliance, node: str) -> bool:
     return bool(answer[0] == 1)
 
 
-@pytest.mark.parametrize("kind", [pytest.param(DiskFull, marks=pytest.mark.real), *KINDS[1:]])
-def test_a_full_disk_of_state_and_log_has_an_end(kind: type[Stderr]) -> None:
+@pytest.mark.parametrize("kind", [pytest.param(of_a_full_disk, marks=pytest.mark.real), *KINDS[1:]])
+def test_a_full_disk_of_state_and_log_has_an_end(kind: Kind) -> None:
     """Requests are denied until there is space, and then allowed, without a restart; the gap is recorded."""
-    with started(kind) as (appliance, machine):
+    with started(kind) as (appliance, disk, broken, said):
         assert registered(appliance, "/before")
-        with machine.broken(), filled(machine.folder) if kind is not DiskFull else contextlib.nullcontext():
+        with broken(), contextlib.nullcontext() if kind is of_a_full_disk else filled(disk):
             eventually(lambda: not registered(appliance, "/while"), "the log is not full")
         eventually(lambda: registered(appliance, "/after"), appliance.story)
         appliance.recorded("--event", "log failed")
-        if kind in {DiskFull, ReaderStopped}:
-            eventually(lambda: "the audit log is written again" in machine.said(), machine.said)
+        if kind in REPAIRED:
+            eventually(lambda: "the audit log is written again" in said(), said)
         killed = appliance.kill("relay")
-        assert killed not in eventually(lambda: appliance.pids("relay"), appliance.story)
+        eventually(lambda: set(appliance.pids("relay")) - {killed}, appliance.story)
         assert registered(appliance, "/later")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_process_is_started_again(kind: type[Stderr]) -> None:
-    with started(kind, SETTINGS) as (appliance, machine):
+def test_every_process_is_started_again(kind: Kind) -> None:
+    with started(kind, SETTINGS) as (appliance, _disk, broken, said):
         roles = set(appliance.processes()) - {"supervisor"}
         assert {"control", "relay", "api", "signer", "rosmaster", "rosout", "recorder", "syslog"} <= roles
         breaks = contextlib.ExitStack()
-        if kind is not DiskFull:  # a full state directory lets no process start
-            breaks.enter_context(machine.broken())
+        if kind is not of_a_full_disk:  # a full state directory lets no process start
+            breaks.enter_context(broken())
         for role in sorted(roles):
             killed = appliance.pids(role)
             if not killed:  # started only when it is needed
@@ -157,5 +141,5 @@ def test_every_process_is_started_again(kind: type[Stderr]) -> None:
         breaks.close()
         appliance.reload(CHANGED)
         appliance.recorded("--event", "policy loaded", count=2)
-        if kind is ReaderStopped:
-            eventually(lambda: "process ended" in machine.said() or None, machine.said)
+        if kind is with_a_stopped_reader:
+            eventually(lambda: "process died" in said() or None, said)

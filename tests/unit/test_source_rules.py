@@ -290,7 +290,7 @@ WALL_CLOCK = {
         "features/recorder/recorder.py", "features/recorder/ring.py", "features/recorder/recorder_ring.py",
         "features/recorder/rings.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "specifications/specifications_in_force.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
-        "supervisor/supervisor.py",
+        "supervisor/supervisor.py", "base/log_output.py",
     ],
     "the date of an end of `EndTable`, for people and for the api": [
         "api/front/access.py", "control/operators/handled_alarms.py", "control/operators/token_orders.py",

@@ -179,7 +179,8 @@ EVENTS: dict[str, str] = {
     "reconciled": "The reconcile loop found and repaired a difference between the wanted and the observed state.",
     "denials folded": "Repetitions of a denial that is already recorded; `detail` has their number, the first and the"
     " last.",
-    "repetitions folded": "Repetitions of an allowed read that is already recorded, and any repeated records of a host"
+    "repetitions folded": "Repetitions of an allowed read, or of a call that waits for an approval, that is already"
+    " recorded, and any repeated records of a host"
     " beyond its quota; `detail` has their number, the first and the last.",
     "log begun": "The first record of a new log; `detail.earlier_log_missing` is set if an earlier log existed.",
     "records removed": "Retention removed old records; `detail` has which, why, and the hash of the last one.",

@@ -5,19 +5,18 @@ from pathlib import Path
 import pytest
 
 from appliance.base.clock import now
-from appliance.base.engine_thread import Driver, InCaller, Turn
+from appliance.base.engine_thread import Drive, Driver, InCaller, Turn
 from appliance.base.log_output import MOST_WAITING, LogOutput, keep_from_blocking
 
 
-class Retries:
-    """Calls the turns of an output when a test wants it, in the place of its thread."""
+def by_hand(started: list[InCaller]) -> Drive:
+    """Return what starts no thread: a test calls the turns of an output."""
 
-    def __init__(self) -> None:
-        self.started: list[InCaller] = []
+    def drive(name: str, turn: Turn, gather: float) -> Driver:
+        started.append(InCaller(name, turn, gather))
+        return started[-1]
 
-    def __call__(self, name: str, turn: Turn, gather: float) -> Driver:
-        self.started.append(InCaller(name, turn, gather))
-        return self.started[-1]
+    return drive
 
 
 @pytest.fixture
@@ -41,24 +40,24 @@ def read(reader: int) -> str:
 
 def test_lines_wait_for_a_reader_in_their_order(pipe: tuple[int, int]) -> None:
     reader, writer = pipe
-    retries = Retries()
-    output = LogOutput(writer, lost, retries)
+    retries: list[InCaller] = []
+    output = LogOutput(writer, lost, by_hand(retries))
     lines = [f"{number:>999}\n" for number in range(200)]
     for line in lines:
         assert output.write(line) == 1000
     found = read(reader)
     assert len(found) < 200_000
     for _ in range(4):
-        retries.started[0].hurry()
+        retries[0].hurry()
         found += read(reader) if found != "".join(lines) else ""
     assert found == "".join(lines)
-    assert len(retries.started) == 1
-    assert retries.started[0].due is None, "no thread is left"
+    assert len(retries) == 1
+    assert retries[0].due is None, "no thread is left"
 
 
 def test_lost_lines_are_counted_and_reported_after_those_that_waited(pipe: tuple[int, int]) -> None:
     reader, writer = pipe
-    output = LogOutput(writer, lost, Retries())
+    output = LogOutput(writer, lost, by_hand([]))
     for number in range(1000):
         output.write(f"{number:>999}\n")
     found = ""
@@ -83,13 +82,13 @@ def test_an_output_that_fails_raises_nothing_and_works_again(tmp_path: Path, kin
         os.close(full)
     elif kind == "closed":
         os.close(writer)
-    retries = Retries()
-    output = LogOutput(writer, lost, retries)
+    retries: list[InCaller] = []
+    output = LogOutput(writer, lost, by_hand(retries))
     output.write("one \ud800\n")
     output.flush()
     free = os.open(tmp_path / "log", os.O_WRONLY | os.O_CREAT)
     os.dup2(free, writer)
-    retries.started[0].hurry()
+    retries[0].hurry()
     output.write("two\n")
     assert (tmp_path / "log").read_text() == "one \\ud800\ntwo\n"
     for descriptor in {free, writer}:
@@ -121,8 +120,8 @@ def test_other_programs_with_the_same_terminal_or_pipe_still_block() -> None:
 
 def test_a_turn_gives_the_time_of_the_next_one(pipe: tuple[int, int]) -> None:
     _reader, writer = pipe
-    retries = Retries()
-    LogOutput(writer, lost, retries).write("x" * 70_000)
+    retries: list[InCaller] = []
+    LogOutput(writer, lost, by_hand(retries)).write("x" * 70_000)
     begun = now()
-    retries.started[0].hurry()
-    assert retries.started[0].due == pytest.approx(begun + 0.5, abs=0.2)
+    retries[0].hurry()
+    assert retries[0].due == pytest.approx(begun + 0.5, abs=0.2)
