@@ -84,7 +84,10 @@ def test_many_denials_turn_the_state_to_a_warning(
     expect(card).to_contain_text("In service, with warnings")
     expect(card).to_contain_text(re.compile(r"\d+ denials in the last minute"))
     [attention] = appliance.status()["attention"]
-    assert re.fullmatch(r"\d+ denials in the last minute; rosrv audit summary --since 1m", attention)
+    assert re.fullmatch(
+        r"\d+ denials in the last minute \(.+ was denied .+ times\); rosrv audit summary --since 1m",
+        attention,
+    )
     card.click()
     expect(page).to_have_url(re.compile("/console/audit.*decision=deny"))
 
