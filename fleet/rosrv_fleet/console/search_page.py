@@ -21,7 +21,13 @@ from rosrv_fleet.search_sql import FleetFilter
 
 WORDS = ("robot", "host", "caller", "topic", "event", "rule", "text", "who", "since", "until")
 ASKED = (*WORDS, "decision", "cursor")
-_DECISIONS = (("", "any"), ("deny", "denied"), ("allow", "allowed"), ("would_deny", "would be denied"))
+_DECISIONS = (
+    ("", "any"),
+    ("deny", "denied"),
+    ("allow", "allowed"),
+    ("would_deny", "would be denied"),
+    ("ask", "waited for approval"),
+)
 _ROWS = 100
 _COLUMNS = tuple(
     map(
