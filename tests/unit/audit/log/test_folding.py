@@ -48,6 +48,17 @@ def test_first_in_full_then_counted() -> None:
     assert (summary.detail["first_id"], summary.detail["last_id"]) == (same[1].id, same[99].id)
 
 
+def test_a_call_that_waits_for_an_approval_is_one_record_whatever_time_is_left() -> None:
+    folder = make_folder(seconds=10)
+    same = [
+        denial(decision="ask", reason=f"held for approval 7; expires in {left} s") for left in (120, 119, 118)
+    ]
+    assert [folder.in_full(one) for one in same] == [same[0].id] * 3
+    assert offer(folder, *same) == same[:1]
+    (summary,) = folder.expire(10)
+    assert (summary.event, summary.decision, summary.detail["count"]) == ("repetitions folded", "ask", 2)
+
+
 def test_summaries_continue_with_the_repetitions() -> None:
     folder = make_folder(seconds=10)
     offer(folder, denial(), denial(), now=0)
