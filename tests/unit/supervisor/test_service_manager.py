@@ -1,6 +1,7 @@
 import asyncio
 import os
 import socket
+import threading
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,21 @@ def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
     assert starting == b"EXTEND_TIMEOUT_USEC=120000000\nWATCHDOG=1"
     assert running == b"READY=1\nWATCHDOG=1"
     assert environment == {}, "a child must not speak in its place"
+
+
+@pytest.mark.nightly
+def test_a_service_manager_that_does_not_read_delays_nothing(tmp_path: Path) -> None:
+    with listening(tmp_path / "notify"):
+        manager = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+
+        def say() -> None:
+            for _ in range(5000):
+                manager.starting("builds its firewall")
+
+        thread = threading.Thread(target=say, daemon=True)
+        thread.start()
+        thread.join(30)
+        assert not thread.is_alive()
 
 
 def test_without_a_service_manager_nothing_is_sent() -> None:
