@@ -15,6 +15,8 @@ from appliance.features.views import states_of
 
 Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]
+SWITCHED_OFF = "monitor-off:"
+"""Begins the kinds of alarms for monitors that somebody switched off, or has in shadow mode."""
 _Condition = tuple[Severity, str, About, str]
 _ORDER = ("alarm", "warning", "notice")
 
@@ -114,7 +116,7 @@ def _policy(status: Status) -> Iterator[_Condition]:
             yield "alarm", f"forgotten:{off.name}", off.about, text
         elif off.about == "monitors":
             end = "without an end" if off.until is None else f"until {_moment(off.until)}"
-            yield "notice", f"monitor-off:{off.name}", "monitors", f"{off.what}, {end}: {off.again}"
+            yield "warning", f"{SWITCHED_OFF}{off.name}", "monitors", f"{off.what}, {end}: {off.again}"
     if policy.confirm_by is not None:
         yield (
             "warning",

@@ -44,7 +44,10 @@ def verbs_of(
     confirmation: AdminRequest[_Confirmed],
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
+    waiting: Callable[[Appliance], Callable[[], None]] = lambda _appliance: lambda: None,
 ) -> tuple[GroupedVerb, GroupedVerb, GroupedVerb]:
+    """`waiting(appliance)` is called before a confirmation, and returns what follows it."""
+
     def revisions(appliance: Appliance) -> None:
         for row in appliance.ask_or_exit(listed).revisions:
             _say_revision(row, as_json=appliance.as_json)
@@ -58,12 +61,15 @@ def verbs_of(
         say_done(appliance.answer_or_exit(back(revision)))
 
     def confirm(appliance: Appliance) -> None:
+        follow = waiting(appliance)
         body = appliance.ask_or_exit(confirmation)
         if appliance.as_json:
             say_json(body)
         else:
             kept = f"revision {body.revision} stays in force"
             say(kept if body.confirmed else f"nothing to confirm: {kept}")
+        if body.confirmed:
+            follow()
         raise typer.Exit(0 if body.confirmed else 1)
 
     for verb, example in ((revisions, "revisions"), (rollback, "rollback 7"), (confirm, "confirm")):

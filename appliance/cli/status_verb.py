@@ -16,7 +16,7 @@ from appliance.base.actors import DISK
 from appliance.base.counted import counted
 from appliance.base.timestamps import age, in_local_zone
 from appliance.channel.admin import A, AdminAnswer, StatusWanted
-from appliance.channel.alarms import Alarm, activity, open_alarms
+from appliance.channel.alarms import SWITCHED_OFF, Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.status import (
     ClockState,
@@ -107,15 +107,23 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Return whether an alarm has no effect on the exit status: recent denials and drops, and silenced alarms."""
-    return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
+    """Return whether an alarm has no effect on the exit status: recent denials and drops, monitors that somebody
+    switched off, and silenced alarms.
+    """
+    return (
+        alarm in activity(body)
+        or alarm.kind.startswith(SWITCHED_OFF)
+        or (alarm.severity == "notice" and alarm.handled != "")
+    )
 
 
 def troubles_of(body: Status) -> list[str]:
     return [
         alarm.text
         for alarm in open_alarms(body)
-        if alarm.severity != "notice" and alarm.kind != "policy-audit-only"
+        if alarm.severity != "notice"
+        and alarm.kind != "policy-audit-only"
+        and not alarm.kind.startswith(SWITCHED_OFF)
     ]
 
 

@@ -24,7 +24,7 @@ class Trouble(NamedTuple):
     severity: Literal["alarm", "warning", "notice"]
     kind: str
     text: str
-    about: Literal["system", "audit"] = "system"
+    about: Literal["system", "monitors", "audit"] = "system"
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ def contents(
             for one in monitors.monitors
         },
         givens={name: found for name in monitors.names if (found := tuple(_givens(monitors, name)))},
+        switches={one.name: one.code.switch for one in monitors.monitors if one.code.switch},
     )
 
 

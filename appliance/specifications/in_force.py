@@ -84,7 +84,8 @@ class Cleared(NamedTuple):
 def loaded(now: InForce, wanted: Wanted, checked: CheckedSpecifications, *, signed: bool) -> Coming:
     """Return the next revision. With `signed`, the site signs the texts."""
     constants = constants_of(wanted, checked, signed=signed)
-    said = {**_absent(now, wanted.switches), **now.switches.said}
+    present = {name: to for name, to in now.states.items() if name in checked.switches}
+    said = {**_absent(now, wanted.switches), **present, **now.switches.said}
     new = InForce(
         now.number + 1,
         wanted.sources.with_topics(wanted.sources.topics, checked.givens),

@@ -10,6 +10,7 @@ import msgspec
 from appliance.base.input_files import entries_of, files_below, read_given_text, stat_given
 from appliance.channel import messages
 from appliance.signing.site_keys import UnsignedError, read_signature, signer
+from appliance.specifications.file_switches import without_file_switch
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_view import read_fields
@@ -108,6 +109,11 @@ class Sources(msgspec.Struct, frozen=True):
             [name for name in new if name in old and old[name] != new[name]],
             [name for name in old if name not in new],
         )
+
+    def without_switches(self) -> "Sources":
+        """Return the sources without the words of their `preset` statements, which change with each switch."""
+        files = {name: without_file_switch(text) for name, text in self.files.items()}
+        return msgspec.structs.replace(self, files=files)
 
     def named(self) -> dict[str, str]:
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}

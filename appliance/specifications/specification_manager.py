@@ -28,6 +28,7 @@ from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.specifications import in_force
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.change_records import off_in
+from appliance.specifications.file_switches import Word, file_switch
 from appliance.specifications.givens import Givens, parsed, split
 from appliance.specifications.in_force import InForce, Wanted, unknown_monitors
 from appliance.specifications.judgement import Checks, Consent, Judge, broken, in_shadow
@@ -54,7 +55,7 @@ from appliance.specifications.specifications_in_force import (
     SourceCheck,
     SpecificationsInForce,
 )
-from appliance.specifications.switches import SHADOW, Switch, Switches
+from appliance.specifications.switches import SHADOW, Switch, Switches, word_of
 from appliance.specifications.timed_switches import LONGEST
 from appliance.store.ends import EndTable
 from appliance.store.revisions import reloaded_by
@@ -204,6 +205,19 @@ class SpecificationManager:
 
     def names(self) -> list[str]:
         return list(self.checked.monitors)
+
+    def lasting(self, name: str) -> Word:
+        """Return the switch of a monitor without one that ends by itself, as its file says it."""
+        return word_of(self.returns.lasting(name, self.switches.states[name]))
+
+    def afresh(self, name: str) -> Word | None:
+        """Return how a monitor would begin with a new state directory; None if its file is not in the folder."""
+        found = self._folder.looked_at()
+        text = found.files.get(self.checked.monitors[name]) if found is not None else None
+        if text is None:
+            return None
+        word = file_switch(text)
+        return word or word_of(replace(self.switches, said={}).own(name))
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
         return self.rollout.statement(relay)

@@ -123,7 +123,10 @@ class SpecificationsInForce(Revisions[MonitorRevisionRow]):
 
     def is_folder(self, sources: Sources) -> bool:
         found = self._folder.looked_at() if self._folder.path is not None else None
-        return found is not None and found.with_topics(sources.topics) == sources
+        found = found and found.with_topics(sources.topics)
+        return found is not None and (
+            found == sources or found.without_switches() == sources.without_switches()
+        )
 
     # --- start ---
 

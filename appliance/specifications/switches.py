@@ -1,13 +1,15 @@
 """The switches of monitors: enabled, disabled, or in shadow mode (`SHADOW`). No I/O.
 
-`--enable` applies to monitors that no operator has switched. Monitors that share variables are in shadow mode
-together.
+A monitor that is new here begins as the word in its file says (`preset deadman 3 as deadman on {`), without a word as
+`--enable` says. The word is then a switch like those of operators, so a later file takes no monitor out of force.
+Monitors that share variables are in shadow mode together.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from appliance.specifications.file_switches import Word
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 
 SHADOW: Literal["shadow"] = "shadow"
@@ -16,11 +18,12 @@ Switch = bool | Literal["shadow"]
 
 SWITCHES = "monitor switches"
 _WORDS = frozenset({"all", "none", "shadow"})
+_OF_FILES: Mapping[Word, Switch] = {"on": True, "shadow": SHADOW, "off": False}
 
 
 @dataclass(frozen=True, slots=True)
 class Switches:
-    """The states of monitors in force; `said` has the switches of operators, `enable` is the start option."""
+    """The states of monitors in force; `said` has the switches of operators and files, `enable` is the start option."""
 
     enable: str = "all"
     said: Mapping[str, Switch] = field(default_factory=dict)
@@ -36,8 +39,10 @@ class Switches:
         return set() if self.enable in _WORDS else {name.strip() for name in self.enable.split(",")}
 
     def of(self, checked: CheckedSpecifications) -> "Switches":
-        """Return the same switches for the monitors of these specifications."""
-        return replace(self, states=self.states_of(checked))
+        """Return the same switches for the monitors of these specifications, with the words of their files."""
+        words = {name: _OF_FILES[word] for name, word in checked.switches.items()}
+        known = replace(self, said={**words, **self.said})
+        return replace(known, states=known.states_of(checked))
 
     def saying(self, said: Mapping[str, Switch]) -> "Switches":
         return replace(self, said=said)
@@ -67,6 +72,11 @@ class Switches:
         return self.said.get(
             name, SHADOW if self.starts_in_shadow else self.enable == "all" or name in self.named
         )
+
+
+def word_of(switch: Switch) -> Word:
+    """Return the word of a file for a switch."""
+    return next(word for word, to in _OF_FILES.items() if to == switch)
 
 
 def require_whole(states: Mapping[str, Switch], checked: CheckedSpecifications) -> None:

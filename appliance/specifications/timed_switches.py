@@ -55,6 +55,10 @@ class TimedSwitches:
     def confirm_by(self, name: str) -> float | None:
         return self._end_of(name, True)
 
+    def lasting(self, name: str, now: Switch) -> Switch:
+        """Return the switch after the limit of the monitor, which is `now` without a limit."""
+        return self._kept[name].back if name in self._kept else now
+
     def unconfirmed(self) -> list[str]:
         return [name for name, one in self._kept.items() if one.of is True]
 

@@ -245,6 +245,7 @@ def _compile(
         tuple(names.safes.values()),
         tuple(names.givens.values()),
         withholdings=withheld,
+        switch=specification.switch,
     )
 
 

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from rosmop.form import nodes
 from rosmop.form.connected_groups import channel_of, sharing
@@ -194,6 +194,8 @@ class SpecificationCode:
 
     It only observes the others. While it cannot judge, it holds these channels.
     """
+    switch: Literal["on", "shadow", "off", ""] = ""
+    """How it begins where it is not known, or empty: as the robot's setting says. It decides nothing in the engine."""
 
 
 @dataclass(eq=False)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from fractions import Fraction
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from lark import Token, Transformer_NonRecursive, v_args
 from lark.tree import Meta
@@ -111,13 +111,26 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
         return tree.TypedFile(file, tuple(found), items(tree.RoleDeclaration), items(tree.PresetStatement))
 
     def preset(
-        self, meta: Meta, preset: Token, version: Token, name: Token | None, *settings: tree.Setting | None
+        self,
+        meta: Meta,
+        preset: Token,
+        version: Token,
+        name: Token | None,
+        switch: Token | None,
+        *settings: tree.Setting | None,
     ) -> tree.PresetStatement:
         if not version.isdigit() or len(version) > 9:
             self.refuse(version, f"`{version[:20]}` is not a version; write a whole number")
         number = int(version) if version.isdigit() else 0
         values = tuple(one for one in settings if one is not None)
-        return tree.PresetStatement(self.at(meta), str(preset), number, str(name or preset), values)
+        return tree.PresetStatement(
+            self.at(meta),
+            str(preset),
+            number,
+            str(name or preset),
+            values,
+            cast("tree.Switch", str(switch or "")),
+        )
 
     def setting(self, meta: Meta, name: Token, value: Token) -> tree.Setting:
         return tree.Setting(self.at(meta), str(name), " ".join(value.split()))

@@ -75,7 +75,7 @@ _FORMS = tuple(
         (r"(?:\A|[};])\s*order\s[^{};]*\Z", "an order is `order first < second;`"),
         (
             r"(?:\A|[};])\s*preset\s[^{};]*(?:\{[^{}]*)?\Z",
-            "a preset is `preset name 1 as other { topic = /topic package/Type; value = 0.5; }`, or `preset name 1;`",
+            "a preset is `preset name 1 as other on { topic = /topic package/Type; value = 5; }`, or `preset name 1;`",
         ),
         (
             r"(?:\A|[};])\s*role\s[^{};]*(?:\{[^{};]*)?\Z",

@@ -20,7 +20,7 @@ _GRAMMAR = r"""
 file: (specification | using | order | preset | role | ";")*
 using: "using" "namespace" NAME ";"
 order: ORDER NAME ("<" NAME)* ";"
-preset: _PRESET NAME NUMBER ["as" NAME "{" setting* "}"]
+preset: _PRESET NAME NUMBER ["as" NAME [ON_OR_OFF] "{" setting* "}"]
 setting: NAME "=" GIVEN_VALUE ";"
 role: _ROLE NAME "(" [parameters] ")" [":" NAME] "{" row* "}"
 row: (ROW_TYPE | DEFAULT) ["(" [parameters] ")"] pattern [CANCEL] (block | ";")
@@ -209,6 +209,7 @@ RESET: "__RESET"
 PUBLISH: "PUBLISH"
 ORDER.5: /order(?=<GAP>+[A-Za-z_]\w*<GAP>*[<;])/
 _PRESET.5: /preset(?=<GAP>+[A-Za-z_]\w*<GAP>+\d)/
+ON_OR_OFF.5: /(on|shadow|off)(?=<GAP>*\{)/
 _ROLE.5: /role(?=<GAP>+[A-Za-z_]\w*<GAP>*\()/
 ROW_TYPE.5: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['(])/
 CANCEL: "cancel"

@@ -6,7 +6,7 @@ resolved.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from rosmop.form.findings import Position
 
@@ -533,6 +533,10 @@ class WithholdDeclaration(SyntaxNode):
     """The networks that operators set, in place of `networks`."""
 
 
+Switch = Literal["on", "shadow", "off", ""]
+"""How a specification begins where it is not known; empty: as the robot's setting says."""
+
+
 @dataclass(frozen=True)
 class Specification(SyntaxNode):
     """One `name() { … }`."""
@@ -549,6 +553,7 @@ class Specification(SyntaxNode):
     givens: tuple[GivenValue | TopicDeclaration, ...] = ()
     withholds: tuple[WithholdDeclaration, ...] = ()
     phase: Name | None = field(default=None, compare=False)
+    switch: Switch = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -596,12 +601,13 @@ class Setting(SyntaxNode):
 
 @dataclass(frozen=True)
 class PresetStatement(SyntaxNode):
-    """`preset preset version as name { settings }`: the name and the values of the specification `preset`."""
+    """`preset preset version as name switch { settings }`: the name and the values of the specification `preset`."""
 
     preset: str
     version: int
     name: str
     settings: tuple[Setting, ...]
+    switch: Switch = ""
 
 
 @dataclass(frozen=True)

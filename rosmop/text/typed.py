@@ -118,6 +118,7 @@ class _Maker:
         result = replace(
             known,
             name=preset.name if preset else known.name,
+            switch=preset.switch if preset else "",
             givens=givens,
             events=tuple(event for event in events if event is not None),
             safes=tuple(safes),

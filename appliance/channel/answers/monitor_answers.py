@@ -1,6 +1,6 @@
 """The monitors: their state and counters, and what a change of them did."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -100,6 +100,9 @@ class MonitorState(msgspec.Struct, frozen=True):
     confirm_by: Annotated[
         Moment | None, doc("when it returns to shadow mode unless confirmed, or null if it stays as it is")
     ] = None
+    lasting: Annotated[
+        Literal["on", "shadow", "off"], doc("its state without a switch that ends by itself: enabled or not")
+    ] = "on"
 
 
 class Monitors(msgspec.Struct, frozen=True):

@@ -1,5 +1,7 @@
 """The link control <-> compiler, which carries the texts of specifications and their contents."""
 
+from typing import Literal
+
 import msgspec
 
 from appliance.channel.messages.message import Message
@@ -41,7 +43,8 @@ class Contents(msgspec.Struct, frozen=True):
     `file:line:column`.
 
     `unbuilt` has the monitors of files with errors. They do nothing; the relay holds their topics. `left_out` has the
-    files whose topics are not known; nothing holds their topics.
+    files whose topics are not known; nothing holds their topics. `switches` has the words `on`, `shadow` and `off` of
+    monitors whose files have one.
     """
 
     monitors: dict[str, str] = {}
@@ -60,6 +63,7 @@ class Contents(msgspec.Struct, frozen=True):
     states: dict[str, StateOwner] = {}
     left_out: dict[str, str] = {}
     givens: dict[str, tuple[GivenDeclared, ...]] = {}
+    switches: dict[str, Literal["on", "shadow", "off"]] = {}
 
 
 class ContentsWanted(Message):

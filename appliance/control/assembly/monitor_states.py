@@ -81,6 +81,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         why_held=monitors.rollout.why_held.get(name, ""),
         given=monitors.givens.states(checked, name),
         confirm_by=monitors.returns.confirm_by(name),
+        lasting=monitors.lasting(name),
     )
 
 

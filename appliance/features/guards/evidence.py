@@ -9,6 +9,7 @@ import json
 from collections.abc import Mapping
 
 from appliance.features.guards.presets import Preset
+from appliance.specifications.file_switches import without_file_switch
 
 _DIGITS = 16
 
@@ -20,5 +21,6 @@ def text_digest(text: str) -> str:
 
 def guard_digest(preset: Preset, text: str, values: Mapping[str, str]) -> str:
     """Return the digest of a guard with this text, made from the preset, and with these values in force."""
-    bound = json.dumps([preset.name, text_digest(preset.text), text, sorted(values.items())])
+    plain = without_file_switch(text)  # on or off, it is the same guard
+    bound = json.dumps([preset.name, text_digest(preset.text), plain, sorted(values.items())])
     return text_digest(bound)

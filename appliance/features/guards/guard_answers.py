@@ -93,6 +93,13 @@ class GuardRow(msgspec.Struct, frozen=True):
             "the nodes, with their topics, that it must hear before a motion passes, or empty if there are none"
         ),
     ] = ""
+    afresh: Annotated[
+        str,
+        doc(
+            "how it would begin with a new state directory: `on`, `shadow` or `off`, as its file or the setting"
+            " `enable` says, or `absent`: its file is not in the folder of specifications"
+        ),
+    ] = "on"
     digest: Annotated[
         str, doc("binds its preset, text and values: the same digest is the same guard, with the same values")
     ] = ""

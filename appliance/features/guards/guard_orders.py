@@ -1,7 +1,8 @@
 """Answer the requests about guards in control: their states, proposals, new guards and new values."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 import msgspec
 
@@ -46,9 +47,10 @@ from appliance.features.guards.presets import (
 from appliance.features.guards.released import origin_of
 from appliance.features.guards.suggestions import LoadedGuard, advice
 from appliance.features.guards.upgrades import Upgrade, same, upgraded
-from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState
+from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState, OlderGuard
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
+from appliance.specifications.switches import word_of
 from appliance.telemetry.audit_trail import AuditTrail
 
 STOPPING_SECONDS = 2.0
@@ -138,12 +140,27 @@ class GuardOrders:
         self._digests = {row.name: row.digest for row in rows}
 
     def state(self) -> GuardsState | None:
-        loaded = len(self._guards())
-        acting = [ActingGuard(name, since) for name, since in self._acting_since.items()]
-        place = self.placement
-        return (
-            GuardsState(loaded, acting, place.elsewhere, place.bypassed, place.unanswered) if loaded else None
-        )
+        guards, place = self._guards(), self.placement
+        if not guards:
+            return None
+        switches = self._monitors.switches
+        return GuardsState(
+            len(guards),
+            [ActingGuard(name, since) for name, since in self._acting_since.items()],
+            place.elsewhere,
+            place.bypassed,
+            place.unanswered,
+            {name: word_of(switches.states[name]) for name in guards
+             if name not in switches.said and not switches.enabled(name)},
+            [*self._older(guards)],
+        )  # fmt: skip
+
+    def _older(self, guards: Mapping[str, Preset]) -> Iterator[OlderGuard]:
+        for name, guard in guards.items():
+            present = PRESETS[guard.name].version
+            if guard.version < present and self._monitors.switches.enabled(name):
+                edited = origin_of(guard.text) == "changed"
+                yield OlderGuard(name, guard.name, guard.version, present, edited)
 
     def _note_bypass(self, found: BypassedGuard) -> None:
         self._trail.happened(
@@ -269,7 +286,9 @@ class GuardOrders:
                 raise GuardError("topics has no `command`: name the topic to guard, such as /cmd_vel")
             name, graph = request.name or request.preset, facts_of(self._graph())
             preset = preset_named(request.preset)
-            text = text_of(planned(preset, name, request.topics, graph, request.values, request.types))
+            guard = planned(preset, name, request.topics, graph, request.values, request.types)
+            shadow = request.shadow or self._monitors.switches.starts_in_shadow
+            text = text_of(replace(guard, switch="shadow" if shadow else "on"))
             file = f"{name}.rv"
             if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
                 raise GuardError(
@@ -287,7 +306,7 @@ class GuardOrders:
             in_force = {
                 one.name: _written(one.value) for one in self._row(name, preset).given if one.kind != "topic"
             }
-            return upgraded(text, in_force, facts_of(self._graph()), topics)
+            return upgraded(text, in_force, facts_of(self._graph()), topics, self._monitors.lasting(name))
         except GuardError as error:
             raise SenselessError(str(error)) from error
 
@@ -382,5 +401,6 @@ class GuardOrders:
             origin=origin_of(text),
             below=below_the_standard(preset, values_of(given)),
             digest=guard_digest(PRESETS[preset.name], text, values_of(given)),
+            afresh=monitors.afresh(name) or "absent",
             awaits=row.awaits if (row := monitors.rollout.rows.get(name)) is not None else "",
         )

@@ -34,6 +34,22 @@ def state_in_words(row: GuardRow) -> str:
     return f"in force, {row.state}{'' if row.preset == 'withhold' else f', {acts}'}{_last_stop(row)}{end}"
 
 
+def afresh_in_words(row: GuardRow) -> str:
+    """Return how the guard would begin with a new state directory, if not as it is, with the remedy."""
+    name = row.name
+    if row.confirm_by is not None or row.off_until is not None:
+        return ""  # it ends by itself
+    now = row.state if row.state in ("shadow", "off") else "on"
+    if row.afresh == now:
+        return ""
+    command = {"on": f"enable {name}", "shadow": f"enable {name} --shadow", "off": f"disable {name}"}[now]
+    write = f"rosrv monitor {command}, on the appliance's machine, writes it there"
+    if row.afresh == "absent":
+        return f"it is only in the state directory, not in the folder of specifications: {write}"
+    then = {"on": "in force", "shadow": "in shadow mode", "off": "disabled"}[row.afresh]
+    return f"its state is not in {row.file}, so with a new state directory it would be {then}: {write}"
+
+
 def _last_stop(row: GuardRow) -> str:
     stop = row.last_stop
     if stop is None:

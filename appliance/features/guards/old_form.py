@@ -29,6 +29,8 @@ class Head:
     version: int
     name: str
     settings: Mapping[str, str]
+    switch: str = ""
+    """`on`, `shadow`, `off` or empty."""
 
 
 def head_of(text: str) -> Head | None:

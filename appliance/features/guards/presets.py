@@ -17,6 +17,7 @@ from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import meant
 from appliance.features.guards import old_form
 from appliance.features.guards.old_form import Head
+from appliance.specifications.file_switches import Word
 from rosmop.types import given_lists
 from rosmop.types.roles import ANY_TYPE, types_of_roles
 
@@ -184,6 +185,8 @@ class Guard:
     """The given topics, by the preset's names for them. `types` has the types of their messages."""
     types: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict)
+    switch: Word | None = None
+    """How it begins on an appliance that does not know it; without it, as the setting `enable` says."""
 
 
 def unknown_guard(name: str, guards: Collection[str]) -> str:
@@ -222,7 +225,7 @@ def text_of(guard: Guard) -> str:
             types[name] = kind
     settings = {name: f"{topic} {types[name]}" if name in types else topic for name, topic in topics.items()}
     settings |= {name: preset.parameter(name).checked(value) for name, value in guard.values.items()}
-    return _written(Head(preset.name, preset.version, guard.name, settings), preset.body)
+    return _written(Head(preset.name, preset.version, guard.name, settings, guard.switch or ""), preset.body)
 
 
 def _require_topic(preset: Preset, name: str, topic: str) -> None:
@@ -243,7 +246,8 @@ def _require_type(preset: Preset, name: str, kind: str, topic: str) -> None:
 
 def _written(head: Head, body: str) -> str:
     settings = "".join(f"    {name} = {value};\n" for name, value in head.settings.items())
-    return f"preset {head.preset} {head.version} as {head.name} {{\n{settings}}}\n{body}"
+    switch = f" {head.switch}" if head.switch else ""
+    return f"preset {head.preset} {head.version} as {head.name}{switch} {{\n{settings}}}\n{body}"
 
 
 def head_of(text: str) -> Head | None:
@@ -261,7 +265,7 @@ def head_of(text: str) -> Head | None:
         name, sign, value = setting.partition("=")
         if sign:
             settings[name.strip()] = " ".join(value.split())
-    return Head(words[1], int(words[2]), words[4] if len(words) > 4 else "", settings)
+    return Head(words[1], int(words[2]), "".join(words[4:5]), settings, "".join(words[5:6]))
 
 
 def body_of(text: str) -> str:

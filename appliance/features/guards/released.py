@@ -11,6 +11,7 @@ from typing import Literal
 
 from appliance.features.guards import old_form, presets
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, Preset, head_of
+from appliance.specifications.file_switches import file_switch
 from rosmop.types.roles import ANY_TYPE
 
 FOLDER = presets.FOLDER / "released"
@@ -42,7 +43,7 @@ def _is_of(text: str, base: Preset) -> bool:
     head = head_of(text)
     assert head is not None  # noqa: S101  the caller knows its preset
     values = {name: value for name, value in head.settings.items() if name not in base.given_topics}
-    guard = Guard(head.name, base, presets.topics_in(text), presets.types_in(text), values)
+    guard = Guard(head.name, base, presets.topics_in(text), presets.types_in(text), values, file_switch(text))
     return text in {presets.text_of(guard), base.text}
 
 

@@ -1,7 +1,7 @@
 """Make a guard of an older version again from the present preset, with its topics and values."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from appliance.features.guards.plans import planned
@@ -18,6 +18,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import order_of, origin_of, released
 from appliance.features.guards.robot_graph import TopicFacts
+from appliance.specifications.file_switches import Word
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,11 @@ def upgraded(
     in_force: Mapping[str, str],
     graph: Iterable[TopicFacts],
     topics: Mapping[str, str] = MappingProxyType({}),
+    switch: Word | None = None,
 ) -> Upgrade:
     """Return the upgrade of a guard, whose constants have the values `in_force`; `topics` replace those that it has.
+
+    `switch` is the word of its new file.
 
     Raises `GuardError` if the text is not that of an older version, or if a value that was set cannot be kept.
     """
@@ -78,6 +82,7 @@ def upgraded(
         given = preset.given_topics  # `cancel` of an action follows from its goal now
         kept = {each: topic for each, topic in topics_in(text).items() if each in given}
         guard = planned(preset, name, {**kept, **topics}, graph, values, types)
+        guard = replace(guard, switch=switch)
     except GuardError as error:
         raise GuardError(f"{name}: {error}; or remove it, and make it again") from error
     return Upgrade(text_of(guard) + order_of(text), changed, warnings)

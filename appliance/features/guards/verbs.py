@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from appliance.base.atomic_files import write_where_told
 from appliance.base.counted import counted
 from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replacement
@@ -18,10 +17,16 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import refuse_beside_dry_run, say_json, say_row, usage_error
+from appliance.cli.specification_folder import (
+    folder_of,
+    say_obstacle,
+    write_specification,
+    write_switches,
+)
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.guards.guard_answers import GuardList, GuardRow
 from appliance.features.guards.guard_facts import preset_row, values_of
-from appliance.features.guards.guard_words import origin_in_words, state_in_words
+from appliance.features.guards.guard_words import afresh_in_words, origin_in_words, state_in_words
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
@@ -95,11 +100,12 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
             say_json({"guard": row.name, "preset": row.preset, "state": row.state, "shadow": shadow,
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
-                      "origin": row.origin, "below": row.below, "digest": row.digest})  # fmt: skip
+                      "origin": row.origin, "afresh": row.afresh, "below": row.below,
+                      "digest": row.digest})  # fmt: skip
         else:
             about = f"guard {row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())},"
             say_row([about, state_in_words(row)], gap=" ")
-            for value in row.below:
+            for value in filter(None, [*row.below, afresh_in_words(row)]):
                 say(f"    {value}", "yellow")
     for warning in body.warnings:
         if appliance.as_json:
@@ -191,9 +197,7 @@ def new(
         GuardNew(preset, topics, given, types, guard, shadow, confirm_within=confirmed, hold=hold)
     )
     _say_changed(appliance, body)
-    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
-    file = f"{guard}.rv"
-    _write(appliance, loaded, file, (loaded.files or {})[file], temporary=body.confirm_by is not None)
+    _write(appliance, guard, temporary=body.confirm_by is not None)
 
 
 @speaks
@@ -258,7 +262,7 @@ def set_values(
             given={name: constants} if constants else {},
         )  # fmt: skip
         _say_changed(appliance, appliance.ask_or_exit(order))
-        _write(appliance, loaded, row.file, changed)
+        write_specification(appliance, loaded, row, changed)
     elif constants:
         answer = appliance.answer_or_exit(admin.MonitorGive(name, constants))
         say(
@@ -291,11 +295,15 @@ def enforce(
     order = admin.MonitorShadow([name], False, confirm_within=confirmed)
     if when_standing:
         stand_or_exit(appliance, within, _VERB)
-    body = appliance.answer_or_exit(order)
-    say(f"in force: {', '.join(body.names) or 'no change'}")
-    if body.began:
-        say(f"{', '.join(body.began)} started in the initial state", "yellow")
-    say_shadow_deadline(body.confirm_by)
+    body = appliance.ask_or_exit(order)
+    if appliance.as_json:
+        say_json(body)
+    else:
+        say(f"in force: {', '.join(body.names) or 'no change'}")
+        if body.began:
+            say(f"{', '.join(body.began)} started in the initial state", "yellow")
+        say_shadow_deadline(body.confirm_by)
+    write_switches(appliance, [name])
 
 
 @speaks
@@ -363,9 +371,13 @@ def upgrade(
 def _upgrade(appliance: Appliance, order: GuardUpgrade) -> None:
     body = appliance.ask_or_exit(order)
     _say_changed(appliance, body)
+    _write(appliance, order.name, temporary=body.confirm_by is not None)
+
+
+def _write(appliance: Appliance, name: str, *, temporary: bool) -> None:
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
-    file = next(row.file for row in loaded.monitors if row.name == order.name)
-    _write(appliance, loaded, file, (loaded.files or {})[file], temporary=body.confirm_by is not None)
+    row = next(row for row in loaded.monitors if row.name == name)
+    write_specification(appliance, loaded, row, (loaded.files or {})[row.file], temporary=temporary)
 
 
 @speaks
@@ -384,7 +396,7 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
     _say_changed(appliance, body)
     if not appliance.as_json and body.confirm_by is None:
         say(f"undo: {_undo(guard)}")
-    folder = _folder(appliance, loaded)
+    folder = folder_of(appliance, loaded)
     if folder and body.confirm_by is None:
         path = file_of(row.file.removesuffix(".rv"), folder)
         try:
@@ -392,7 +404,7 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
                 path.unlink()
         except OSError as error:
             why = f"{path} is not removed: {error.strerror}; a reload of the folder loads the guard again"
-            _say_obstacle(appliance, why)
+            say_obstacle(appliance, why)
 
 
 def _undo(guard: GuardRow) -> str:
@@ -454,37 +466,6 @@ def _say_changed(appliance: Appliance, body: Replacement) -> None:
         say_json(body)
     else:
         say_replaced(body, "rosrv guard enforce")
-
-
-def _folder(appliance: Appliance, loaded: Monitors) -> Path | None:
-    """Return the folder of specifications, or None. Over REST it may be on another machine."""
-    if loaded.folder is None or appliance.place is not None:
-        return None
-    return Path(loaded.folder) if Path(loaded.folder).is_dir() else None
-
-
-def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temporary: bool = False) -> None:
-    folder = _folder(appliance, loaded)
-    if folder is None:
-        obstacle = "the appliance keeps the text; it has no folder of specifications on this machine"
-    elif temporary:
-        obstacle = (
-            f"the appliance keeps the text; {folder} is not changed by a load that waits for confirmation"
-        )
-    else:
-        try:
-            write_where_told(folder / file, text.encode())
-            return
-        except OSError as error:
-            obstacle = f"the appliance keeps the text, but {folder}/{file} is not written: {error.strerror}"
-    _say_obstacle(appliance, obstacle)
-
-
-def _say_obstacle(appliance: Appliance, obstacle: str) -> None:
-    if appliance.as_json:
-        typer.echo(obstacle, err=True)
-    else:
-        say(obstacle, "yellow")
 
 
 def _plan(appliance: Appliance, request: GuardTry) -> None:

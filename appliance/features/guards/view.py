@@ -26,6 +26,16 @@ class BypassedGuard(msgspec.Struct, frozen=True):
     publishers: Annotated[list[str], doc("the URIs of the publishers, as the node names them")]
 
 
+class OlderGuard(msgspec.Struct, frozen=True):
+    """A guard in force with the text of an older version of its preset."""
+
+    name: Annotated[str, doc("the guard")]
+    preset: Annotated[str, doc("its preset")]
+    version: Annotated[int, doc("the version in its text")]
+    present: Annotated[int, doc("the present version of the preset")]
+    edited: Annotated[bool, doc("its text was also changed, so `rosrv guard upgrade` does not replace it")]
+
+
 class GuardsState(msgspec.Struct, frozen=True):
     """The loaded guards."""
 
@@ -41,6 +51,14 @@ class GuardsState(msgspec.Struct, frozen=True):
     unanswered: Annotated[
         list[str], doc("nodes with a guarded command that do not say from whom they take it")
     ] = []
+    never_enabled: Annotated[
+        dict[str, str],
+        doc(
+            "guards that neither an operator nor their file switched, with their state by the setting `enable`:"
+            " `off` or `shadow`"
+        ),
+    ] = {}
+    older: Annotated[list[OlderGuard], doc("guards in force with an older version of their preset")] = []
 
 
 def _since(guard: ActingGuard) -> str:
@@ -52,6 +70,22 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
     for guard in state.acting:
         text = f"the guard {_since(guard)}: rosrv audit search --category monitor --text {guard.name}"
         yield Trouble("notice", f"guard-acts:{guard.name}", text)
+    for name, idle in state.never_enabled.items():
+        how, verb = ("is disabled", "enable") if idle == "off" else ("only records (shadow mode)", "enforce")
+        text = (
+            f"the guard {name} {how}, because neither an operator nor its file brought it into force: rosrv monitor"
+            f" {verb} {name}"
+        )
+        yield Trouble("warning", f"guard-off:{name}", text, "monitors")
+    for old in state.older:
+        remedy = (
+            f"its text was also edited, so compare it with the preset, then remove it and make it again: rosrv guard"
+            f" remove {old.name}"
+            if old.edited
+            else f"rosrv guard upgrade {old.name} --when-standing"
+        )
+        text = f"the guard {old.name} has {old.preset} {old.version}; the present version is {old.present}: {remedy}"
+        yield Trouble("warning", f"guard-older:{old.name}", text, "monitors")
     for one in state.bypassed:
         text = (
             f"{one.node} takes {one.topic} from {', '.join(one.publishers)}, past its guards: end that process, and"

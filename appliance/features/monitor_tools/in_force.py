@@ -15,6 +15,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
 from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
+from appliance.cli.specification_folder import write_switches
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import printable, say
@@ -320,11 +321,16 @@ def rv_state(appliance: Appliance) -> None:
         say(f"{name} {topic} XML-RPC port {xmlrpc} TCP port {tcp}")
 
 
-def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str) -> None:
+def _switch(appliance: Appliance, order: admin.MonitorSwitch | admin.MonitorShadow, word: str) -> None:
     body = appliance.ask_or_exit(order)
     if appliance.as_json:
         say_json({**in_full(body), "enabled": word == "enabled", "shadow": word == _SHADOW})
-        return
+    else:
+        _say_switched(body, word)
+    write_switches(appliance, order.names)
+
+
+def _say_switched(body: Switched, word: str) -> None:
     end = "" if body.until is None else f", until {moment(body.until)}"
     say(f"{word}: {', '.join(body.names) or 'no change'}{end}")
     if body.began:

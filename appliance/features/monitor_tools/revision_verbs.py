@@ -1,19 +1,33 @@
 """`rosrv monitor revisions|show|diff|rollback|confirm`: revisions of the specifications."""
 
 import difflib
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
-from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
+from appliance.channel.admin import (
+    MonitorConfirm,
+    MonitorRevisions,
+    MonitorRevisionWanted,
+    MonitorRollback,
+    MonitorsWanted,
+)
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced
 from appliance.cli.output import say_diff, say_json, usage_error
+from appliance.cli.specification_folder import write_switches
 from rosmop.tool.terminal import say
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision (default: the one in force)")]
+
+
+def _waiting(appliance: Appliance) -> Callable[[], None]:
+    loaded = appliance.ask_or_exit(MonitorsWanted())
+    names = [row.name for row in loaded.monitors if loaded.confirm_by or row.confirm_by]
+    return lambda: write_switches(appliance, names)
 
 
 revisions, rollback, confirm = verbs_of(
@@ -22,6 +36,7 @@ revisions, rollback, confirm = verbs_of(
     confirmation=MonitorConfirm(),
     back=MonitorRollback,
     say_done=say_replaced,
+    waiting=_waiting,
 )
 
 

@@ -10,6 +10,7 @@ from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
+from appliance.channel.alarms import SWITCHED_OFF, open_alarms
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_source import AuditSource, audit_of
@@ -19,6 +20,7 @@ from appliance.features.selftest.probe_nodes import TOPIC, ProbeError, call, mes
 from appliance.features.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 
 _CALLER = "/rosrv_selftest"  # a random number follows, because repeated reads of one caller are only counted
+_GUARD_OFF = "guard-off:"
 _MANY_RESTARTS = 3
 _MANY_RECORDS = 200_000
 _RECORD_SECONDS = 5.0
@@ -52,7 +54,11 @@ def running(appliance: Appliance) -> Iterator[SelftestFinding]:
 
 
 def _status(status: Status) -> Iterator[SelftestFinding]:
-    troubles = list(troubles_of(status))
+    off = [alarm.text for alarm in open_alarms(status)
+           if alarm.severity == "warning" and alarm.kind.startswith((SWITCHED_OFF, _GUARD_OFF))]  # fmt: skip
+    for text in off:
+        yield warn("monitors", text, "rosrv monitor list")
+    troubles = [trouble for trouble in troubles_of(status) if trouble not in off]
     for trouble in troubles:
         yield fail("status", trouble, "rosrv status")
     if not troubles:
