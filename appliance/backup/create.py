@@ -46,7 +46,11 @@ _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a 
 _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/operating.md)"
 
 
-def back_up(state: Path, file: Path) -> list[str]:
+Seen = Callable[[str, Path], None]
+"""Gets each name in the archive, and the copy that was archived."""
+
+
+def back_up(state: Path, file: Path, seen: Seen = lambda _name, _copy: None) -> list[str]:
     """Write the backup; return the names in the tar archive. Raises `BackupError`."""
     try:
         refuse_half_restored(state)
@@ -57,7 +61,7 @@ def back_up(state: Path, file: Path) -> list[str]:
             f"{state} has no audit log: it is not the state directory of an appliance (--state)"
         )
     with _signals_interrupt():
-        return _back_up(state, file)
+        return _back_up(state, file, seen)
 
 
 @contextmanager
@@ -85,7 +89,7 @@ def _signals_interrupt() -> Iterator[None]:
         set_all(signal.SIG_DFL)
 
 
-def _back_up(state: Path, file: Path) -> list[str]:
+def _back_up(state: Path, file: Path, seen: Seen) -> list[str]:
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except FileExistsError:
@@ -97,7 +101,7 @@ def _back_up(state: Path, file: Path) -> list[str]:
             os.fdopen(descriptor, "wb") as raw,
             tarfile.open(fileobj=raw, mode="w:gz", format=_FORMAT) as archive,
         ):
-            names = _write(state, archive, file.absolute().parent)
+            names = _write(state, archive, file.absolute().parent, seen)
             archive.close()
             raw.flush()
             os.fsync(raw.fileno())
@@ -118,7 +122,7 @@ def _is_full(error: OSError | sqlite3.Error) -> bool:
     return getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
 
 
-def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
+def _write(state: Path, archive: tarfile.TarFile, beside: Path, seen: Seen) -> list[str]:
     names = []
     with TemporaryDirectory(prefix=".rosrv-backup-", dir=beside) as folder:
         copy = Path(folder) / "copy.db"
@@ -138,6 +142,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
             entry.size, entry.mtime, entry.mode = copy.stat().st_size, int(clock.wall()), mode
             with copy.open("rb") as content:
                 archive.addfile(entry, content)
+            seen(name, copy)
             copy.unlink()
             names.append(name)
     return names

@@ -173,6 +173,11 @@ def _grid(body: Status, host_in_words: HostInWords) -> Table:
     for off in body.switched_off:
         end = "indefinitely" if off.until is None else f"until {moment(off.until)}"
         grid.add_row("switched off", Text(f"{off.what} since {moment(off.since)}, {end}", style=_YELLOW))
+    if body.new_state is not None:
+        lacks = f"without the {', '.join(body.new_state.lacks)} of an earlier one"
+        grid.add_row(
+            "state directory", Text(f"new since {moment(body.new_state.since)}, {lacks}", style=_YELLOW)
+        )
     shadows = f" ({body.shadows} lost, awaited)" if body.shadows else ""
     grid.add_row(
         "graph",

@@ -14,6 +14,7 @@ from appliance.control.feature_parts import FeatureParts
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.handled_alarms import HandledAlarms
+from appliance.control.operators.new_state import StateAge
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.sessions import Sessions
@@ -34,6 +35,7 @@ class QueryParts:
     clock: ClockCheck
     switched_off: SwitchedOffWatch
     rest: Current[RestLink]
+    state_age: StateAge
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> Quer
         trail=trail,
         forgotten_after=settings.forgotten_after,
     )
-    handled = HandledAlarms(base.store, base.ends)
+    handled, state_age = HandledAlarms(base.store, base.ends), StateAge(base.store, trail)
     queries = Queries(
         parts,
         trail,
@@ -77,11 +79,12 @@ def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> Quer
         switched_off=switched_off.rows,
         blocks=base.hosts.blocks.state,
         handled=handled.marked,
+        new_state=state_age.state,
         name=settings.name,
     )
     bearers = Bearers(tokens.usable, lambda: rest().state_tokens(), sessions)
     core = make_core(base, parts, bearers, Alarms(queries.present, handled))
-    return QueryParts(core, queries, tokens, clock, switched_off, rest)
+    return QueryParts(core, queries, tokens, clock, switched_off, rest, state_age)
 
 
 def make_operators(base: Foundation, made: QueryParts, features: FeatureParts) -> Operators:

@@ -101,10 +101,12 @@ async def _start(
     features = FeatureParts()
     queries = make_queries(base, parts, features)
     await features.begin(queries.core)
+    state_began = queries.state_age.begin()
     base.policies.start(restarted=restarted or role.paired)
     parts.endpoints.places.policy_changed(base.policies.current.ports)
     base.policy_services.began()
     await parts.monitors.start(restarted=restarted, taken_over=role.paired)
+    state_began(parts.monitors)
     features.add(await gate.begin(_starting(base, parts)))
     control = _Control(base, parts, features, make_operators(base, queries, features))
     core, ends = parts.core, parts.endpoints

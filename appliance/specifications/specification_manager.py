@@ -486,7 +486,10 @@ class SpecificationManager:
         changed = [
             name
             for name in dict.fromkeys(names)
-            if switches.states[name] != to or seconds is not None or (to is False and name in self.returns)
+            if switches.states[name] != to
+            or seconds is not None
+            or (to is False and name in self.returns)
+            or (to is not True and name not in switches.said)  # it is off by the setting, and now by an order
         ]
         if not changed:
             return changed

@@ -212,6 +212,8 @@ EVENTS: dict[str, str] = {
     "ended by the clock": "The machine's clock ended a token, a ticket or another right (`detail.kind`, its name in"
     " `resource`), which otherwise had `detail.seconds` left: the clock was set forward, or it shows that the appliance"
     " was off for that long.",
+    "state directory new": "The appliance started with a new state directory, which has nothing of an earlier one;"
+    " `detail.parts` says what that means, `detail.on` and `detail.off` name the monitors.",
     "protection forgotten": "A monitor is disabled or in shadow mode, or a section of the policy audit-only, for"
     " longer than `forgotten_after`; `resource` names it, `reason` says how to enable it again.",
     "adopted": "A registration was taken over from the robot's own master by an operator's order (`rosrv adopt`).",
@@ -245,7 +247,8 @@ SEVERITIES: dict[str, Severity] = {
             "policy loaded", "stop ended",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
-            "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
+            "state directory new", "switchover ordered",
+            "token added", "token revoked", "token rotated", "took over", "topic looked into",
             "monitor looked into", "graph adopted", "graph released",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),

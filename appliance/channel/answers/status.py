@@ -223,6 +223,13 @@ class HandledAlarm(msgspec.Struct, frozen=True):
     note: RevisionNote = ""
 
 
+class NewState(msgspec.Struct, frozen=True):
+    """A state directory that is younger than a day; the configuration may be older."""
+
+    since: Moment
+    lacks: Annotated[list[str], doc("what an earlier state directory had and this one has not, by name")]
+
+
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
@@ -256,6 +263,9 @@ class Status(msgspec.Struct, frozen=True):
     handled_alarms: Annotated[
         list[HandledAlarm], doc("alarms that an operator acknowledged or silenced")
     ] = []
+    new_state: Annotated[
+        NewState | None, doc("the state directory, if it is younger than a day, otherwise null")
+    ] = None
 
 
 if not TYPE_CHECKING:

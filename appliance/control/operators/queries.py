@@ -19,6 +19,7 @@ from appliance.channel.answers.status import (
     BlocksState,
     ClockState,
     MinuteState,
+    NewState,
     PolicyState,
     Status,
     SwitchedOff,
@@ -57,6 +58,7 @@ class Queries:
     switched_off: Callable[[], list[SwitchedOff]]
     blocks: Callable[[], BlocksState]
     handled: Callable[[Status], Status]
+    new_state: Callable[[], NewState | None]
     name: str = ""
     started: float = field(default_factory=wall)
 
@@ -133,6 +135,7 @@ class Queries:
             clock=self.clock(),
             switched_off=self.switched_off(),
             blocks=self.blocks(),
+            new_state=self.new_state(),
             last_minute=MinuteState(
                 sum(meter.denied.counts().values()), meter.dropped.counts(), most_denied=meter.most_denied()
             ),

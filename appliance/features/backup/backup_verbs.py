@@ -13,6 +13,7 @@ from appliance.base.counted import counted
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
 from appliance.cli.typed_confirmation import Confirm, Yes, confirm_state
+from appliance.features.backup.only_in_state import lacking_in_folder, specifications_in
 from appliance.features.backup.purge import purge as remove
 from appliance.features.backup.purge import require_state_directory
 from appliance.features.backup.restore import restore as put_back
@@ -34,19 +35,24 @@ def backup(
 ) -> None:
     """Write the state directory to one file: audit log, registrations, policies, keys. The appliance may be running.
 
-    Your own files are not included: configuration, policy and specifications.
+    Your own files are not included: configuration, policy and specifications. Specifications in force that the folder
+    lacks are only in the state directory; they are named.
 
     Example: rosrv backup /media/safe/rosrv-2026-03-01.tar.gz
     """
+    texts: dict[str, str] = {}
     try:
-        names = back_up(state, file)
+        names = back_up(state, file, lambda name, copy: texts.update(specifications_in(name, copy)))
     except BackupError as error:
         raise _failed(str(error)) from None
-    size = file.stat().st_size
+    size, only_here = file.stat().st_size, lacking_in_folder(state, texts)
     if as_json:
-        say_json({"file": str(file), "files": len(names), "bytes": size})
-    else:
-        say(f"{file}: {counted(len(names), 'file')}, {size} bytes")
+        say_json({"file": str(file), "files": len(names), "bytes": size, "only_in_state": only_here})
+        return
+    say(f"{file}: {counted(len(names), 'file')}, {size} bytes")
+    if only_here:
+        what = f"only in the state directory, not like this in the folder of specifications: {', '.join(only_here)}"
+        say(f"{what}; rosrv guard list names the command for guards", "yellow")
 
 
 def restore(

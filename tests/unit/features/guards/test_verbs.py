@@ -110,6 +110,9 @@ class Robot:
             self.files[f"{request.name}.rv"] = text_of(
                 Guard(request.name, preset, request.topics, request.types, request.values)
             )
+            lasting = "shadow" if request.shadow else "on"
+            file = f"{request.name}.rv"
+            self.rows.append(example(MonitorState, name=request.name, file=file, lasting=lasting))
         return _changed(request)
 
 
@@ -136,7 +139,10 @@ def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.Captur
     order = run(verbs.new, Robot(tmp_path), "fence", "/cmd_vel", ["margin=0.5"], by="/odom", shadow=True)
     topics = {"command": "/cmd_vel", "by": "/odom"}
     assert order == GuardNew("fence", topics, {"margin": "0.5"}, name="fence", shadow=True)
-    assert "\n    margin = 0.5;\n" in (tmp_path / "fence.rv").read_text()
+    text = (tmp_path / "fence.rv").read_text()
+    assert (
+        text.startswith("preset fence ") and " as fence shadow {" in text and "\n    margin = 0.5;\n" in text
+    )
     assert "rosrv guard enforce fence" in capsys.readouterr().out
 
 
