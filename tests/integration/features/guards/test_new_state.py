@@ -1,15 +1,19 @@
 """Guards of the configuration are in force with a new state directory, as after another card or `apt purge`."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 from appliance.channel import admin
+from appliance.control.operators.new_state import LACKS
+from appliance.features.guards.presets import PRESETS, Guard, text_of
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
+from tests.support.rosmaster import call_on
 from tests.support.waiting import eventually
 
 NEW = ("guard", "new", "deadman", "/cmd_vel", "--type", "command=geometry_msgs/Twist")
@@ -76,8 +80,81 @@ def test_the_file_has_each_switch_and_a_file_without_one_is_a_warning(packaged: 
     done = packaged.rosrv("status", check=False)
     assert done.returncode == 1
     assert "rosrv monitor enable deadman" in " ".join(done.stdout.split())
-    tested = packaged.rows("selftest")
-    assert any(row["outcome"] == "warn" and "deadman" in row["text"] for row in tested)
     packaged.rosrv("monitor", "enable", "deadman")
     assert file.read_text().startswith("preset deadman 3 as deadman on {\n")
     eventually(lambda: packaged.rosrv("status", check=False).returncode == 0, packaged.story)
+
+
+class Part(NamedTuple):
+    """What is in a state directory: commands that put it there, and what shows it."""
+
+    orders: Sequence[Sequence[str]]
+    look: Callable[[Appliance], object]
+
+
+def names(*command: str, of: str) -> Callable[[Appliance], object]:
+    return lambda appliance: {row[of] for row in appliance.rows(*command)}
+
+
+def fastest(appliance: Appliance) -> object:
+    [speed] = [row for row in appliance.ask(admin.MonitorsWanted()).monitors if row.name == "speed"]
+    return {one.name: one.value for one in speed.given}["vMax"]
+
+
+def parameter(appliance: Appliance) -> object:
+    return call_on(appliance.host, appliance.master_uri, "hasParam", "/t", "/there")[2]
+
+
+def log_key(appliance: Appliance) -> object:
+    return (appliance.state / "control" / "audit.pub").read_text()
+
+
+PARTS: dict[str, Part] = {
+    "switches": Part([("monitor", "enable", "own")], lambda one: states(one)["own"]),
+    "values": Part([("guard", "set", "speed", "vMax=0.2")], fastest),
+    "loaded specifications": Part([("monitor", "load", "loaded.rv")], lambda one: "loaded" in states(one)),
+    "policy revisions": Part([("policy", "reload")], names("policy", "revisions", of="revision")),
+    "blocks": Part([("host", "block", "10.77.0.99", "--for", "1h")], names("host", "blocks", of="host")),
+    "tokens": Part([("token", "add", "eve", "--for", "1d")], names("token", "list", of="name")),
+    "doors": Part([("door", "add", "eve")], names("door", "list", of="name")),
+    "registrations": Part([], parameter),
+    "handled alarms": Part(
+        [("alarm", "silence", "guard-off:speed", "--for", "1h")],
+        lambda one: len(one.status()["handled_alarms"]),
+    ),
+    "audit log": Part([], log_key),
+}
+ELSEWHERE = {
+    "enrolled hosts": "needs tunnels: tests/system/ipsec",
+    "adoption": "needs a robot's own master: tests/system/network/test_adopt.py",
+    "memberships": "needs a collector or a second appliance: tests/system/features",
+}
+OWN = "own() { event e() /own std_msgs/Bool '{}' { } }"
+
+
+def test_a_new_state_directory_lacks_each_part_of_the_earlier_one_and_says_so(packaged: Appliance) -> None:
+    """Each part differs after its orders, and is as at the first start with a new state directory."""
+    assert PARTS.keys() | ELSEWHERE.keys() == LACKS.keys()
+    folder = packaged.directory / "monitors"
+    (folder / "own.rv").write_text(OWN)
+    (folder / "speed.rv").write_text(text_of(Guard("speed", PRESETS["speed"])))
+    loaded = packaged.directory / "loaded.rv"
+    loaded.write_text(OWN.replace("own()", "loaded()"))
+    with_new_state(packaged)
+    first = {name: part.look(packaged) for name, part in PARTS.items()}
+    policy = packaged.policy_file.read_text()
+    packaged.policy_file.write_text(f"{policy}# 2\n")
+    call_on(packaged.host, packaged.master_uri, "setParam", "/t", "/there", 1)
+    for part in PARTS.values():
+        for order in part.orders:
+            packaged.rosrv(*(str(loaded) if word == "loaded.rv" else word for word in order))
+    used = {name: part.look(packaged) for name, part in PARTS.items()}
+    assert [name for name in PARTS if used[name] == first[name] and name != "audit log"] == []
+    named = packaged.row("backup", str(packaged.directory / "backup.tar.gz"))["only_in_state"]
+    assert named == ["loaded.rv"]
+    with_new_state(packaged)
+    new = {name: part.look(packaged) for name, part in PARTS.items()}
+    assert [name for name in PARTS if new[name] != first[name]] == ["audit log"]
+    [record] = packaged.recorded(event="state directory new")
+    assert record["detail"]["parts"] == dict(LACKS)
+    assert packaged.status()["new_state"]["lacks"] == [*LACKS]

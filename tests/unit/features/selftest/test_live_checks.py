@@ -1,7 +1,7 @@
 import secrets
 import time
 from collections.abc import Iterator
-from itertools import chain, repeat
+from itertools import chain, islice, repeat
 
 import httpx
 import pytest
@@ -9,8 +9,11 @@ import pytest
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.base import clock
+from appliance.channel.answers.status import Status
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.features.selftest import live_checks
+from tests.support.answers import example
+from tests.support.memory_call import call_of
 from tests.support.memory_rest import page, problem, rest_client
 from tests.support.virtual_clock import VirtualClock, let_time_pass
 
@@ -76,3 +79,18 @@ def test_an_unreadable_log_is_not_a_defect() -> None:
     found, text, _searches = outcome(DENIED)
     assert found == "skip"
     assert "too many requests" in text
+
+
+OFF = {"about": "monitors", "name": "gun", "what": "monitor gun is disabled", "again": "rosrv monitor enable gun",
+       "since": 0.0, "until": None, "forgotten": False}  # fmt: skip
+
+
+def test_protection_that_is_off_is_a_warning_and_no_failure() -> None:
+    healthy = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
+    guards = {"loaded": 1, "acting": [], "never_enabled": {"deadman": "off"}}
+    status = example(Status, **healthy, switched_off=[OFF], guards=guards)
+    found = islice(live_checks.running(call_of(lambda _request: status)), 1, 4)
+    told = {(one.outcome, one.text.rpartition(": ")[2]) for one in found}
+    commands = {"rosrv monitor enable gun", "rosrv monitor enable deadman"}
+    assert told >= {("warn", command) for command in commands}
+    assert not any(outcome == "fail" for outcome, _command in told)
