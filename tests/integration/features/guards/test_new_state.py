@@ -106,7 +106,8 @@ def parameter(appliance: Appliance) -> object:
 
 
 def log_key(appliance: Appliance) -> object:
-    return (appliance.state / "control" / "audit.pub").read_text()
+    file = appliance.state / "control" / "audit.pub"
+    return eventually(lambda: file.read_text() if file.exists() else "", appliance.story)
 
 
 PARTS: dict[str, Part] = {

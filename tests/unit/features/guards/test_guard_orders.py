@@ -379,7 +379,7 @@ async def test_an_old_guard_is_upgraded_as_it_was_planned(
     assert (await row(orders)).origin == "older"
     plan = await orders.plan(guard_requests.GuardTry(name="fence", upgrade=True), "eve")
     in_force = values_of(monitors.givens.states(monitors.checked, "fence"))
-    new = upgraded(released("fence", 2).text, in_force, [], {})
+    new = upgraded(released("fence", 2).text, in_force, [], {}, "shadow")
     assert (plan.file, plan.text, plan.changed, plan.shadow) == ("fence.rv", new.text, new.changed, True)
     assert plan.warnings == new.warnings
     await orders.upgrade(guard_requests.GuardUpgrade("fence", confirm_within=60.0), "eve")

@@ -335,7 +335,7 @@ def test_all_guards_of_an_older_version_are_upgraded_and_written(
 ) -> None:
     robot = Robot(tmp_path, Guard("old", PRESETS["fence"], types=FENCE.types))
     assert run(verbs.upgrade, robot) == GuardUpgrade("old")
-    assert (tmp_path / "old.rv").read_text() == robot.files["old.rv"]
+    assert (tmp_path / "old.rv").read_text() == robot.files["old.rv"].replace(" as old {", " as old on {")
     robot.orders.clear()
     run(verbs.upgrade, robot, "old", confirm_within="5m")
     assert robot.orders == [GuardUpgrade("old", confirm_within=300.0)]
