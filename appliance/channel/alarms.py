@@ -16,7 +16,7 @@ from appliance.features.views import states_of
 Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]
 SWITCHED_OFF = "monitor-off:"
-"""Begins the kinds of alarms for monitors that somebody switched off, or has in shadow mode."""
+"""Begins the kinds of alarms for monitors that an order or a file disabled, or put into shadow mode."""
 _Condition = tuple[Severity, str, About, str]
 _ORDER = ("alarm", "warning", "notice")
 

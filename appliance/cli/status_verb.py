@@ -107,7 +107,7 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Return whether an alarm has no effect on the exit status: recent denials and drops, monitors that somebody
+    """Return whether an alarm has no effect on the exit status: recent denials and drops, monitors that were
     switched off, and silenced alarms.
     """
     return (

@@ -1,6 +1,6 @@
 """The switches of monitors: enabled, disabled, or in shadow mode (`SHADOW`). No I/O.
 
-A monitor that is new here begins as the word in its file says (`preset deadman 3 as deadman on {`), without a word as
+A monitor that is new here begins as the word in its file says (`preset deadman 3 as deadman on {`), or else as
 `--enable` says. The word is then a switch like those of operators, so a later file takes no monitor out of force.
 Monitors that share variables are in shadow mode together.
 """

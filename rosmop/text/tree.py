@@ -534,7 +534,7 @@ class WithholdDeclaration(SyntaxNode):
 
 
 Switch = Literal["on", "shadow", "off", ""]
-"""How a specification begins where it is not known; empty: as the robot's setting says."""
+"""How a specification begins where it is not known, or empty for the setting of the robot."""
 
 
 @dataclass(frozen=True)

@@ -309,7 +309,7 @@ WALL_CLOCK = {
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/operators/switched_off.py", "features/tunnels/self_service.py",
+        "control/operators/new_state.py", "control/operators/switched_off.py", "features/tunnels/self_service.py",
     ],
     "whether the wall clock can be believed, and where it is read": [
         "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py", "store/ends.py",

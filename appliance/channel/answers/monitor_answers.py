@@ -101,7 +101,7 @@ class MonitorState(msgspec.Struct, frozen=True):
         Moment | None, doc("when it returns to shadow mode unless confirmed, or null if it stays as it is")
     ] = None
     lasting: Annotated[
-        Literal["on", "shadow", "off"], doc("its state without a switch that ends by itself: enabled or not")
+        Literal["on", "shadow", "off"], doc("its state without a switch that ends automatically")
     ] = "on"
 
 

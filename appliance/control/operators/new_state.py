@@ -15,7 +15,7 @@ NEW_SECONDS = 86_400.0
 """A state directory counts as new for a day."""
 
 LACKS: Mapping[str, str] = {
-    "switches": "monitors are on or off as their files say, without a word there as the setting `enable` says",
+    "switches": "monitors are on or off as their files say, or else as the setting `enable` says",
     "values": "constants and topics that operators gave to monitors are those of the files",
     "loaded specifications": "those that are only loaded, not in the folder, are not in force",
     "policy revisions": "the policy's file is in force, without earlier revisions",
@@ -29,7 +29,7 @@ LACKS: Mapping[str, str] = {
     "audit log": "a new log begins, with a new key",
     "memberships": "fleet and standby must be joined again",
 }
-"""What was in an earlier state directory, and what holds without it; the table in docs/reference/processes.md."""
+"""The parts of a state directory, and the consequence if they are missing; the table in docs/reference/processes.md."""
 
 _SETTING = "state began"
 _log = structlog.get_logger()

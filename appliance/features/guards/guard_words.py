@@ -38,7 +38,7 @@ def afresh_in_words(row: GuardRow) -> str:
     """Return how the guard would begin with a new state directory, if not as it is, with the remedy."""
     name = row.name
     if row.confirm_by is not None or row.off_until is not None:
-        return ""  # it ends by itself
+        return ""  # it ends automatically
     now = row.state if row.state in ("shadow", "off") else "on"
     if row.afresh == now:
         return ""

@@ -86,7 +86,7 @@ def test_the_file_has_each_switch_and_a_file_without_one_is_a_warning(packaged: 
 
 
 class Part(NamedTuple):
-    """What is in a state directory: commands that put it there, and what shows it."""
+    """A part of a state directory: the orders that change it, and a look at it."""
 
     orders: Sequence[Sequence[str]]
     look: Callable[[Appliance], object]

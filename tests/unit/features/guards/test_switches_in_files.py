@@ -40,7 +40,7 @@ def said(word: Word | None) -> str:
 
 
 @pytest.mark.parametrize("word", WORDS)
-def test_the_word_is_kept_and_is_no_part_of_the_guard(word: Word | None) -> None:
+def test_the_word_is_kept_and_does_not_belong_to_the_guard(word: Word | None) -> None:
     text = said(word)
     found = contents({"deadman.rv": text}, {}, lints=False)
     assert found.switches == ({"deadman": word} if word else {})
@@ -117,7 +117,7 @@ def alarms(state: GuardsState | None) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(("enable", "command"), [("none", "enable"), ("shadow", "enforce")])
-async def test_a_guard_that_nobody_switched_is_a_warning_with_the_command(
+async def test_a_guard_without_a_switch_is_a_warning_with_the_command(
     tmp_path: Path, enable: str, command: str
 ) -> None:
     async with monitors_of(tmp_path, {"deadman.rv": PLAIN}, enable=enable) as monitors:
