@@ -2,6 +2,7 @@ import os
 import signal
 import xmlrpc.client
 from pathlib import Path
+from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -9,10 +10,15 @@ from tests.support.command import ROSRV
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import needs
+from tests.support.waiting import LIMIT
 
 MONITORS = Path(__file__).parents[3] / "monitors"
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 NOBODY = "http://10.77.0.10:1/"
+
+
+class _AnyPath(SimpleXMLRPCRequestHandler):
+    rpc_paths = ()
 
 
 def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
@@ -37,6 +43,30 @@ def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
         finally:
             tail.stop()
         assert [record["caller_id"] for record in appliance.recorded("--event", "node lost")] == ["/brief"]
+
+
+def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(lab: Lab, robot: Host) -> None:
+    """A node chooses the path of its own URI, and dies like any other."""
+    middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 0.1}\n"
+    paths = {"/one": "%d/", "/two": "%s%s/", "/three": "%/"}
+    with Appliance(middle, settings=settings, options=("--api", "off")) as appliance:
+
+        def live_and_die() -> None:
+            asked: list[str] = []
+            with SimpleXMLRPCServer(("10.77.0.10", 0), _AnyPath, logRequests=False) as server:
+                server.register_function(lambda caller: asked.append(caller) or [1, "", 7], "getPid")
+                server.timeout = LIMIT
+                with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+                    for name, path in paths.items():
+                        uri = f"http://10.77.0.10:{server.server_address[1]}/{path}"
+                        master.registerSubscriber(name, "/chatter", "std_msgs/String", uri)
+                for _node in paths:
+                    server.handle_request()
+            assert asked
+
+        robot.run(live_and_die)
+        for name in paths:
+            appliance.recorded("--event", "node lost", caller_id=name)
 
 
 def test_a_paused_subscriber_gets_a_new_publisher_when_it_goes_on(

@@ -7,11 +7,32 @@ import pytest
 from appliance.master.endpoints.delivery import ANSWER, NodeApiClient
 from appliance.master.graph.registry import Registry
 from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError, XmlRpcClient
-from roswire.uris import NodeUri
+from roswire.uris import NodeUri, parse_node_uri
 from roswire.xmlrpc import build_response
 from tests.support.incarnations import incarnation
 
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
+_EVERY = "/aZ09_.~!$&'()*+,;=:@%/-/"  # each character that a path may have
+
+
+@pytest.mark.usefixtures("sockets")
+@pytest.mark.parametrize("path", ["/%d/%s/%n", "/%", "/%%%(a)s", _EVERY])
+async def test_a_path_is_sent_as_the_node_wrote_it(path: str) -> None:
+    """A path belongs to its node, so it is no part of a format string."""
+    heads: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        heads.append(await reader.readuntil(b"\r\n\r\n"))
+        assert len(await reader.readexactly(int(heads[-1].rpartition(b"Content-Length: ")[2])))
+        body = build_response([1, "", 7])
+        writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    uri = parse_node_uri(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}{path}")
+    assert await XmlRpcClient(uri, timeout=2.0).call("getPid", "/me") == [1, "", 7]
+    assert heads[0].split(b"\r\n")[0] == f"POST {path} HTTP/1.1".encode()
+    server.close()
 
 
 @pytest.mark.nightly
