@@ -123,6 +123,28 @@ class Definitions:
         return _fingerprint("".join(map(self._md5_text, parts)))
 
     def full_text(self, name: str) -> str:
+        own, *parts = self._parts(name)
+        return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
+
+    def fingerprint(self, name: str) -> str:
+        """Return a SHA-256 of all that a definition says: everything but its comments and spaces.
+
+        The md5sum of ROS leaves out the brackets and the type names of nested messages, so types with different
+        layouts can have the same.
+        """
+        lines = [
+            line
+            for part in self._parts(name)
+            for line in (
+                f"MSG: {part.name}",
+                *(f"{constant.type} {constant.name}={constant.text}" for constant in part.constants),
+                *(f"{field.notation} {field.name}" for field in part.fields),
+            )
+        ]
+        return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
+
+    def _parts(self, name: str) -> Collection[MessageDefinition]:
+        """Return a type, and all types that it contains."""
         self._depth(name, ())
         order: dict[str, MessageDefinition] = {}
         waiting = [name]
@@ -132,8 +154,7 @@ class Definitions:
                 continue
             order[current] = message = self.message(current)
             waiting += [field.type for field in reversed(message.fields) if field.type not in BUILTINS]
-        own, *parts = order.values()
-        return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
+        return order.values()
 
     def layout(self, name: str) -> MessageLayout:
         self._depth(name, ())

@@ -121,6 +121,8 @@ EVENTS: dict[str, str] = {
     "door disconnected": "Connections to a door ended that had begun; `reason` has that of the last one.",
     "door entry refused": "A connection to a door was refused: its ticket, address or handshake is not valid, or the"
     " door is full; `host` is the peer.",
+    "definitions differ": "Two publishers define one type differently with one md5sum, in which ROS leaves out the"
+    " brackets of nested messages; `host` and `caller_id` are the later one, `detail` has the earlier.",
     "door failed": "The process of a door ended, or its port could not be listened on.",
     "recording ordered": "A recording was ordered; `detail` has who ordered it, and the seconds before and after.",
     "recording closed": "The flight recorder finished a recording; `detail` has its sha256 and its triggers.",
@@ -256,7 +258,7 @@ SEVERITIES: dict[str, Severity] = {
             "authority refused", "motion not stopped", "bundle metadata rejected", "bundle refused",
             "graph restored",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "ended by the clock",
-            "enrolment refused",
+            "definitions differ", "enrolment refused",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
             "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
             "policy refused", "process died", "recording missed", "renewal refused", "rest certificate replaced",

@@ -27,7 +27,7 @@ def assembled_door(
         return rosapi.answer(request)
 
     sight = MasterSight(node, now)
-    door = DoorNode(node, types, answer, most_topics=most_topics, calls=calls)
+    door = DoorNode(node, types, answer, most_topics=most_topics, calls=calls, hosts=hosts)
     lookout = Lookout(sight, types, door, hosts)
     rosapi = Rosapi(sight, types, lookout)
     return door, lookout

@@ -112,10 +112,22 @@ class HostsWanted(Message, frozen=True):
 
 
 class HostsGiven(Message, frozen=True):
-    """A number for the host of each node of request `number`; -1 for a node that is gone."""
+    """A number for the host of each node of request `number`: 0 for the robot's machine, -1 for a node that is gone."""
 
     number: int
     hosts: list[int]
+
+
+class DefinitionsDiffer(Message, frozen=True):
+    """Two definitions of one type have one md5sum.
+
+    Each publisher is a node and a topic; both are empty for the definition of ROS or the operator.
+    """
+
+    type: str
+    md5sum: str
+    earlier: tuple[str, str]
+    later: tuple[str, str]
 
 
 class ConnectionsChanged(Message, frozen=True):
@@ -169,7 +181,7 @@ class ClientsShown(Message, frozen=True):
 DoorLink = (
     DoorStarted | DoorGiven | TypesGiven | PolicyChanged | BlocksGiven | DoorEnded | AgentListener | ViewerGiven
     | TicketEnded | SocketWanted | SocketGiven | SocketRefused | HostsWanted | HostsGiven | ConnectionsChanged
-    | DoorCounted | ClientsShown
+    | DoorCounted | ClientsShown | DefinitionsDiffer
 )  # fmt: skip
 
 

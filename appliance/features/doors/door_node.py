@@ -6,7 +6,7 @@ left, unless a new topic needs its slot. The master and the relay decide about a
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sized
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 from weakref import WeakValueDictionary
@@ -34,11 +34,13 @@ from appliance.features.doors.client_requests import (
 )
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
-from appliance.features.doors.heard_topic import HeardTopic, one_type
+from appliance.features.doors.heard_topic import HeardTopic, one_type, two_types
 from appliance.features.doors.host_shares import check_share, of_hosts
 from appliance.features.doors.known_types import DoorMessage, KnownType, KnownTypes, SharedFrames, TypeKey
 from appliance.features.doors.lingering import Lingering
+from appliance.features.doors.lookout import HostsOf
 from appliance.features.doors.message_writer import MessageWriter, Now
+from appliance.features.doors.node_hosts import ROBOT
 from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES, DOOR_TOPICS
 from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
 from roswire.node import (
@@ -106,12 +108,19 @@ class DoorClient(_Subscriber, ParameterClient, Protocol):
 @dataclass(slots=True)
 class _Publication:
     publication: NodePublication
+    request: AdvertiseTopic
     type: KnownType
     asked: float
     """The time when the master was last asked whether it grants the publication."""
     doubtful: bool = False
     """Whether subscribers of the publication have left since then, or the master refused it."""
     refusal: RosError | None = None
+    learner: _Learner | None = None
+    """The subscriber that hears the publishers which define the type; None if ROS or the operator defines it."""
+    agreed: Sequence[Mapping[str, str]] = ()
+    """The headers of the publishers that were last compared with the type."""
+    heard: float = field(default_factory=clock.now)
+    """The time when such a publisher was last present."""
     clients: set[DoorClient] = field(default_factory=set)
     wills: dict[DoorClient, Raw] = field(default_factory=dict)
 
@@ -138,8 +147,10 @@ class DoorNode:
         *,
         most_topics: int,
         calls: ClientMemory,  # charged with arguments of calls, which may outlive their connection
+        hosts: HostsOf,
     ) -> None:
         self.node = node
+        self._hosts = hosts
         self._topics = DOOR_TOPICS.bounds.sized(most_topics)
         self._calls = calls
         self.waiting_calls = of_hosts("calls of this door that wait for answers", DOOR_CALLS.bounds.whole)
@@ -204,7 +215,8 @@ class DoorNode:
                 # Its subscribers would not get it if there is no memory, or if the right to publish has ended.
                 with contextlib.suppress(LimitExceededError, RosError):
                     await self._check_granted(known)
-                    known.publish(known.wills[client], client.memory)
+                    if await self._check_type(known):
+                        known.publish(known.wills[client], client.memory)
             self._unadvertise(topic, client)
         for topic in [topic for topic, heard in self._heard.items() if client in heard.clients]:
             self._unsubscribe(topic, client)
@@ -245,26 +257,37 @@ class DoorNode:
         async with self._lock(f"publisher {request.topic}"):
             known = self._publications.get(request.topic)
             if known is not None and not known.clients and not self._fits(known, request):
-                del self._publications[request.topic]
-                await self.node.unadvertise(request.topic)
+                await self._drop(request.topic)
+                known = None
+            if known is not None and (objection := await self._objection(known)):
+                await self._drop(request.topic, objection)
                 known = None
             if known is None:
                 users = [one.clients for one in self._publications.values()]
                 await self._make_room(
                     self._publications, users, client, self._published, self._end_publication
                 )
-                with self._refusing_all(request):
-                    kind = await self._published_type(request)
-                _check_will(request, kind, client.memory)
-                with self._refusing_all(request):
-                    publication = await self.node.advertise(
-                        request.topic,
-                        MessageType.defined(kind.definitions, kind.name),
-                        latched=request.latched,
-                        queue=request.queue,
-                        replay=_REPLAY_SECONDS,
-                    )
-                known = self._publications[request.topic] = _Publication(publication, kind, clock.now())
+                learner = _Learner(self._calls)
+                try:
+                    with self._refusing_all(request):
+                        kind = await self._published_type(request, learner)
+                    _check_will(request, kind, client.memory)
+                    with self._refusing_all(request):
+                        publication = await self.node.advertise(
+                            request.topic,
+                            MessageType.defined(kind.definitions, kind.name),
+                            latched=request.latched,
+                            queue=request.queue,
+                            replay=_REPLAY_SECONDS,
+                        )
+                except BaseException:
+                    self._unsubscribe(request.topic, learner)
+                    raise
+                known = self._publications[request.topic] = _Publication(
+                    publication, request, kind, clock.now(), learner=None if kind.defined else learner
+                )
+                if kind.defined:
+                    self._unsubscribe(request.topic, learner)
             elif request.type not in (None, known.publication.type.name):
                 raise ProtocolError(
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
@@ -281,16 +304,72 @@ class DoorNode:
 
         The publisher that defined its type may be gone, or the operator's file has changed.
         """
-        defined = known.type.defined and self._types.defines(TypeKey(known.type.name, known.type.md5sum))
+        defined = known.type.defined and self._types.defines(known.type.key)
         given = known.type.name, known.publication.latched
         return defined and (request.type is None or (request.type, request.latched) == given)
 
-    async def _published_type(self, request: AdvertiseTopic) -> KnownType:
+    async def _published_type(self, request: AdvertiseTopic, learner: _Learner) -> KnownType:
         """Return the type as ROS or the operator define it, or else as the publishers of this topic do."""
         name = request.type or await self._type_of(request.topic)
         if self._types.has_message(name):
             return self._types.message(name)
-        return one_type(request.topic, await self._headers(request.topic), self._types, name)
+        headers = await self._counting(await self._headers(request.topic, learner))
+        return one_type(request.topic, headers, self._types, name)
+
+    async def _counting(self, headers: list[Mapping[str, str]]) -> list[Mapping[str, str]]:
+        """Return the headers that count for the type of a topic: if they differ, the defined or the robot's own."""
+        keys = [self._types.key(header) for header in headers]
+        if len({*keys}) <= 1:
+            return headers
+        defined = [header for key, header in zip(keys, headers, strict=True) if self._types.defines(key)]
+        return defined or await self._of_robot(headers) or headers
+
+    async def _of_robot(self, headers: Collection[Mapping[str, str]]) -> list[Mapping[str, str]]:
+        hosts = await self._hosts({header.get("callerid", "") for header in headers})
+        return [header for header in headers if hosts.get(header.get("callerid", "")) == ROBOT]
+
+    async def _check_type(self, known: _Publication) -> bool:
+        """Return whether the publication has the type of its topic; if not, end it and tell its clients."""
+        objection = await self._objection(known)
+        if objection:
+            topic = known.publication.topic
+            async with self._lock(f"publisher {topic}"):
+                if self._publications.get(topic) is known:
+                    await self._drop(topic, objection)
+        return not objection
+
+    async def _objection(self, known: _Publication) -> str:
+        """Return why the publication has not the type of its topic any more, or an empty text.
+
+        A type that ROS or the operator defines stays. Another one ends with the publishers that define it so.
+        """
+        topic = known.publication.topic
+        if known.learner is None:
+            return ""
+        subscription = self.node.subscribers.get(topic)
+        headers = [] if subscription is None else [*subscription.connected.values()]
+        if headers and [*map(id, headers)] == [*map(id, known.agreed)]:
+            known.heard = clock.now()
+        elif headers:
+            keys = {self._types.key(header) for header in await self._counting(headers)}
+            if keys != {known.type.key}:
+                return two_types(topic, next(iter(keys - {known.type.key})), known.type.key)
+            known.agreed, known.heard = headers, clock.now()
+        elif clock.now() - known.heard > _LINGER_SECONDS:
+            return (
+                f"the publishers of {topic} that define its type are gone, so the door does not know it any longer; put"
+                " its .msg file in msg/PACKAGE of the folder of specifications (rosrv monitor reload)"
+            )
+        return ""
+
+    async def _drop(self, topic: str, reason: str = "") -> None:
+        known = self._publications.pop(topic)
+        for client in known.clients if reason else ():
+            again = replace(known.request, reply_to=None, will=known.wills.get(client))
+            client.failed(again, reason)  # its protocol repeats the request with its next message
+        if known.learner is not None:
+            self._unsubscribe(topic, known.learner)
+        await self.node.unadvertise(topic)
 
     async def _type_of(self, topic: str) -> str:
         try:
@@ -317,15 +396,15 @@ class DoorNode:
         async with self._lock(f"publisher {topic}"):
             known = self._publications.get(topic)
             if known is not None and not known.clients:
-                del self._publications[topic]
-                await self.node.unadvertise(topic)
+                await self._drop(topic)
 
     async def _publish(self, request: PublishMessage, client: DoorClient) -> None:
         known = self._publications.get(request.topic)
         if known is None:
             raise ProtocolError(f"{request.topic} is not advertised by this client")
         await self._check_granted(known)
-        known.publish(request.values, client.memory)
+        if await self._check_type(known):
+            known.publish(request.values, client.memory)
 
     async def _check_granted(self, known: _Publication) -> None:
         """Raise the master's refusal if the publication is no longer granted, for example after an approval ended.
@@ -358,8 +437,11 @@ class DoorNode:
                 except RosError:
                     self._unsubscribe(topic, client)  # its protocol forgets the topic
                     raise
-                self._heard[topic].clients[client] = request
+                heard = self._heard[topic]
+                heard.clients[client] = request
                 self._subscribed.used(topic)
+                for key in {*heard.told} & {*self._present(topic)}:
+                    client.warned(heard.told[key])
                 self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))
                 return
             users = [one.clients for one in self._heard.values()]
@@ -398,14 +480,15 @@ class DoorNode:
         heard = self._heard.get(topic)
         if heard is None:
             return
-        if heard.header is not header and (reason := heard.refusal(header, self._present(topic))):
-            if heard.tells(header):
+        if heard.header is not header and (reason := heard.refusal(header, lambda: self._present(topic))):
+            if heard.tells(header, reason):
                 for client in heard.clients:
                     client.warned(reason)
+                self._tasks.start(self._prefer_robot(heard, header))
             return
         clients, kind = heard.clients, header.get("type", ANY)
         shared = self._frames if receivers is None and len(clients) > 1 else None
-        message = DoorMessage(topic, body, header, clock.wall_ns(), heard.codec, shared)
+        message = DoorMessage(topic, body, header, clock.wall_ns(), heard.known, shared)
         now = asyncio.get_running_loop().time()
         wrong = []
         for client in clients if receivers is None else receivers:
@@ -420,15 +503,28 @@ class DoorNode:
 
     def _present(self, topic: str) -> list[TypeKey]:
         """Return the types of the present publishers of a topic, also of this node."""
-        subscription, own = self.node.subscribers.get(topic), self.node.publishers.get(topic)
+        subscription, own = self.node.subscribers.get(topic), self._publications.get(topic)
         headers = [] if subscription is None else subscription.connected.values()
-        present = [TypeKey.of(header) for header in headers]
-        return present if own is None else [*present, TypeKey(own.type.name, own.type.md5sum)]
+        present = [self._types.key(header) for header in headers]
+        return present if own is None else [*present, own.type.key]
+
+    async def _prefer_robot(self, heard: HeardTopic[_Subscriber], header: Mapping[str, str]) -> None:
+        """Let the type of this header count if its publisher, unlike the one that counts, is on the robot's machine."""
+        counts = heard.header
+        if counts is None or self._types.defines(self._types.key(counts)):
+            return
+        if [*await self._of_robot([counts, header])] == [header] and heard.header is counts:
+            heard.put_first(header)
+            heard.told = {
+                self._types.key(counts): two_types(heard.topic, *map(self._types.key, (header, counts)))
+            }
+            for client in heard.clients:
+                client.warned(heard.told[self._types.key(counts)])
 
     def heard_type(self, topic: str) -> KnownType | None:
         """Return the type that counts on a topic to which the door subscribes, or None if there is none."""
         heard = self._heard.get(topic)
-        if heard is None or heard.header is None or TypeKey.of(heard.header) not in self._present(topic):
+        if heard is None or heard.header is None or self._types.key(heard.header) not in self._present(topic):
             return None
         try:
             return heard.known(heard.header)
@@ -546,21 +642,19 @@ class DoorNode:
 
     async def learn(self, topic: str) -> KnownType:
         """Return the type of a topic, from its publishers. Raise `RosError` if none of them answers or can be used."""
-        headers = await self._headers(topic)
-        if not headers:
-            raise PeerUnreachableError(f"no publisher of {topic} answers")
-        keys = [TypeKey.of(header) for header in headers]
-        defined = [header for key, header in zip(keys, headers, strict=True) if self._types.defines(key)]
-        return self._types.learn((defined or headers)[0])
-
-    async def _headers(self, topic: str) -> list[Mapping[str, str]]:
-        """Return the connection headers of the publishers of a topic, after at most a second."""
         learner = _Learner(self._calls)
-        await self._subscribe(SubscribeTopic(topic), learner)
         try:
-            return await self.node.subscribers[topic].headers(_LEARN_SECONDS)
+            headers = await self._headers(topic, learner)
         finally:
             self._unsubscribe(topic, learner)
+        if not headers:
+            raise PeerUnreachableError(f"no publisher of {topic} answers")
+        return self._types.learn((await self._counting(headers))[0])
+
+    async def _headers(self, topic: str, learner: _Learner) -> list[Mapping[str, str]]:
+        """Subscribe, and return the headers of the publishers of a topic, after at most a second."""
+        await self._subscribe(SubscribeTopic(topic), learner)
+        return await self.node.subscribers[topic].headers(_LEARN_SECONDS)
 
     async def _make_room(
         self,

@@ -10,6 +10,7 @@
 """
 
 import asyncio
+import itertools
 import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -78,6 +79,7 @@ class DoorProcesses:
         self._tickets = tickets
         self._left = left
         self._host_numbers: dict[Address, int] = {}
+        self._numbers = itertools.count(1)  # none is used twice, also after hosts were forgotten
         self._settings = core.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
         self._revision = core.policy.revision
@@ -180,6 +182,8 @@ class DoorProcesses:
                 slot.counts = message
                 full = message.connections >= self._settings.connections
                 slot.full_since = (slot.full_since or clock.now()) if full else None
+            case door_link.DefinitionsDiffer():
+                self._record_definitions(row, message)
             case door_link.ClientsShown(clients):
                 slot.clients = clients[: door_link.MOST_SHOWN]
             case door_link.ConnectionsChanged():
@@ -191,9 +195,11 @@ class DoorProcesses:
         host = self._core.graph.host_of(node)
         if host is None:
             return -1
+        if host.is_loopback or any(host in network for network in self._core.policy.current().robot):
+            return 0
         if len(self._host_numbers) >= _MOST_HOSTS:
             self._host_numbers.clear()
-        return self._host_numbers.setdefault(host, len(self._host_numbers))
+        return self._host_numbers.setdefault(host, next(self._numbers))
 
     def _lost(self, number: int, _reason: str) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
@@ -314,6 +320,25 @@ class DoorProcesses:
                 self._send(slot, message, *([made.fileno()] if message.descriptors else []))
 
     # --- records ---
+
+    def _record_definitions(self, row: DoorRow, found: door_link.DefinitionsDiffer) -> None:
+        hosts = [self._core.graph.host_of(node) for node, _topic in (found.earlier, found.later)]
+        earlier, later = (
+            f"{node[:200]} ({topic[:200]}, {host or 'gone'})" if node else "ROS or the operator"
+            for (node, topic), host in zip((found.earlier, found.later), hosts, strict=True)
+        )
+        self._core.trail.happened(
+            "definitions differ",
+            f"{earlier} and {later} define {found.type[:200]} differently with the md5sum {found.md5sum[:32]}; the door"
+            f" {row.name} reads each topic as its own publisher defines it",
+            host=None if hosts[1] is None else str(hosts[1]),
+            caller_id=found.later[0][:200],
+            category="topic",
+            resource=found.later[1][:200],
+            reads=True,
+            earlier=found.earlier[0][:200],
+            type=found.type[:200],
+        )
 
     def _record(self, row: DoorRow, change: door_link.ConnectionsChanged) -> None:
         happened = partial(

@@ -48,7 +48,7 @@ from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.png_frames import DoorFrame
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic
 from appliance.features.doors.viewer_queue import ViewerQueue
-from roswire.errors import PeerError, quoted
+from roswire.errors import DefinitionError, PeerError, quoted
 from roswire.names import resolve, resolve_parameter
 from roswire.xmlrpc import Value
 
@@ -402,16 +402,23 @@ class Foxglove:
             self._tell("connectionGraphUpdate", **changed, removedTopics=removed, removedServices=services)
 
     def message(self, message: DoorMessage, now: float) -> None:
-        md5sum = message.header.get("md5sum", "")
+        try:
+            fingerprint = message.type.key.fingerprint
+        except DefinitionError:
+            fingerprint = ""
         for number in self._by_topic.get(message.topic, ()):
             seen = self._topics[self._subscriptions[number]]
-            if seen.md5sum == md5sum:
+            if seen.fingerprint == fingerprint:
                 self.queue.put(number, message, len(message.body), now)
             elif seen not in self._changed:  # the next look announces the topic with its definition
                 self._changed.add(seen)
-                self._refuse(
-                    f"{seen.topic} has the md5sum {md5sum[:32]}, not {seen.md5sum}: subscribe to it again"
+                md5sum = message.header.get("md5sum", "")[:32]
+                changed = (
+                    "another definition"
+                    if md5sum == seen.md5sum
+                    else f"the md5sum {md5sum}, not {seen.md5sum}"
                 )
+                self._refuse(f"{seen.topic} has {changed}: subscribe to it again")
 
     def warned(self, reason: str) -> None:
         self._refuse(reason)

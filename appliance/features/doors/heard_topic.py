@@ -1,22 +1,23 @@
 """The type of a topic to which a door subscribes, and its clients.
 
-1. One type counts at a time. The version that ROS's packages or the operator define comes before the others; among
-   those, the one of the first publisher counts until that publisher is gone.
-2. Messages of another type are dropped, and each client gets the reason once.
-3. The header of a publisher is parsed at most once, even if it cannot be used.
+1. One type counts at a time. The version that ROS's packages or the operator define comes before the others, then
+   that of a publisher on the robot's machine; among the rest, the one of the first publisher counts until it is gone.
+2. Messages of another type are dropped, and each client gets the reason once, also a later client.
+3. A type is another one if its definition says anything else, even with the same md5sum.
+4. The header of a publisher is parsed at most once, even if it cannot be used.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from appliance.features.doors.client_requests import SubscribeTopic
 from appliance.features.doors.known_types import KnownType, KnownTypes, TypeKey
-from appliance.features.doors.values import MessageCodec
 from roswire.errors import DefinitionError, ProtocolError
 
 Client = TypeVar("Client")
 _MOST_TOLD = 8  # other types of one topic; a publisher can change its own at will
+_DESCRIBE = ("type", "md5sum", "message_definition")
 
 
 @dataclass(slots=True)
@@ -27,44 +28,42 @@ class HeardTopic(Generic[Client]):
     types: KnownTypes
     clients: dict[Client, SubscribeTopic] = field(default_factory=dict)
     header: Mapping[str, str] | None = None
-    told: set[TypeKey] = field(default_factory=set)
+    told: dict[TypeKey, str] = field(default_factory=dict)
+    """What clients got to know about types that do not count."""
     doubtful: bool = False
     """Whether the policy has changed since the master last granted the subscription."""
-    _known: KnownType | None = None
+    _known: tuple[Mapping[str, str], KnownType] | None = None
     _unusable: tuple[Mapping[str, str], DefinitionError] | None = None
 
-    def refusal(self, header: Mapping[str, str], present: Collection[TypeKey]) -> str:
-        """Return why a message with this header is dropped, or an empty text; `present` has the publishers' types."""
-        if header is self.header:
-            return ""
-        counts = None if self.header is None else TypeKey.of(self.header)
-        key = TypeKey.of(header)
-        if key != counts:
-            if (
-                counts is not None
-                and counts in present
-                and (self.types.defines(counts) or not self.types.defines(key))
-            ):
-                return two_types(self.topic, counts, key)
-            self._known = self._unusable = None
+    def refusal(self, header: Mapping[str, str], present: Callable[[], Collection[TypeKey]]) -> str:
+        """Return why a message with this header is dropped, or an empty text; `present` gives the publishers' types."""
+        if self.header is not None and not same_text(header, self.header):
+            counts, key = self.types.key(self.header), self.types.key(header)
+            if key != counts:
+                kept = self.types.defines(counts) or not self.types.defines(key)
+                if kept and counts in present():
+                    return two_types(self.topic, counts, key)
+                self._known = self._unusable = None
         self.header = header
         return ""
 
-    def tells(self, header: Mapping[str, str]) -> bool:
+    def put_first(self, header: Mapping[str, str]) -> None:
+        """Let this type count."""
+        self.header = header
+        self._known = self._unusable = None
+
+    def tells(self, header: Mapping[str, str], reason: str) -> bool:
         """Return whether clients have not yet got the reason about the type of this header."""
-        key = TypeKey.of(header)
+        key = self.types.key(header)
         if key in self.told or len(self.told) >= _MOST_TOLD:
             return False
-        self.told.add(key)
+        self.told[key] = reason
         return True
 
-    def codec(self, header: Mapping[str, str]) -> MessageCodec:
-        """Raise `DefinitionError` if the definition cannot be used."""
-        return self.known(header).codec
-
     def known(self, header: Mapping[str, str]) -> KnownType:
-        if self._known is not None and TypeKey.of(header) == (self._known.name, self._known.md5sum):
-            return self._known
+        """Raise `DefinitionError` if the definition cannot be used."""
+        if self._known is not None and same_text(header, self._known[0]):
+            return self._known[1]
         if self._unusable is not None and self._unusable[0] is header:
             error = self._unusable[1]
             raise DefinitionError(error.text, error.source, error.line)
@@ -74,22 +73,28 @@ class HeardTopic(Generic[Client]):
             self._unusable = header, error.with_traceback(None)
             raise
         if header is self.header:
-            self._known = known
+            self._known = header, known
         return known
+
+
+def same_text(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
+    return one is other or all(one.get(name) == other.get(name) for name in _DESCRIBE)
 
 
 def two_types(topic: str, counts: TypeKey, other: TypeKey) -> str:
     return (
-        f"{topic} has publishers of two types: {_named(counts)} counts, messages of {_named(other)} are dropped."
-        " Let all publishers use one version, or put its .msg file in msg/PACKAGE of the folder of specifications"
+        f"{topic} has publishers of two types: {_named(counts)} counts, messages of {_other(counts, other)} are"
+        " dropped. Let all publishers use one version, or put its .msg file in msg/PACKAGE of the folder of"
+        " specifications"
     )
 
 
 def one_type(topic: str, headers: Collection[Mapping[str, str]], types: KnownTypes, name: str) -> KnownType:
-    """Return the type `name` as all publishers of the topic define it. Raise `PeerError` in words."""
-    found = {TypeKey.of(header): header for header in headers}
+    """Return the type `name` as all these publishers of the topic define it. Raise `PeerError` in words."""
+    found = {types.key(header): header for header in headers}
     if len(found) > 1:
-        words = " and ".join(sorted(map(_named, found)))
+        first, *others = found
+        words = " and ".join([_named(first), *(_other(first, key) for key in others)])
         raise ProtocolError(f"{topic} has publishers of two types, {words}: use one version")
     for key, header in found.items():
         if key.name != name:
@@ -104,3 +109,9 @@ def one_type(topic: str, headers: Collection[Mapping[str, str]], types: KnownTyp
 
 def _named(key: TypeKey) -> str:
     return f"{key.name[:200]} with the md5sum {key.md5sum[:32]}"
+
+
+def _other(counts: TypeKey, other: TypeKey) -> str:
+    if counts[:2] == other[:2]:
+        return f"another definition of {other.name[:200]} with the same md5sum"
+    return _named(other)

@@ -102,7 +102,7 @@ class Lookout:
         }
         await self._ask(graph, things | {("service", name): nodes for name, nodes in graph.services.items()})
         topics = [
-            SeenTopic(topic, kind.name, kind.full_text, kind.md5sum)
+            SeenTopic(topic, kind.name, kind.full_text, kind.key.md5sum, kind.key.fingerprint)
             for topic in graph.topics
             if (kind := self._type(topic, graph)) is not None
         ]

@@ -1,6 +1,6 @@
 """Ask control which nodes are on the same host, so that a door divides its queries by host.
 
-A door learns no address of another host: control gives each host a number.
+A door learns no address of another host: control gives each host a number, and the robot's machine the first.
 """
 
 import asyncio
@@ -9,6 +9,8 @@ from collections.abc import Callable, Collection, Mapping
 from appliance.features.doors.door_link import MOST_NODES, HostsWanted
 
 _SECONDS = 2.0
+ROBOT = "0"
+"""The robot's own machine, as `NodeHosts.of` names it."""
 
 
 class NodeHosts:

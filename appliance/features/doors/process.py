@@ -357,6 +357,8 @@ class DoorProcess:
                 )
                 if not self._child.tell(message):
                     self._changes.setdefault((peer, ticket), one)
+            for found in self._types.take_differing():
+                self._child.tell(door_link.DefinitionsDiffer(*found))
             counted = self._counts()
             if counted != self._counted and self._child.tell(counted):
                 self._counted = counted

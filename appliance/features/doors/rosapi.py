@@ -248,9 +248,9 @@ class Rosapi:
         if self._types.has_message(given.type):
             return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}
         seen = [one for one in (await self._outlook.look()).topics if one.type == given.type]
-        versions = {one.md5sum: one for one in seen}
+        versions = {one.fingerprint: one for one in seen}
         if len(versions) > 1:
-            words = " and ".join(f"{one.topic} ({md5sum})" for md5sum, one in versions.items())
+            words = " and ".join(f"{one.topic} ({one.md5sum})" for one in versions.values())
             raise ProtocolError(f"{quoted(given.type)} has several definitions: {words}")
         for one in seen:
             return {"typedefs": typedefs(Definitions.from_full_text(one.type, one.definition), one.type)}

@@ -162,8 +162,10 @@ def publish_frame(message: DoorMessage, form: tuple[str, Compression]) -> DoorFr
         head = _RAW.pack(_RAW_SECS, secs, _RAW_NSECS, nsecs, _RAW_BYTES, len(message.body))
         return binary_frame(_publish_head(topic) + head, message.body)
     if compression == "cbor":
-        return binary_frame(_publish_head(topic) + b"\x63msg", message.codec.cbor(message.body))
-    text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.codec.json(message.body)})
+        return binary_frame(_publish_head(topic) + b"\x63msg", message.type.codec.cbor(message.body))
+    text = msgspec.json.encode(
+        {"op": "publish", "topic": topic, "msg": message.type.codec.json(message.body)}
+    )
     return PngFrame(text) if compression == "png" else text_frame(text)
 
 

@@ -20,12 +20,13 @@ class VisibleGraph:
 
 @dataclass(frozen=True, slots=True)
 class SeenTopic:
-    """A topic, its type, and the full text and md5sum of the type."""
+    """A topic, its type, and the full text, md5sum and fingerprint of the type."""
 
     topic: str
     type: str
     definition: str
     md5sum: str
+    fingerprint: str
 
 
 @dataclass(frozen=True, slots=True)

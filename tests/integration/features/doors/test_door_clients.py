@@ -11,6 +11,7 @@ from websockets.typing import Subprotocol
 
 from tests.support.features.doors.real_door import real_door
 from tests.support.nodes import RosSession
+from tests.support.processes import Process
 from tests.support.site import Site
 
 SECONDS = 20.0
@@ -64,6 +65,52 @@ def test_a_rosbridge_client_hears_publishes_and_calls(site: Site, ros: RosSessio
         await client.send(json.dumps({"op": "call_service", "service": "/rosapi/topics_and_raw_types"}))
         topics = (await next_frame(client, "service_response"))["values"]
         assert "string data" in topics["typedefs_full_text"][topics["topics"].index("/chatter")]
+
+    with_client(site, work)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    "site", ["appliance"], indirect=True
+)  # a stock node may not hear a quick new advertisement
+def test_a_guest_defines_no_type_for_another_topic(site: Site, ros: RosSession) -> None:
+    """A guest comes first with another definition of the same md5sum, and leaves; then the robot's text changes."""
+
+    async def work(client: ClientConnection) -> None:
+        async def sends(*frames: dict[str, Any], topic: str = "/drive") -> None:
+            for frame in frames:
+                await client.send(json.dumps(frame | {"topic": topic}))
+
+        async def drives(base: Process, message: dict[str, Any], **heard: Any) -> None:
+            before = len(base.seen(event="received"))
+            for _attempt in range(40):
+                await sends({"op": "publish", "msg": message})
+                await asyncio.sleep(0.5)
+                if found := base.seen(event="received")[before:]:
+                    assert {key: found[0][key] for key in heard} == heard
+                    return
+            raise AssertionError("the base heard nothing")
+
+        advertise, subscribe = {"op": "advertise", "type": "own/Drive"}, {"op": "subscribe"}
+        guest = await asyncio.to_thread(ros.node, "rospy", "drive", "/guest/drive", "left", name="guest")
+        await sends(advertise, subscribe, topic="/guest/drive")
+        assert (await next_frame(client, "publish"))["msg"]["left"] == []
+        await sends({"op": "unsubscribe"}, topic="/guest/drive")
+        base = await asyncio.to_thread(ros.node, "rospy", "drive", "/drive", "right", name="base")
+        for leaves in (True, False):
+            await sends(advertise, subscribe)
+            while (heard := await next_frame(client, "publish"))["topic"] != "/drive":
+                pass
+            assert heard["msg"]["right"] == [] and heard["msg"]["left"]["speed"] > 0
+            await drives(base, {"left": {"speed": 5}, "right": []}, left=5, right=[])
+            if leaves:
+                await sends({"op": "unsubscribe"})
+                await asyncio.to_thread(guest.stop)
+        await asyncio.to_thread(base.stop)
+        base = await asyncio.to_thread(ros.node, "rospy", "drive", "/drive", "left", name="base")
+        await drives(base, {"left": [{"speed": 7}], "right": {"speed": 6}}, left=[7], right=6)
+        while (heard := await next_frame(client, "publish"))["msg"]["left"] != []:
+            pass
 
     with_client(site, work)
 

@@ -322,7 +322,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
     queue: ViewerQueue[int | str] = ViewerQueue()
     foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
     graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})
-    foxglove.surroundings(DoorSurroundings(graph, [SeenTopic("/t", "a/B", "int8 x", "md5")], []))
+    foxglove.surroundings(DoorSurroundings(graph, [SeenTopic("/t", "a/B", "int8 x", "md5", "sha")], []))
     while foxglove.next_frame(0.0) is not None:
         pass
     return foxglove, queue
@@ -384,7 +384,9 @@ def test_a_subscription_ends_with_its_channel() -> None:
     foxglove, _queue = viewer()
     subscribe = '{"op":"subscribe","subscriptions":[{"id":5,"channelId":%d}]}'
     assert received(foxglove, subscribe % 1) == [SubscribeTopic("/t", "a/B")]
-    gone = DoorSurroundings(VisibleGraph({}, {}, {}, {}), [SeenTopic("/t", "a/C", "int8 y", "md5")], [])
+    gone = DoorSurroundings(
+        VisibleGraph({}, {}, {}, {}), [SeenTopic("/t", "a/C", "int8 y", "md5", "sha")], []
+    )
     assert foxglove.surroundings(gone) == [UnsubscribeTopic("/t")]
     assert received(foxglove, '{"op":"unsubscribe","subscriptionIds":[5]}') == []
     assert received(foxglove, subscribe % 2) == [SubscribeTopic("/t", "a/C")]
@@ -394,7 +396,7 @@ def test_a_channel_that_comes_back_has_a_new_number() -> None:
     foxglove, _queue = viewer()
     announced = []
     for number in range(100):
-        seen = [SeenTopic(f"/t{number % 2}", "a/B", "int8 x", "md5")]
+        seen = [SeenTopic(f"/t{number % 2}", "a/B", "int8 x", "md5", "sha")]
         foxglove.surroundings(DoorSurroundings(VisibleGraph({}, {}, {}, {}), seen, []))
         while (frame := text_frame(foxglove)) is not None:
             announced += [one["id"] for one in json.loads(frame).get("channels", ())]

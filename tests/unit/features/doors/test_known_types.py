@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import pytest
 
-from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
+from appliance.features.doors.known_types import DoorMessage, KnownType, KnownTypes, SharedFrames
 from appliance.features.doors.png_frames import DoorFrame
 from appliance.features.doors.rosbridge_frames import Compression, publish_frame
-from appliance.features.doors.values import MessageCodec, ValueLimits
+from appliance.features.doors.values import ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_layout import MessageLayout
@@ -72,6 +72,32 @@ def test_no_header_replaces_a_type_of_the_operator(types: KnownTypes) -> None:
 def test_the_text_of_ros_counts_even_if_a_header_has_its_md5sum(types: KnownTypes) -> None:
     given = header("std_msgs/String", "string data  # the robot is safe to touch")
     assert types.learn(given) is types.message("std_msgs/String")
+
+
+PARTS = f"\n{'=' * 80}\nMSG: own/Part\nint8 x\n{'=' * 80}\nMSG: own/Other\nint8 x"
+
+
+@pytest.mark.parametrize(
+    ("text", "other"),
+    [
+        ("Part[] a" + PARTS, "Part a" + PARTS),
+        ("Part[] a" + PARTS, "Part[3] a" + PARTS),
+        ("Part a\nPart b" + PARTS, "Part a\nPart[2] b" + PARTS),
+        ("Part a" + PARTS, "Other a" + PARTS),
+    ],
+)
+def test_a_definition_is_not_that_of_an_equal_md5sum(types: KnownTypes, text: str, other: str) -> None:
+    one, two = header("own/Load", text), header("own/Load", other)
+    assert one["md5sum"] == two["md5sum"]
+    known = types.learn(one)
+    assert types.learn(two) is not known and types.learn(one) is known
+    assert types.key(one) != types.key(two)
+    commented = header("own/Load", text.replace("\n", "  # a comment\n", 1))
+    assert types.key(commented) == types.key(one)
+    assert len(types.take_differing()) == 1
+    types.define(Definitions.from_full_text("own/Load", text))
+    assert types.learn(one) is types.learn(commented) is types.message("own/Load") is not types.learn(two)
+    assert types.learn(one | {"message_definition": ""}) is types.message("own/Load")
 
 
 @pytest.mark.parametrize(
@@ -165,9 +191,9 @@ def test_the_operators_files_define_types_until_they_change(types: KnownTypes) -
 def test_a_message_is_encoded_once_for_all_clients_within_bounds(types: KnownTypes) -> None:
     given, learned = header("own/Bytes", "uint8[] x"), list[str]()
 
-    def learn(fields: Mapping[str, str]) -> MessageCodec:
+    def learn(fields: Mapping[str, str]) -> KnownType:
         learned.append(fields["type"])
-        return types.learn(fields).codec
+        return types.learn(fields)
 
     def message(size: int) -> DoorMessage:
         return DoorMessage("/x", struct.pack("<I", size) + bytes(size), given, 0, learn, shared)

@@ -23,15 +23,15 @@ from appliance.features.doors.client_requests import (
     WithdrawService,
 )
 from appliance.features.doors.door_memory import DoorMemory
-from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.known_types import DoorMessage, KnownTypes
 from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
-from appliance.features.doors.values import MessageCodec, ValueLimits
+from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue, ViewerStalledError
 from roswire.definitions import Definitions
 
-STRING = MessageCodec(
-    Definitions.from_files({"std_msgs/String.msg": "string data"}), "std_msgs/String", ValueLimits()
+STRING = KnownTypes(Definitions.from_files({"std_msgs/String.msg": "string data"}), ValueLimits()).message(
+    "std_msgs/String"
 )
 
 
@@ -297,7 +297,7 @@ def test_a_client_that_asks_and_does_not_read_is_given_up(client: Client) -> Non
 def test_a_call_is_answered_or_fails_with_a_message(client: Client) -> None:
     (call,) = client.sends({"op": "call_service", "service": "add", "args": {"a": 1}, "id": "c"})
     assert isinstance(call, CallOfService) and call.service == "/add" and values(call) == {"a": 1}
-    client.rosbridge.answered(call.call, STRING.json(b"\x01\0\0\0x"))
+    client.rosbridge.answered(call.call, STRING.codec.json(b"\x01\0\0\0x"))
     (second,) = client.sends({"op": "call_service", "service": "/add", "args": [1, 2]})
     assert values(second) == [1, 2]
     reason = "denied by [Services] /add (site.ini:3)"
@@ -328,7 +328,7 @@ def test_calls_without_an_answer_are_bounded() -> None:
 def test_a_service_of_the_client_gets_calls_and_its_answers_are_matched_by_id(client: Client) -> None:
     offer = {"op": "advertise_service", "service": "brake", "type": "std_srvs/SetBool"}
     assert client.sends(offer) == [OfferService("/brake", "std_srvs/SetBool")]
-    call = client.rosbridge.ask("/brake", STRING.json(b"\x01\0\0\0x"))
+    call = client.rosbridge.ask("/brake", STRING.codec.json(b"\x01\0\0\0x"))
     (asked,) = client.gets()
     assert asked == {"op": "call_service", "service": "brake", "args": {"data": "x"}, "id": call}
     answer = {"op": "service_response", "service": "brake", "id": call, "values": {"ok": 1}, "result": True}

@@ -277,6 +277,132 @@ async def test_a_publication_on_a_topic_of_two_types_is_refused_in_words() -> No
         assert "/shared has publishers of two types, own/Load with the md5sum" in (await client.next())["msg"]
 
 
+LEFT = "Wheels[] left\nWheels right" + f"\n{'=' * 80}\nMSG: own/Wheels\nint8 speed"
+RIGHT = LEFT.replace("Wheels[] left", "Wheels left").replace("Wheels right", "Wheels[] right")
+"""Two definitions with one md5sum, because it leaves out the brackets. One right wheel of `RIGHT` reads as one left."""
+
+
+async def next_warning(client: WebSocketClient) -> str:
+    while (frame := await client.next())["op"] != "status":
+        pass
+    return str(frame["msg"])
+
+
+async def test_a_definition_with_the_same_md5sum_changes_nothing_on_another_topic() -> None:
+    """A guest sent its definition first. What clients hear and send, they do with that of the topic's own publisher."""
+    async with door_world() as world:
+        guest, robot = await world.robot("10.0.0.66", "/guest"), await world.robot("10.0.0.3", "/robot")
+        await publishes(guest, "/guest/drive", "own/Drive", LEFT)
+        own = await publishes(robot, "/drive", "own/Drive", RIGHT)
+        client, viewer = await world.client(), await world.client(subprotocols=SUBPROTOCOLS)
+        client.send({"op": "subscribe", "topic": "/guest/drive"})
+        client.send({"op": "advertise", "topic": "/guest/drive", "type": "own/Drive"})
+        world.master.answers["getSystemState"] = [
+            [["/drive", ["/robot"]], ["/guest/drive", ["/guest"]]],
+            [],
+            [],
+        ]
+        world.master.answers["getTopicTypes"] = [["/drive", "own/Drive"], ["/guest/drive", "own/Drive"]]
+        await asyncio.sleep(3)
+        heard: list[Body] = []
+        await robot.subscribe("/drive", lambda body, _header: heard.append(body))
+        for gone in (False, True):
+            if gone:
+                await guest.close()
+                world.nodes.remove(guest)
+                await asyncio.sleep(15)
+            client.send({"op": "subscribe", "topic": "/drive"})
+            client.send({"op": "advertise", "topic": "/drive", "type": "own/Drive"})
+            await asyncio.sleep(2)
+            client.send({"op": "publish", "topic": "/drive", "msg": {"left": {"speed": 5}, "right": []}})
+            await asyncio.sleep(1)
+            assert heard.pop() == b"\x05\0\0\0\0" and not heard
+            assert (await client.next())["msg"] == {"left": {"speed": 5}, "right": []}
+            own.publish(b"\x07\0\0\0\0")
+            assert (await client.next())["msg"] == {"left": {"speed": 7}, "right": []}
+            heard.clear()
+        channels: dict[str, str] = {}
+        while len(channels) < 2:
+            frame = await viewer.next()
+            channels |= {one["topic"]: one["schema"] for one in frame.get("channels", ())}
+        assert channels == {"/drive": RIGHT, "/guest/drive": LEFT}
+        [found] = world.types.take_differing()
+        assert found.name == "own/Drive"
+        assert {found.earlier, found.later} == {("/guest", "/guest/drive"), ("/robot", "/drive")}
+        assert world.types.take_differing() == []
+
+
+@pytest.mark.parametrize("robot_host", ["0", "7"])
+async def test_the_robots_own_definition_comes_before_that_of_a_guest_who_was_first(robot_host: str) -> None:
+    """Without a publisher on the robot's machine, the first one counts until it is gone. All clients get the reason."""
+    async with door_world() as world:
+        world.hosts = {"/guest": "66", "/robot": robot_host}
+        guest, robot = await world.robot("10.0.0.66", "/guest"), await world.robot("10.0.0.3", "/robot")
+        first = await publishes(guest, "/drive", "own/Drive", LEFT)
+        client, late = await world.client(), await world.client()
+        client.send({"op": "subscribe", "topic": "/drive"})
+        await asyncio.sleep(1)
+        first.publish(b"\0\0\0\0\x01")
+        assert (await client.next())["msg"] == {"left": [], "right": {"speed": 1}}
+        own = await publishes(robot, "/drive", "own/Drive", RIGHT)
+        await asyncio.sleep(1)
+        own.publish(b"\x02\0\0\0\0")
+        assert "another definition of own/Drive with the same md5sum are dropped" in await next_warning(
+            client
+        )
+        await asyncio.sleep(1)
+        late.send({"op": "subscribe", "topic": "/drive"})
+        assert "with the same md5sum" in await next_warning(late)
+        for speed in (3, 4):
+            own.publish(bytes([speed]) + bytes(4))
+            first.publish(b"\0\0\0\0" + bytes([speed]))
+            await asyncio.sleep(1)
+        while late.frames.qsize():
+            values = (await late.next())["msg"]
+            assert values["right"] == ([] if robot_host == "0" else {"speed": values["right"]["speed"]}), (
+                values
+            )
+        late.send({"op": "advertise", "topic": "/drive", "type": "own/Drive"})
+        await asyncio.sleep(2)
+        refused = late.frames.qsize() and "publishers of two types" in (await late.next())["msg"]
+        assert refused == (robot_host != "0")
+        await guest.unadvertise("/drive")
+        await asyncio.sleep(1)
+        own.publish(b"\x05\0\0\0\0")
+        while (frame := await late.next())["op"] != "publish" or frame["msg"]["right"] != []:
+            pass
+        assert frame["msg"] == {"left": {"speed": 5}, "right": []}
+
+
+@pytest.mark.parametrize("comes", [True, False])
+async def test_a_client_does_not_publish_a_definition_whose_publisher_is_gone(comes: bool) -> None:
+    async with door_world() as world:
+        guest, robot = await world.robot("10.0.0.66", "/guest"), await world.robot("10.0.0.3", "/robot")
+        heard: list[Body] = []
+        await robot.subscribe("/drive", lambda body, _header: heard.append(body))
+        await publishes(guest, "/drive", "own/Drive", LEFT)
+        client = await world.client()
+        message = {"left": [{"speed": 5}], "right": {"speed": 0}}
+        client.send({"op": "advertise", "topic": "/drive", "type": "own/Drive"})
+        await asyncio.sleep(2)
+        client.send({"op": "publish", "topic": "/drive", "msg": message})
+        await asyncio.sleep(1)
+        assert heard.pop() == b"\x01\0\0\0\x05\0"
+        await guest.unadvertise("/drive")
+        if comes:
+            await publishes(robot, "/drive", "own/Drive", RIGHT)
+        await asyncio.sleep(1 if comes else 15)
+        client.send({"op": "publish", "topic": "/drive", "msg": message})
+        words = "two types" if comes else "the publishers of /drive that define its type are gone"
+        assert words in await next_warning(client)
+        client.send({"op": "publish", "topic": "/drive", "msg": message})
+        again = "Expected `object`" if comes else "no publisher of /drive has been heard"
+        assert again in await next_warning(client)
+        client.send({"op": "publish", "topic": "/drive", "msg": {"left": {"speed": 5}}})
+        await asyncio.sleep(1)
+        assert heard == ([b"\x05\0\0\0\0"] if comes else [])
+
+
 async def test_a_service_that_is_replaced_by_another_type_is_not_called_with_old_bytes() -> None:
     async with door_world() as world:
         robot = await world.robot("10.0.0.3", "/robot")
