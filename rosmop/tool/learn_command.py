@@ -76,7 +76,7 @@ def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definiti
     for survey in surveys:
         own = definitions_by_type(survey.definitions)
         for kind in set(survey.topics.values()) & set(own.message_types) & set(recorded.message_types):
-            if recorded.md5sum(kind) != own.md5sum(kind):
+            if recorded.fingerprint(kind) != own.fingerprint(kind):
                 raise program.usage_error(
                     f"{survey.name} has a different definition of {kind} than the recordings before it"
                 )
@@ -169,7 +169,7 @@ def _needed(learnt: LearningResult, recorded: Definitions) -> list[str]:
         if name in found or name in BUILTINS:
             continue
         try:
-            if own.md5sum(name) == recorded.md5sum(name):
+            if own.fingerprint(name) == recorded.fingerprint(name):
                 continue
         except DefinitionError:
             pass  # not a type of ROS itself

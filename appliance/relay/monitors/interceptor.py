@@ -40,6 +40,8 @@ from appliance.relay.monitors.time_budget import TimeBudgets
 from appliance.relay.report import Reporter
 from appliance.relay.transport.pump import Version
 from rosmop.run.outcomes import MessageSender
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
 from roswire.tcpros import ServiceReply
 
 if TYPE_CHECKING:
@@ -280,7 +282,9 @@ class Interceptor:
         name = monitors.type_of(topic, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
             return ""
-        objection = _other_definition(topic, name, monitors.md5sum(name), header)
+        objection = _other_definition(topic, name, monitors.md5sum(name), header) or _other_text(
+            topic, name, monitors.definitions, header
+        )
         return self._objection(topic, objection, monitors.type_of(topic) is None)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
@@ -473,3 +477,27 @@ def _other_definition(resource: str, name: str, md5sum: str, header: Mapping[str
         f"the specifications define {resource} as [{name}/{md5sum}], but its messages are [{theirs}/{found}];"
         " add the robot's definition to the specifications (in msg/ beside them)"
     )
+
+
+def _other_text(topic: str, name: str, definitions: Definitions, header: Mapping[str, str]) -> str:
+    """Return an objection to a publisher's definition that differs, although it has the same md5sum.
+
+    A definition that is left out, cannot be read, or is far longer than ours, such as a comment of megabytes, says
+    nothing: the md5sum decides.
+    """
+    ours, theirs = definitions.full_text(name), header.get("message_definition", "")
+    if theirs in ("", ours) or len(theirs) > 2 * len(ours) + _LONGER:
+        return ""
+    try:
+        same = Definitions.from_full_text(name, theirs).fingerprint(name) == definitions.fingerprint(name)
+    except DefinitionError:
+        return ""
+    if same:
+        return ""
+    return (
+        f"the specifications and the publisher define {topic} as {name} with the same md5sum, but with other arrays or"
+        " nested types; add the robot's definition to the specifications (in msg/ beside them)"
+    )
+
+
+_LONGER = 1 << 15  # characters of comments

@@ -35,6 +35,7 @@ from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.transport.frames import Batch
+from roswire.standard import standard_definitions
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.support.stated import stated
 from tests.unit.relay.monitors.monitored import (
@@ -81,6 +82,34 @@ def world() -> Iterator[Monitored]:
 def passes_by(relayed: RelayedTopic) -> bool:
     simple = relayed.simple()
     return simple is not None and simple[1] is None
+
+
+TWIST = """a() { event e(double x) /cmd_vel geometry_msgs/Twist '{linear:{x:x}}' { } }"""
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        (("", ""), False),
+        (("Vector3 linear", "Vector3  linear  # forwards"), False),
+        (("Vector3 linear", "Vector3[] linear"), True),
+        (("Vector3 angular", "Vector3[2] angular"), True),
+        (
+            ("MSG: geometry_msgs/Vector3", "MSG: geometry_msgs/Other"),
+            False,
+        ),  # it cannot be read: the md5sum decides
+    ],
+)
+def test_a_definition_with_other_arrays_is_refused_in_spite_of_its_md5sum(
+    world: Monitored, change: tuple[str, str], refused: bool
+) -> None:
+    assert isinstance(world.load(TWIST), SpecificationsTaken)
+    definitions = standard_definitions()
+    text = definitions.full_text("geometry_msgs/Twist").replace(*change)
+    header = {"type": "geometry_msgs/Twist", "md5sum": definitions.md5sum("geometry_msgs/Twist")}
+    objection = world.engine.interceptor.objection("/cmd_vel", header | {"message_definition": text})
+    assert ("with the same md5sum, but with other arrays" in objection) == refused
+    assert world.engine.interceptor.objection("/cmd_vel", header) == ""
 
 
 def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Monitored) -> None:
