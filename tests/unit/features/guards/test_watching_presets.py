@@ -546,9 +546,64 @@ def test_samples_of_a_motion_that_ends_at_a_limit_pass() -> None:
         for at in (*np.arange(0, last - 1e-6, period), last):
             p, *more = _at(parts, at)
             points.append((float(at), [1.5 - (end - p)], *([value] for value in more[: values - 1])))
-        guard.tell("state", state(1.5 - end, names=["elbow"]), now)
-        outcome = guard.tell("command", trajectory(["elbow"], *points), now)
+        guard.tell("state", state(1.5 - end, names=["elbow"]), now * 1000)
+        outcome = guard.tell("command", trajectory(["elbow"], *points), now * 1000)
         assert outcome.result == "passed", (motion, period, ramp, values)
+
+
+def streamed(
+    guard: Guarded, period: int, after: int, ahead: float, *, reports: int = 8, lag: int = 0, moving: int = 1500
+) -> tuple[float, float, int, int]:
+    """Send a point every `period` ms, `after` ms in the future and `ahead` rad beyond the place of a joint then.
+
+    The joint drives straight to the point that passed last, and its place is reported `lag` ms later. Return its place
+    and greatest velocity over 0.5 s, and the numbers of points that were sent and that passed.
+    """
+    place = target = 0.0
+    arrives, sent, passing, places = 0, 0, 0, [0.0]
+    for now in range(1, moving):
+        left = max(arrives - now + 1, 1)
+        place += (target - place) / left
+        places.append(place)
+        if now % reports == 0:
+            guard.tell("state", state(places[max(0, now - lag)], names=["elbow"]), now)
+        if now % period == 0 and now > 100:
+            point = place + ahead
+            sent += 1
+            if guard.tell("command", trajectory(["elbow"], (after / 1000, [point])), now).result == "passed":
+                passing += 1
+                target, arrives = point, now + after
+    fastest = max((places[at] - places[at - 500]) / 0.5 for at in range(500, moving))
+    return place, fastest, sent, passing
+
+
+@pytest.mark.parametrize(
+    ("period", "after", "ahead"),
+    [(2, 1, 0.02), (10, 1, 0.06), (20, 1, 0.14), (20, 20, 0.16), (50, 1, 0.14), (20, 200, 0.74)],
+)
+def test_a_stream_of_points_is_no_faster_than_one_trajectory(period: int, after: int, ahead: float) -> None:
+    """MoveIt Servo and jog nodes send points: each is within `jump`, and the joint must not gain it with each one."""
+    guard = Guarded("joints", low=-100, high=100)
+    _place, fastest, _sent, _passing = streamed(guard, period, after, ahead)
+    assert fastest <= 1.1 * 3.2 + 0.15 / 0.5 + 0.1
+
+
+@pytest.mark.parametrize(
+    ("period", "reports", "lag", "part"),
+    [(4, 2, 4, 1.0), (8, 8, 8, 0.9), (20, 8, 8, 0.1), (20, 8, 8, 1.0), (33, 10, 5, 1.0), (100, 8, 8, 0.5)],
+)
+def test_a_stream_of_points_that_keeps_the_velocity_passes(period: int, reports: int, lag: int, part: float) -> None:
+    guard = Guarded("joints", low=-100, high=100)
+    ahead = part * 3.2 * period / 1000
+    place, _fastest, sent, passing = streamed(guard, period, period, ahead, reports=reports, lag=lag)
+    assert passing == sent and place > 0.9 * part * 3.2 * 1.3
+
+
+def test_a_joint_that_was_moved_by_hand_or_wraps_is_taken_where_it_is() -> None:
+    guard = Guarded("joints")
+    for at, place in ((10, 3.1), (20, -3.1), (30, 0.0), (31, 1.0)):
+        guard.tell("state", state(place, 0), at)
+        assert guard.tell("command", trajectory(JOINTS, (0, [place + 0.1, 0])), at + 1).result == "passed"
 
 
 def test_a_trajectory_needs_the_present_position_of_each_joint() -> None:
