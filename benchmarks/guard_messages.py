@@ -4,23 +4,35 @@ Each preset runs with its defaults in the engine and module of a relay. Each of 
 a robot that stands for two seconds and then drives slowly. A time is the median of the processor time of 2,000 messages
 on that topic, caches warm, without the guard's ticks. Where the last release has the preset, its text runs beside the
 present one, message by message: the ratio is what the changes cost.
+
+With `--deployed`, lone scans of 1,080 rays go from a rospy node to another through an appliance, in turns on a topic
+that no monitor reads, and on one for each preset that reads scans. Before each, a motion is commanded. The delay is
+from `publish` until the callback, and its ratio is to that without a monitor.
 """
 
+import argparse
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 from rosbags.typesys import get_types_from_msg
 
+from appliance.channel.admin import MonitorsWanted
 from appliance.features.guards.presets import PRESETS, Guard, Preset, text_of
 from appliance.features.guards.released import FOLDER, released
+from benchmarks.cold import realtime
+from benchmarks.relay_throughput import HERE
 from rosmop.run.engine import MonitorSet
 from rosmop.run.fast_path import BatchOptions, FastLane
 from rosmop.run.outcomes import MessageSender, Outcome
 from rosmop.tests.acting import STORE, message
+from tests.support.appliance import Appliance
 from tests.support.features.guards.running_guard import DEFINITIONS, on_its_module, part_of
+from tests.support.nodes import PYTHON, RosSession
 
 MESSAGES = 2_000
 STANDING = 100
@@ -195,7 +207,58 @@ def last_release(name: str) -> Preset | None:
     return released(name, max(versions)) if versions else None
 
 
+def deployed(rays: int, scans: int) -> int:
+    reading = [
+        (preset, name)
+        for preset in PRESETS.values()
+        for name, types in preset.topics.items()
+        if name != "command" and types[0] == "sensor_msgs/LaserScan"
+    ]
+    texts = {
+        preset.name: text_of(
+            Guard(
+                preset.name, preset, {"command": f"/{preset.name}_command", name: f"/{preset.name}"},
+                values={"silent": "10"},
+            )
+        )
+        for preset, name in reading
+    }  # fmt: skip
+    topics = ["/none", *(f"/{name}" for name in texts)]
+    with (
+        Appliance(monitors=texts) as appliance,
+        tempfile.TemporaryDirectory() as home,
+        RosSession(appliance.master_uri, Path(home)) as session,
+    ):
+        appliance.rosrv("monitor", "enable", *texts)
+        command = [
+            *realtime(),
+            PYTHON,
+            str(HERE / "nodes" / "stopped_node.py"),
+            str(scans),
+            str(rays),
+            *topics,
+        ]
+        took = session.start(command).wait_for(event="measured", timeout=120 + scans)["took"]
+        faults = {one.name: one.faults for one in appliance.ask(MonitorsWanted()).monitors}
+    for topic in topics:
+        came = [one for one in took[topic] if one is not None]
+        ratio = statistics.median(came) / statistics.median(took["/none"])
+        cuts = statistics.quantiles(came, n=100)
+        sys.stdout.write(
+            f"{topic[1:]:11} {rays} rays: {len(came)} of {scans} came, 50 % {cuts[49]:.2f} ms, 99 % {cuts[98]:.2f} ms,"
+            f" ratio {ratio:.2f}, {faults.get(topic[1:], 0)} faults\n"
+        )
+    return 0
+
+
 def main() -> int:
+    arguments = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    arguments.add_argument("--deployed", action="store_true")
+    arguments.add_argument("--rays", type=int, default=1080)
+    arguments.add_argument("--scans", type=int, default=400)
+    given = arguments.parse_args()
+    if given.deployed:
+        return deployed(given.rays, given.scans)
     sys.stdout.write(
         f"{'preset':11} {'topic':8} {'message':22} {'became':9} {'µs':>7} {'released':>9} {'ratio':>6}\n"
     )

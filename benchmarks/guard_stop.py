@@ -2,18 +2,30 @@
 
 A rospy node commands full speed 50 times a second, and falls silent. The time is from its last call of `publish`
 until the base's callback for the stop, minus the guard's `silent`. With `--busy`, another program keeps a core busy.
+
+With `--drive MINUTES`, a base drives under five guards beside two busy loops, with a scanner of 1,080 rays, while
+guards are loaded and set, nodes fall silent and the appliance restarts. A line says when it moved again after each act,
+and how many scans others lost.
 """
 
 import argparse
+import math
+import os
 import statistics
+import sys
 import tempfile
+import threading
+import time
+from dataclasses import replace
 from pathlib import Path
 
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from benchmarks.cold import realtime
 from benchmarks.published_stop import busy_programs
 from benchmarks.relay_throughput import HERE
+from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
+from tests.support.features.guards.guarded_robot import ACTS, Act, GuardedRobot, Passage, rows
 from tests.support.nodes import PYTHON, RosSession
 
 ALLOWED = 20.0
@@ -34,12 +46,51 @@ def lateness(trials: int, silent: float) -> list[float | None]:
     return found
 
 
+def drives(robot: GuardedRobot) -> None:
+    """Let the base drive."""
+
+
+def drive(minutes: float) -> int:
+    """Drive a base under five guards with an act now and then; return the number of times that something was lost."""
+    presets = ("separation", "zone", "fence", "speed", "deadman")
+    sent = {"sensor_msgs/LaserScan": 15, "geometry_msgs/Twist": 10}
+    guards = [
+        (replace(row, streams=streams), row.guard())
+        for row in rows(1080)
+        if row.preset in presets
+        for streams in [
+            {name: replace(one, hertz=sent.get(one.kind, one.hertz)) for name, one in row.streams.items()}
+        ]
+    ]
+    broken = 0
+    with (
+        Lab("rosrv-drive") as lab,
+        busy_programs(2),
+        Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--api", "off")) as appliance,
+        tempfile.TemporaryDirectory() as home,
+        GuardedRobot(appliance, lab.host("robot", "10.77.0.10/24"), Path(home), guards) as robot,
+    ):
+        print(f"first motion: {robot.moves(0) < math.inf}")
+        robot.lost()  # before the nodes were connected
+        for act in ACTS:
+            threading.Event().wait(60 * minutes / len(ACTS))
+            quiet = Passage(Act(drives), robot.moves(time.monotonic()), robot.lost(), robot.faults(), 0)
+            robot.moves(time.monotonic())
+            for passage in (quiet, robot.after(act)):
+                broken += not passage.holds
+                print(f"{passage}; load {os.getloadavg()[0]:.1f}", flush=True)
+    return broken
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--trials", type=int, default=1000)
     arguments.add_argument("--silent", type=float, default=0.3)
     arguments.add_argument("--busy", action="store_true")
+    arguments.add_argument("--drive", type=float, metavar="MINUTES")
     given = arguments.parse_args()
+    if given.drive:
+        sys.exit(drive(given.drive) > 0)
     with busy_programs(1 if given.busy else 0):
         rows = lateness(given.trials, given.silent)
     late = [one for one in rows if one is not None]

@@ -58,7 +58,7 @@ def deployed(stops: int) -> dict[str, list[float]]:
     ):
         node = session.start([*realtime(), PYTHON, str(HERE / "nodes" / "stopped_node.py"), str(stops)])
         measured = node.wait_for(event="measured", timeout=120 + stops)
-    return {"changed command": measured["changed"], "published stop": measured["stopped"]}
+    return {"changed command": measured["took"]["/drive"], "published stop": measured["took"]["/scan"]}
 
 
 @contextlib.contextmanager

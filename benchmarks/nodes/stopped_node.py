@@ -1,12 +1,14 @@
-"""Measure how late commands and stops arrive, with two rospy nodes (run by Debian's Python): `stopped_node.py COUNT`.
+"""Measure how late messages arrive, with two rospy nodes (run by Debian's Python).
 
-One node publishes in turns a command (`/drive`), which a monitor changes, and a scan (`/scan`), for which a monitor
-publishes a stop (`/cmd_vel`). The other receives both, because a node's messages to itself never leave its process.
-The program prints `{"event": "measured", "changed": [...], "stopped": [...]}`: milliseconds from `publish` until the
-callback.
+`stopped_node.py COUNT`: one node publishes in turns a command (`/drive`), which a monitor changes, and a scan
+(`/scan`), for which a monitor publishes a stop (`/cmd_vel`). The other receives both, because a node's messages to
+itself never leave its process. `stopped_node.py COUNT RAYS TOPIC...`: one node publishes in turns a scan on each topic,
+each after a motion on TOPIC_command. The other receives the scans. The program prints `{"event": "measured", "took":
+{TOPIC: [...]}}`: milliseconds from `publish` until the callback.
 """
 
 import json
+import math
 import os
 import select
 import struct
@@ -22,6 +24,8 @@ PAUSE = 0.007
 LIMIT = 5.0
 ARRIVED = struct.Struct("d")
 NAMES = [word for word in sys.argv if word.startswith("__")]
+COUNT, *WORDS = [word for word in sys.argv[1:] if ":=" not in word]
+STOPS = {"/drive": Twist, "/cmd_vel": Twist}
 
 
 def receive(arrivals):
@@ -29,9 +33,8 @@ def receive(arrivals):
         os.write(arrivals, ARRIVED.pack(time.monotonic()))
 
     rospy.init_node("driving_node", argv=NAMES, anonymous=True, disable_signals=True)
-    subscribers = [
-        rospy.Subscriber(topic, Twist, arrived, tcp_nodelay=True) for topic in ("/drive", "/cmd_vel")
-    ]
+    heard = dict.fromkeys(WORDS[1:], LaserScan) or STOPS
+    subscribers = [rospy.Subscriber(topic, kind, arrived, tcp_nodelay=True) for topic, kind in heard.items()]
     sys.stdin.read()
     del subscribers
 
@@ -42,6 +45,13 @@ def measure(publisher, message, arrivals, patience=LIMIT):
     if not select.select([arrivals], [], [], patience)[0]:
         return None
     return (ARRIVED.unpack(os.read(arrivals, ARRIVED.size))[0] - began) * 1e3
+
+
+def room(rays):
+    """Return a scan of a round scanner in a room of 10 m."""
+    ranges = [5 + ray * 7 % 11 / 100 for ray in range(rays)]
+    step = 2 * math.pi / rays
+    return LaserScan(angle_min=-math.pi, angle_increment=step, range_min=0.1, range_max=30.0, ranges=ranges)
 
 
 def main():
@@ -56,6 +66,12 @@ def main():
     drive = Twist()
     drive.linear.x = 3.0
     messages = {"/drive": drive, "/scan": LaserScan(ranges=[0.1])}
+    if WORDS:
+        messages = dict.fromkeys(WORDS[1:], room(int(WORDS[0])))
+    commands = {
+        topic: rospy.Publisher(f"{topic}_command", Twist, queue_size=10, tcp_nodelay=True)
+        for topic in WORDS[1:]
+    }
     paths = {
         topic: (rospy.Publisher(topic, type(message), queue_size=10, tcp_nodelay=True), message)
         for topic, message in messages.items()
@@ -65,11 +81,15 @@ def main():
             pass
     took = {topic: [] for topic in paths}
     pause = threading.Event()
-    for _ in range(int(sys.argv[1])):
+    motion = Twist()
+    motion.linear.x = 0.2
+    for _ in range(int(COUNT)):
         for topic, path in paths.items():
+            if topic in commands:
+                commands[topic].publish(motion)
             pause.wait(PAUSE)
             took[topic].append(measure(*path, arrivals))
-    print(json.dumps({"event": "measured", "changed": took["/drive"], "stopped": took["/scan"]}), flush=True)
+    print(json.dumps({"event": "measured", "took": took}), flush=True)
 
 
 if __name__ == "__main__":
