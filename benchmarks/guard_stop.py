@@ -68,7 +68,11 @@ def drive(minutes: float) -> int:
         busy_programs(2),
         Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--api", "off")) as appliance,
         tempfile.TemporaryDirectory() as home,
-        GuardedRobot(appliance, lab.host("robot", "10.77.0.10/24"), Path(home), guards) as robot,
+        GuardedRobot(
+            appliance,
+            RosSession(appliance.master_uri, Path(home), lab.host("robot", "10.77.0.10/24")),
+            guards,
+        ) as robot,
     ):
         print(f"first motion: {robot.moves(0) < math.inf}")
         robot.lost()  # before the nodes were connected

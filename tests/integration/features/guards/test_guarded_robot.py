@@ -16,6 +16,7 @@ from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
 from tests.support.features.guards.guarded_robot import ACTS, RAYS, Act, GuardedRobot, Row, rows
 from tests.support.features.guards.running_guard import named
+from tests.support.nodes import RosSession
 from tests.support.rows import require_rows
 
 ROWS = rows()
@@ -40,8 +41,15 @@ def test_each_topic_of_a_preset_has_its_messages() -> None:
     )
 
 
-def survive(robot: GuardedRobot, acts: Sequence[Act]) -> None:
-    with robot:
+@pytest.fixture
+def ros(own_appliance: Appliance, common_robot: Host, tmp_path: Path) -> RosSession:
+    return RosSession(own_appliance.master_uri, tmp_path, common_robot)
+
+
+def survive(
+    appliance: Appliance, ros: RosSession, guards: Sequence[tuple[Row, str]], acts: Sequence[Act]
+) -> None:
+    with GuardedRobot(appliance, ros, guards) as robot:
         assert robot.moves(0) < math.inf, f"the base never moves: {robot.faults()}"
         robot.lost()  # before the nodes were connected
         assert robot.moves(time.monotonic()) < math.inf
@@ -50,38 +58,36 @@ def survive(robot: GuardedRobot, acts: Sequence[Act]) -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])
-def test_a_robot_moves_again_after_each_act(
-    own_appliance: Appliance, common_robot: Host, tmp_path: Path, row: Row
-) -> None:
+def test_a_robot_moves_again_after_each_act(own_appliance: Appliance, ros: RosSession, row: Row) -> None:
     """The base moves within a second, nothing faults, and others lose no message, beside two busy loops."""
     with busy_programs(2):
-        survive(GuardedRobot(own_appliance, common_robot, tmp_path, [(row, row.guard())]), ACTS)
+        survive(own_appliance, ros, [(row, row.guard())], ACTS)
 
 
 @pytest.mark.parametrize("rays", RAYS[:-1])
 @pytest.mark.parametrize("preset", [row.preset for row in SCANNED])
 def test_a_robot_moves_with_each_scanner(
-    own_appliance: Appliance, common_robot: Host, tmp_path: Path, preset: str, rays: int
+    own_appliance: Appliance, ros: RosSession, preset: str, rays: int
 ) -> None:
     row = next(row for row in rows(rays) if row.name in {one.name for one in SCANNED if one.preset == preset})
     with busy_programs(2):
-        survive(GuardedRobot(own_appliance, common_robot, tmp_path, [(row, row.guard())]), FEW)
+        survive(own_appliance, ros, [(row, row.guard())], FEW)
 
 
 @pytest.mark.parametrize(
     ("row", "preset"), OLDER, ids=[f"{row.name}-{preset.version}" for row, preset in OLDER]
 )
 def test_a_robot_moves_behind_the_guards_of_earlier_releases(
-    own_appliance: Appliance, common_robot: Host, tmp_path: Path, row: Row, preset: Preset
+    own_appliance: Appliance, ros: RosSession, row: Row, preset: Preset
 ) -> None:
     """An upgrade of the appliance leaves their texts in force."""
     with busy_programs(2):
-        survive(GuardedRobot(own_appliance, common_robot, tmp_path, [(row, row.guard(preset))]), FEW)
+        survive(own_appliance, ros, [(row, row.guard(preset))], FEW)
 
 
 @pytest.mark.real
-def test_a_large_scanner_stops_no_robot(own_appliance: Appliance, common_robot: Host, tmp_path: Path) -> None:
+def test_a_large_scanner_stops_no_robot(own_appliance: Appliance, ros: RosSession) -> None:
     """`separation` and `zone` together judge 1,650 rays from the first scan on, and navigation gets each scan."""
     guards = [(row, row.guard()) for row in SCANNED if row.preset in {"separation", "zone"}]
     acts = [replace(act, within=math.inf) for act in FEW if act.name != "silence"]
-    survive(GuardedRobot(own_appliance, common_robot, tmp_path, guards), acts)
+    survive(own_appliance, ros, guards, acts)

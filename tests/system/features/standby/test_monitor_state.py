@@ -1,11 +1,15 @@
+import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from appliance.channel import admin
 from examples.landshark.lab import Lab
 from tests.integration.monitors.test_emergency_stop import STOP
+from tests.support.features.guards.guarded_robot import PATIENCE, GuardedRobot, rows
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
@@ -57,3 +61,19 @@ def test_a_latched_stop_stays(site: StandbySite, takeover: str) -> None:
         assert not monitor(site, "b")["held"]
         ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: false")
         listener.wait_for_count(seen + 3, event="received")
+
+
+@pytest.mark.parametrize("takeover", ["switchover", "power cut"])
+def test_a_guarded_base_moves_again(site: StandbySite, takeover: str) -> None:
+    guards = [(row, row.guard()) for row in rows() if row.preset in {"separation", "zone"}]
+    with GuardedRobot(site.appliances["a"], site.ros(), guards) as robot:
+        assert robot.moves(0) < math.inf
+        if takeover == "switchover":
+            site.promote("a")
+        else:
+            site.cut("a")
+        eventually(lambda: site.holder() == "b", site.story)
+        robot.appliance = site.appliances["b"]
+        eventually(lambda: all(one.enabled for one in robot.ask(admin.MonitorsWanted()).monitors), site.story)
+        assert robot.moves(time.monotonic()) <= PATIENCE
+        assert not robot.faults()
