@@ -8,16 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.guards.presets import FOLDER, PRESETS, Preset
+from appliance.features.guards.presets import PRESETS, Preset
 from appliance.features.guards.released import FOLDER as RELEASED
 from appliance.features.guards.released import released
 from benchmarks.published_stop import busy_programs
 from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
 from tests.support.features.guards.guarded_robot import ACTS, RAYS, Act, GuardedRobot, Row, rows
-from tests.support.features.guards.running_guard import named
 from tests.support.nodes import RosSession
-from tests.support.rows import require_rows
 
 ROWS = rows()
 FEW = [act for act in ACTS if act.name in {"load", "malformed", "silence"}]
@@ -30,15 +28,6 @@ OLDER = [
     and (preset := released(row.preset, int(path.stem.rpartition("-")[2]))).version
     < PRESETS[row.preset].version
 ]
-
-
-@pytest.mark.complete
-def test_each_topic_of_a_preset_has_its_messages() -> None:
-    topics = {f"{path.stem} {name}" for path in FOLDER.glob("*.rv") for name in named(path.stem).given_topics}
-    streams = {f"{row.preset} {name}" for row in ROWS for name in row.streams}
-    require_rows(
-        topics - {"answer cancel"}, streams, "rows in tests/support/features/guards/guarded_robot.py"
-    )
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import covering
+from tests.support.features.guards.guarded_robot import rows
 from tests.support.features.guards.running_guard import DEFINITIONS
 from tests.support.rows import require_rows
 
@@ -217,3 +218,15 @@ def test_a_mistyped_type_is_answered_with_the_nearest() -> None:
     )
     with pytest.raises(GuardError, match=r"did you mean geometry_msgs/Twist\?"):
         text_of(guard)
+
+
+@pytest.mark.complete
+def test_each_preset_is_tried_in_an_appliance() -> None:
+    """Each of its topics has the messages of a robot."""
+    topics = {
+        f"{path.stem} {name}" for path in FOLDER.glob("*.rv") for name in Preset(path.stem).given_topics
+    }
+    streams = {f"{row.preset} {name}" for row in rows() for name in row.streams}
+    require_rows(
+        topics - {"answer cancel"}, streams, "rows in tests/support/features/guards/guarded_robot.py"
+    )
