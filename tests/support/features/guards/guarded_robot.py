@@ -367,7 +367,7 @@ def another_node(robot: GuardedRobot) -> None:
     for name, preset in robot.presets.items():
         if "forget" in {one.name for one in preset.parameters}:
             robot.ask(GuardSet(name, {"forget": str(robot.forgotten)}))
-        elif preset.name == "withhold":  # it withholds until the switch is back, or it begins again
+        elif preset.name in WAIT:
             load(robot)
 
 
@@ -389,6 +389,8 @@ def restart(robot: GuardedRobot) -> None:
     robot.appliance.start()
 
 
+WAIT = {"arm", "joints", "withhold"}
+"""Presets that wait for a node that is gone until they begin again, `arm` for as long as a check counts."""
 ACTS = (
     Act(load), Act(reload), Act(resume), Act(disable), Act(shadow), Act(set_value), Act(malformed), Act(silence),
     Act(another_node, within=2.0), Act(kill_relay, within=2.0, cuts=True),
