@@ -17,6 +17,7 @@ import tempfile
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 from appliance.features.guards.presets import PRESETS, Guard, text_of
@@ -47,7 +48,7 @@ def lateness(trials: int, silent: float) -> list[float | None]:
 
 
 def drives(robot: GuardedRobot) -> None:
-    """Let the base drive."""
+    """Let the base drive; the seconds are the longest without a motion."""
 
 
 def drive(minutes: float) -> int:
@@ -77,8 +78,11 @@ def drive(minutes: float) -> int:
         print(f"first motion: {robot.moves(0) < math.inf}")
         robot.lost()  # before the nodes were connected
         for act in ACTS:
+            began = time.monotonic()
             threading.Event().wait(60 * minutes / len(ACTS))
-            quiet = Passage(Act(drives), robot.moves(time.monotonic()), robot.lost(), robot.faults(), 0)
+            moved = [event["at"] for event in robot.base.seen(event="moves") if event["at"] > began]
+            stood = max((later - earlier for earlier, later in pairwise(moved)), default=math.inf)
+            quiet = Passage(Act(drives), stood, robot.lost(), robot.faults(), 0)
             robot.moves(time.monotonic())
             for passage in (quiet, robot.after(act)):
                 broken += not passage.holds
