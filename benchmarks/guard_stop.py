@@ -26,7 +26,15 @@ from benchmarks.published_stop import busy_programs
 from benchmarks.relay_throughput import HERE
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
-from tests.support.features.guards.guarded_robot import ACTS, Act, GuardedRobot, Passage, rows
+from tests.support.features.guards.guarded_robot import (
+    ACTS,
+    VELOCITY,
+    Act,
+    GuardedRobot,
+    Passage,
+    rows,
+    scans,
+)
 from tests.support.nodes import PYTHON, RosSession
 
 ALLOWED = 20.0
@@ -54,14 +62,15 @@ def drives(robot: GuardedRobot) -> None:
 def drive(minutes: float) -> int:
     """Drive a base under five guards with an act now and then; return the number of times that something was lost."""
     presets = ("separation", "zone", "fence", "speed", "deadman")
-    sent = {"sensor_msgs/LaserScan": 15, "geometry_msgs/Twist": 10}
+    commands = replace(VELOCITY, hertz=10, frames=VELOCITY.frames[1:4])
+    streams = {VELOCITY.kind: commands, "sensor_msgs/LaserScan": replace(scans(1080), hertz=15)}
     guards = [
-        (replace(row, streams=streams), row.guard())
+        (
+            replace(row, streams={name: streams.get(one.kind, one) for name, one in row.streams.items()}),
+            row.guard(),
+        )
         for row in rows(1080)
         if row.preset in presets
-        for streams in [
-            {name: replace(one, hertz=sent.get(one.kind, one.hertz)) for name, one in row.streams.items()}
-        ]
     ]
     broken = 0
     with (
