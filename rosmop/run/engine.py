@@ -746,8 +746,13 @@ class MonitorSet:
                 self._silent[topic] = lane.prepare(loud=True, told=[True] * len(lane.events))
             return self._silent[topic]._replace(source=sender.source)
 
-        taken = self.process_fast(topic, buffer, time_ns, silent)
-        return self.process(topic, buffer, time_ns, sender) if taken is None else taken
+        lane = self.lane(topic)
+        if lane is None or not self.lane_ready(lane, time_ns):
+            return self.process(topic, buffer, time_ns, sender)
+        taken = lane.process_message(buffer, time_ns, silent(lane))
+        if taken is not None:
+            return taken
+        return self.process(topic, buffer, time_ns, sender, tried="over" if lane.exhausted else "left")
 
     def process_fast(
         self,

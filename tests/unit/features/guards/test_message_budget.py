@@ -193,7 +193,7 @@ LARGEST = {
         "trajectory_msgs/JointTrajectory", joint_names=JOINTS, points=POINTS
     ),
     "sensor_msgs/Image": message(
-        "sensor_msgs/Image", height=240, width=640, step=1920, data=[7] * (240 * 1920)
+        "sensor_msgs/Image", height=480, width=640, step=1920, data=[7] * (480 * 1920)
     ),
 }
 """The largest honest messages; those of other types are small."""
