@@ -350,8 +350,9 @@ class MonitorSet:
         A monitor that exceeds the bound faults. It also holds for ticks, deadlines, and monitors in shadow
         mode.
         """
-        for part in (self, *self.shadows):
-            part.interpreter.turn.limit(clock, seconds)
+        self.interpreter.turn.limit(clock, seconds)
+        for shadow in self.shadows:  # other messages wait for it
+            shadow.interpreter.turn.limit(clock, seconds, 0)
 
     def hurry(self, part: float) -> None:
         self.interpreter.turn.part = part

@@ -100,18 +100,24 @@ class ActionState:
     seconds: float = inf
     part: float = 1.0  # the usable fraction of `seconds`
     until: float = inf
+    permitted: int = 0
     least: float = inf
     """The instructions and elements after which the time counts, and those of this message so far (`spent`)."""
     spent: int = 0
 
-    def limit(self, clock: Callable[[], float], seconds: float) -> None:
-        """Limit the processor time (seconds) of each message, tick or deadline, starting with the next."""
-        self.clock, self.seconds = clock, seconds
+    def limit(
+        self, clock: Callable[[], float], seconds: float, permitted: int = INSTRUCTIONS_PER_SECOND
+    ) -> None:
+        """Limit the processor time (seconds) of each message, tick or deadline, starting with the next.
+
+        Each second permits that many instructions, even if they take longer.
+        """
+        self.clock, self.seconds, self.permitted = clock, seconds, permitted
 
     def begin(self) -> None:
         if self.clock is not None:
             self.until = self.clock() + self.seconds * self.part
-            self.least, self.spent = INSTRUCTIONS_PER_SECOND * self.seconds * self.part, 0
+            self.least, self.spent = self.permitted * self.seconds * self.part, 0
 
     def late(self, more: int = 0) -> bool:
         """Whether the time is over, or will be after `more` instructions."""
