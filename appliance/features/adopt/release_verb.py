@@ -2,10 +2,12 @@
 
 import asyncio
 import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
+import structlog
 import typer
 
 from appliance.base.counted import counted
@@ -60,6 +62,8 @@ def release(
         raise usage_error("the rules and sockets of this machine need root: run it with sudo", verb=_VERB)
     try:
         if dead:
+            # A reader of standard output that has ended (head) must not end it between two steps.
+            structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
             report = asyncio.run(release_dead(state))
         else:
             if not force:
