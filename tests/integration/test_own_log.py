@@ -5,6 +5,7 @@ import fcntl
 import io
 import os
 import subprocess
+import sys
 import threading
 import xmlrpc.client
 from collections.abc import Callable, Iterator, Sequence
@@ -143,3 +144,34 @@ def test_every_process_is_started_again(kind: Kind) -> None:
         appliance.recorded("--event", "policy loaded", count=2)
         if kind is with_a_stopped_reader:
             eventually(lambda: "process died" in said() or None, said)
+
+
+_LOGS = {
+    "appliance": "from appliance.supervisor.logs import configure_logs; configure_logs('tester')",
+    "collector": "from rosrv_fleet.output import configure_log; configure_log()",
+    "witness": (
+        "import time; from appliance.features.standby.witness.enforcement import BoundedLog, write_error;"
+        " BoundedLog(write_error, time.monotonic).add('no firewall')"
+    ),
+}
+_REPORTS = """
+import logging, threading, warnings, structlog
+structlog.get_logger().error("own")
+logging.getLogger("library").error("foreign")
+warnings.warn("odd")
+thread = threading.Thread(target=lambda: 1 / 0)
+thread.start()
+thread.join()
+print("goes on")
+"""
+
+
+@pytest.mark.parametrize("program", _LOGS)
+def test_nothing_that_reports_fails_without_room(program: str) -> None:
+    reports = _REPORTS if program != "witness" else 'print("goes on")'
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", f"{_LOGS[program]}\n{reports}"],
+            stdout=subprocess.PIPE, stderr=full, text=True, check=False,
+        )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "goes on\n")
