@@ -115,7 +115,7 @@ PARTS: dict[str, Part] = {
     "values": Part([("guard", "set", "speed", "vMax=0.2")], fastest),
     "loaded specifications": Part([("monitor", "load", "loaded.rv")], lambda one: "loaded" in states(one)),
     "policy revisions": Part([("policy", "reload")], names("policy", "revisions", of="revision")),
-    "blocks": Part([("host", "block", "10.77.0.99", "--for", "1h")], names("host", "blocks", of="host")),
+    "blocks": Part([("host", "block", "10.77.0.99", "--for", "1h")], names("host", "blocks", of="address")),
     "tokens": Part([("token", "add", "eve", "--for", "1d")], names("token", "list", of="name")),
     "doors": Part([("door", "add", "eve")], names("door", "list", of="name")),
     "registrations": Part([], parameter),
