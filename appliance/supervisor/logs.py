@@ -1,5 +1,9 @@
-"""Configure the logs of all processes: on standard error, readable on a terminal, otherwise JSON."""
+"""Configure the logs of all processes: on standard error, readable on a terminal, otherwise JSON.
 
+A terminal gets no control characters, because names and reasons come from the network.
+"""
+
+import io
 import logging
 import sys
 from typing import Any, TextIO, cast
@@ -27,7 +31,7 @@ def configure_logs(process: str) -> None:
         structlog.processors.TimeStamper(fmt="%H:%M:%S" if human else "iso", utc=not human),
     ]
     renderer: list[structlog.typing.Processor] = (
-        [structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)]
+        [_printable, structlog.dev.ConsoleRenderer(exception_formatter=_traceback)]
         if human
         else [structlog.processors.ExceptionRenderer(_transform), structlog.processors.JSONRenderer()]
     )
@@ -52,6 +56,20 @@ def _lost(lines: int, since: str) -> str:
     """Return a line of the log, which the caller writes."""
     log = structlog.wrap_logger(structlog.ReturnLogger())
     return f"{log.warning(f'lines of the log were lost since {since}', lines=lines)}\n"
+
+
+def _printable(_logger: Any, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    return {name: _shown(value) if isinstance(value, str) else value for name, value in event.items()}
+
+
+def _traceback(stream: TextIO, error: structlog.typing.ExcInfo) -> None:
+    written = io.StringIO()
+    structlog.dev.plain_traceback(written, error)
+    stream.write("\n".join(map(_shown, written.getvalue().split("\n"))))
+
+
+def _shown(text: str) -> str:
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def write_line(text: str, stream: TextIO) -> None:

@@ -14,6 +14,7 @@ COLUMNS = (
     "time", "sequence", "id", "event", "severity", "decision", "host", "caller_id", "category", "resource", "section",
     "key", "file", "line", "reason", "detail",
 )  # fmt: skip
+_END = "\r\n"
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -44,5 +45,5 @@ def _harmless(cell: str) -> str:
 
 def _line(cells: Iterable[str]) -> str:
     line = io.StringIO()
-    csv.writer(line, lineterminator="").writerow(cells)
-    return line.getvalue()
+    csv.writer(line, lineterminator=_END).writerow(cells)  # it quotes a cell with characters of the line's end
+    return line.getvalue().removesuffix(_END)
