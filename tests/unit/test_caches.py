@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from distribution.fact_cache import facts_of_files
+from tests.support.rows import require_rows
 from tests.support.sources import LANGUAGE_TESTS, ROOT
 
 FOLDERS = ("appliance", "roswire", "rosmop", "fleet/rosrv_fleet")
@@ -126,8 +127,10 @@ BY_HAND = {
     "appliance/features/doors/foxglove.py::_channels": "if len(self._channels) >= self._limits.channels",
     "appliance/features/doors/foxglove.py::_parameters": "if len(self._parameters) >= self._limits.parameters",
     "appliance/features/doors/fragments.py::_frames": "if self._bytes > self._most_bytes",
+    "appliance/features/doors/heard_topic.py::told": "len(self.told) >= _MOST_TOLD",
     "appliance/features/doors/known_types.py::_failed": "while len(self._failed) > _MOST_FAILURES",
     "appliance/features/doors/known_types.py::_kept": "while self.bytes > self._most",
+    "appliance/features/doors/known_types.py::_read": "while len(self._read) > _MOST_READ",
     "appliance/features/doors/message_reader.py::_made": TEXT,
     "appliance/features/doors/message_writer.py::made": TEXT,
     "appliance/features/doors/rosbridge.py::_advertised": "_check_room(self._advertised, ",
@@ -200,6 +203,39 @@ BY_HAND = {
     "roswire/node/ros_node.py::subscribers": OPEN,
 }
 """The rule of each dictionary, or the text of its module that bounds it: then others make room, or it is refused."""
+WHOLE = "its key has everything that its value depends on"
+HOST = "its value is of the host, address or policy that is the key, and no content"
+CLIENT = "it is of one connection, which chooses its own keys"
+COUNTED = "its value counts or shortens reports; each is decided without it"
+KEYED = {
+    "appliance/audit/log/folding.py::_due": COUNTED,
+    "appliance/audit/log/folding.py::_kinds": COUNTED,
+    "appliance/control/rest/rest_proof.py::_taken": WHOLE,  # a challenge, which control makes and signs
+    "appliance/features/doors/door_parameters.py::_reads": CLIENT,
+    "appliance/features/doors/door_processes.py::_host_numbers": HOST,
+    "appliance/features/doors/foxglove.py::_channels": CLIENT,
+    "appliance/features/doors/foxglove.py::_parameters": CLIENT,
+    "appliance/features/doors/fragments.py::_frames": CLIENT,
+    "appliance/features/doors/heard_topic.py::told": COUNTED,
+    "appliance/features/doors/known_types.py::_failed": WHOLE,  # the name, the md5sum and the whole definition
+    "appliance/features/doors/known_types.py::_kept": WHOLE,  # as `_failed`, or the message itself
+    "appliance/features/doors/known_types.py::_read": WHOLE,  # as `_failed`
+    "appliance/features/doors/rosbridge.py::_advertised": CLIENT,
+    "appliance/features/doors/rosbridge.py::_subscriptions": CLIENT,
+    "appliance/features/recorder/recording_plan.py::_begun": HOST,
+    "appliance/features/recorder/recording_plan.py::_open": HOST,
+    "appliance/features/topics/topic_looks.py::_shown": COUNTED,
+    "appliance/master/endpoints/delivery.py::_used": WHOLE,  # the address that is called
+    "appliance/master/endpoints/node_ports.py::_routes": HOST,
+    "appliance/policy/policy.py::standings": HOST,
+    "appliance/relay/loop.py::_payers": HOST,
+    "appliance/relay/monitors/host_mask.py::_known": WHOLE,
+    "appliance/relay/monitors/observation_points.py::_numbers": WHOLE,
+    "appliance/relay/monitors/observations.py::_told": COUNTED,
+    "appliance/specifications/episodes.py::_known": COUNTED,
+    "rosmop/logics/parsing.py::_shapes": WHOLE,
+}
+"""Why no peer can make the key of a bounded dictionary for another content, which would then be taken for the first."""
 RULES_BY_HAND = {OPEN, LOCKS, TEXT, ANSWER, ONE_EACH, OURS_ONLY, NO_CACHE}
 OF_OPERATORS = re.compile(
     r"appliance/(api/console|cli|configuration)/|rosmop/(batch|certify|check|fast|form|learn|recordings|tool|types)/"
@@ -289,6 +325,12 @@ def test_each_dictionary_that_is_asked_and_filled_has_its_rule() -> None:
         one for one, rule in BY_HAND.items() if rule not in RULES_BY_HAND and found[one].count(rule) == 0
     ]
     assert lacking == [], "the module has not this bound any longer"
+
+
+def test_each_bounded_dictionary_says_why_no_content_is_taken_for_another() -> None:
+    """Functions with a cache need no row: their key has all their arguments."""
+    bounded = {one for one, rule in BY_HAND.items() if rule not in RULES_BY_HAND}
+    require_rows(bounded, KEYED, "KEYED in tests/unit/test_caches.py")
 
 
 @pytest.mark.parametrize(

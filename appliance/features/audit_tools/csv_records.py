@@ -45,5 +45,7 @@ def _harmless(cell: str) -> str:
 
 def _line(cells: Iterable[str]) -> str:
     line = io.StringIO()
-    csv.writer(line, lineterminator=_END).writerow(cells)  # it quotes a cell with characters of the line's end
+    csv.writer(line, lineterminator=_END).writerow(
+        cells
+    )  # it quotes a cell with characters of the line's end
     return line.getvalue().removesuffix(_END)

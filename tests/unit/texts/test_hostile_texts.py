@@ -279,7 +279,7 @@ FEEDS: dict[str, Feed | str] = {
 
 @pytest.mark.complete
 def test_each_entrance_is_fed() -> None:
-    require_rows(CELLS, FEEDS, "FEEDS in tests/unit/test_hostile_texts.py")
+    require_rows(CELLS, FEEDS, "FEEDS in tests/unit/texts/test_hostile_texts.py")
 
 
 @texts
