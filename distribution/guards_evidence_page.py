@@ -157,6 +157,7 @@ EVIDENCE: Mapping[str, Evidence] = {
             "test_the_curve_of_a_controller_keeps_the_limits_of_joints",
             "test_samples_of_a_motion_that_ends_at_a_limit_pass",
             "test_a_trajectory_needs_the_present_position_of_each_joint",
+            "test_a_stream_of_points_is_no_faster_than_one_trajectory",
         ),
     ),
     "rate": Evidence(
@@ -223,7 +224,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     ),
     "zone": Evidence(
         ("IEC 61496-3, scanners", "ISO 13855, approach of persons"),
-        "`points` rays that end in the zone, in that scan; a scanner that is silent for `silent`",
+        "`points` rays that end in the zone or before it, at most 20 ms after that scan; a scanner that is silent for `silent`",
         "silent",
         (
             "the zone covers the way of the base until it stands, and of a person who approaches",
@@ -237,6 +238,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         unit=(
             "test_a_thing_in_the_zone_stops_the_base_until_it_is_clear_and_zero_is_commanded",
             "test_a_scan_that_does_not_see_the_zone_stops",
+            "test_a_zone_that_a_thing_before_it_hides_is_not_free",
         ),
     ),
     "withhold": Evidence(

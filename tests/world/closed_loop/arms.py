@@ -5,6 +5,7 @@ Between two points it drives the curve of joint_trajectory_controller, and to th
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -16,6 +17,8 @@ from tests.world.closed_loop.world import COMMAND, NEVER, World
 JOINTS: Sequence[str] = ("shoulder", "elbow", "wrist")
 TRAJECTORY = "trajectory_msgs/JointTrajectory"
 _NEAR = 1e-6
+WINDOW = 500
+"""The milliseconds in which a joint gains at most one jump."""
 OVERSHOOT = 1.1
 """How much of `vMax` a curve between two points may have."""
 
@@ -132,7 +135,12 @@ class JointsWorld(World):
                 lambda node=node, names=names: self._report(node, names),  # type: ignore[misc]  # as above
                 first=r.uniform(0, 200),
             )
-        self.every(lambda: r.uniform(300, 1200), self._command, first=600)
+        self.trail: deque[tuple[int, list[float]]] = deque(maxlen=WINDOW // 10)
+        """When the joints were where, in the last `WINDOW`."""
+        if r.random() < 0.3:
+            self._stream()
+        else:
+            self.every(lambda: r.uniform(300, 1200), self._command, first=600)
         if not self.live:
             self.after(r.uniform(1000, 6000), self._fails)
             self.with_second()
@@ -231,12 +239,36 @@ class JointsWorld(World):
                 return made
         return points
 
+    def _stream(self) -> None:
+        """Let a node send points one by one, as MoveIt Servo does: below `vMax`, or with a jump each time."""
+        r = self.random
+        period, after = r.choice((10, 20, 50, 100)), 200 if self.live else r.choice((1, 20, 200))
+        ahead = self.fastest * after / 1000
+        ahead = 0.5 * ahead if self.live else r.choice((0.5 * ahead, ahead, ahead + 0.9 * self.jump))
+        ways = [r.choice((-1, 1)) for _ in JOINTS]
+
+        def point() -> None:
+            for joint, place in enumerate(self.place):
+                if abs(place) > 0.6 * self.most:
+                    ways[joint] = -1 if place > 0 else 1
+            places = (place + way * ahead for place, way in zip(self.place, ways, strict=True))
+            self._send(
+                "",
+                JOINTS,
+                [Point(after / 1000, tuple(max(-self.most, min(self.most, one)) for one in places))],
+            )
+
+        self.every(lambda: period, point, first=600)
+
     def _command(self) -> None:
         r = self.random
         bad = "" if self.live else r.choice(("", "", "", *DAMAGE))
         names, points = DAMAGE[bad](self, self._good()) if bad else (JOINTS, self._good())
         if r.random() < 0.05:
             names, points, bad = JOINTS, [], "empty"
+        self._send(bad, names, points)
+
+    def _send(self, bad: str, names: Sequence[str], points: list[Point]) -> None:
         self.trace(f"a trajectory of {len(points)} points: {bad or 'good'}")
         data = trajectory(self.now, names, points)
         passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, self.commander)
@@ -295,6 +327,13 @@ class JointsWorld(World):
         self.place = [*before.positions]
 
     def watch(self) -> None:
+        self.trail.append((self.now, [*self.place]))
+        began, before = self.trail[0]
+        most = self.jump + OVERSHOOT * self.fastest * ((self.now - began) / 1000 + 0.02)
+        if not self.switched_off and began > self.fresh_from + 100:
+            for place, one in zip(self.place, before, strict=True):
+                if not abs(place - one) <= most:
+                    self.broken("L3", f"a joint moves from {one:.3f} to {place:.3f} rad since {began} ms")
         if not self.switched_off and any(not abs(one) <= self.most + _NEAR for one in self.place):
             self.broken("L1", f"a joint is out of its limits: {self.place}")
 

@@ -30,6 +30,18 @@ def is_inside(corners: Sequence[Point], x: float, y: float) -> bool:
     return found
 
 
+def are_inside(corners: Sequence[Point], x: "np.ndarray", y: "np.ndarray", margin: float) -> "np.ndarray":
+    """Return which points are inside a polygon, `margin` away from its edge."""
+    found, apart = np.zeros(x.shape, bool), np.full(x.shape, np.inf)
+    for ax, ay, bx, by in edges(corners):
+        dx, dy = bx - ax, by - ay
+        part = np.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0, 1)
+        apart = np.minimum(apart, np.hypot(x - ax - part * dx, y - ay - part * dy))
+        if dy:
+            found ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) * dx / dy)
+    return found & (apart > margin)
+
+
 def depth(corners: Sequence[Point], x: float, y: float) -> float:
     """Return the distance to the edge of a polygon, negative outside of it."""
     least = min(math.dist((x, y), nearest_on(edge, x, y)) for edge in edges(corners))

@@ -142,7 +142,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "separation takes NaN for far": Fault("L2", "separation", replaced(r"\? 0 : -1;", "? 0 : far;")),
     "separation does not ask whether rays cover its way": Fault(
-        "L2", "separation", replaced(r"!covers\(from, to\)", "false")
+        "L2", "separation", replaced(r"&& covers\(from, to\)", "")
     ),
     "sensor takes a blind scan": Fault(
         "L2", "sensor", replaced(r"valid > 0 && valid >= least \* values.size\(\)", "true")
@@ -252,7 +252,8 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L2", "standstill", "hears no silence", r"sinceMeasure <= silent &&", ""),
     ("L2", "zone", "hears no silence", r"!\(sinceScan <= silent\) \|\|", ""),
     ("L2", "zone", "takes NaN for free", r"blankIsFree && !\(r < 0\)", "!(r < 0)"),
-    ("L2", "zone", "does not ask whether rays cover it", r"valid && covers\([^)]*\)\)", "valid"),
+    ("L2", "zone", "does not ask whether rays cover it", r"whole = covers\(\);", "whole = true;"),
+    ("L2", "zone", "takes a zone behind a thing for free", r"r > far \|\| r < own", "r > far || r < 0.4"),
     ("L2", "agree", "hears no silence", r"since <= silent && sinceOther <= silent", "true"),
     ("L2", "arm", "hears no silence", r"battery <= silent &&", ""),
     ("L2", "sensor", "hears no silence", r"since <= silent &&", ""),
@@ -263,8 +264,9 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L3", "overspeed", "does not stop at a measurement", r"(?s)(fast = true;\s*passed = false;\s*)STOP;", r"\1"),
     ("L3", "standstill", "waits twice as long", r"now - since <= settle", "now - since <= 2 * settle"),
     ("L3", "standstill", "stops once", r"pause == 0 && !slow && age\(measure\) <= silent", "false"),
-    ("L3", "zone", "does not stop at a scan", r"(?s)(rays end in the zone[^}]*?)STOP;", r"\1"),
-    ("L3", "joints", "permits any jump", r"fabs\(p - positions(Too)?\[row(Too)?\]\) <= jump", "0 <= jump"),
+    ("L3", "zone", "judges no tick", r"(?s)(rays count[^}]*?)STOP;", r"\1"),
+    ("L3", "joints", "permits any jump", r"jump \+ vMax|- jump(?=.*;)", "+ 100"),
+    ("L3", "joints", "grants a jump with each point", r"<= 3 \* jump \?", "< -1e9 ?"),
     ("L3", "fence", "judges no tick", r"lastV > 0 && \(!\(age\(pose\)", "false && (!(age(pose)"),
     ("L3", "rate", "drops a stop", r"if \(moves && !slower &&", "if (!slower &&"),
     ("L4", "enable", "has one device", r"node = caller\(device\)", 'node = "a device"'),

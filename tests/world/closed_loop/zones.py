@@ -1,7 +1,7 @@
-"""Worlds of `zone`: a base with a square zone around it, which covers its way until it stands."""
+"""Worlds of `zone`: a base with a square zone around it, which covers its way until it stands, or with any polygon."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -9,9 +9,12 @@ import numpy as np
 from tests.support.features.guards.running_guard import Value
 from tests.world.closed_loop import geometry
 from tests.world.closed_loop.bases import DIFFERENTIAL, OMNIDIRECTIONAL, STEERED
+from tests.world.closed_loop.geometry import Point
 from tests.world.closed_loop.messages import SCAN, STILL, Legs, boolean, straight
-from tests.world.closed_loop.motion import WHOLE, Person, SeparationWorld
+from tests.world.closed_loop.motion import PERSON_RADIUS, WHOLE, Person, SeparationWorld
 from tests.world.closed_loop.world import NEVER, SLACK, void
+
+FRONT: Sequence[Point] = ((0.1, -0.4), (1, -0.4), (1, 0.4), (0.1, 0.4))
 
 MUTED = 2.0
 """Seconds of the longest muting."""
@@ -44,9 +47,16 @@ class ZoneWorld(SeparationWorld):
         """Half a side of the zone."""
         self.muted_from, self.muted_until = -NEVER, NEVER
         self.occupied_at, self.occupied = NEVER, False
+        self.occupied_since: int | None = None
+        """When the first scan with something in the zone arrived that no free one has followed."""
         self.scan_occupied = False
         """Whether the scan that is made now surely has something in the zone."""
         self.ready: set[int] = set()
+        self.around = r.random() < 0.5
+        """Whether the zone is the square, which protects the base."""
+        self.corners = (
+            FRONT if self.live and not self.around else self._square() if self.around else self._any()
+        )
         if self.live:
             self.half, self.honest, self.span = 1.0, (0.3, 1.2), 6000
             self.walls = geometry.edges([(-5, -5), (9, -5), (9, 5), (-5, 5)])
@@ -56,7 +66,7 @@ class ZoneWorld(SeparationWorld):
         mutes = self.alone == "mute" or (not self.live and r.random() < 0.2)
         values: dict[str, Value] = {
             "slow": self.slow, "points": self.points, "silent": self.silent, "clear": self.clear,
-            "muteFor": MUTED if mutes else 0.0, "polygon": self._square(),
+            "muteFor": MUTED if mutes else 0.0, "polygon": " ".join(f"{x},{y}" for x, y in self.corners),
         }  # fmt: skip
         self.guarded(values, {"by": SCAN})
         self.scanner(r.uniform(25, self.silent * 850), delay)
@@ -74,10 +84,25 @@ class ZoneWorld(SeparationWorld):
         self.with_second()
         self.interrupt(0.25)
 
-    def _square(self) -> str:
-        far = round(self.half, 2)
-        self.half = far
-        return " ".join(f"{x},{y}" for x, y in ((far, -far), (far, far), (-far, far), (-far, -far)))
+    def _square(self) -> Sequence[Point]:
+        far = self.half = 1.0 if self.live else round(self.half, 2)
+        return ((far, -far), (far, far), (-far, far), (-far, -far))
+
+    def _any(self) -> Sequence[Point]:
+        """Return corners in turn around a point, so that no edges cross: before, around or beside the scanner."""
+        r = self.random
+        away, angle, sides = (
+            r.choice((0.0, r.uniform(0.3, 2.5))),
+            r.uniform(-math.pi, math.pi),
+            r.randrange(3, 9),
+        )
+        corners = []
+        for side in range(sides):
+            turned, radius = angle + (side + r.uniform(0.1, 0.9)) * 2 * math.pi / sides, r.uniform(0.3, 1.5)
+            x, y = radius * math.cos(turned), radius * math.sin(turned)
+            corners.append((round(away * math.cos(angle) + x, 3), round(away * math.sin(angle) + y, 3)))
+        self.half = max(math.hypot(*corner) for corner in corners)
+        return corners
 
     def _around(self) -> None:
         """Place obstacles and persons; the zone is free at first in most worlds."""
@@ -132,9 +157,17 @@ class ZoneWorld(SeparationWorld):
         return self.muted_from <= self.now <= self.muted_until
 
     def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
-        near = self.half - 0.01
-        x, y = found * np.cos(self.angles), found * np.sin(self.angles)
-        inside = np.isfinite(found) & (np.abs(x) < near) & (np.abs(y) < near)
+        """Note whether a thing is in the zone, also one behind another."""
+        inside = np.zeros(found.shape, bool)
+        discs = [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
+        for walls, persons in [([wall], []) for wall in self.walls] + [([], [disc]) for disc in discs]:
+            away = geometry.ranges(self.base.x, self.base.y, self.angles + self.base.heading, walls, persons)
+            seen = (away < self.far) & (away > self.near)
+            x, y = (
+                np.where(seen, away, 0) * np.cos(self.angles),
+                np.where(seen, away, 0) * np.sin(self.angles),
+            )
+            inside |= seen & geometry.are_inside(self.corners, x, y, 0.01)
         self.scan_occupied = int(inside.sum()) >= self.points
         occupied, (data, valid) = self.scan_occupied, super().scan(found)
         return data + bytes([occupied]), valid
@@ -142,19 +175,12 @@ class ZoneWorld(SeparationWorld):
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         occupied = bool(data[-1]) and bool(valid)
         self.occupied = occupied
+        self.occupied_since = (self.occupied_since or self.now) if occupied else None
         if occupied:
             self.occupied_at = self.now
         if occupied and not self.muted:
             self.ready.clear()
         super().arrive(data[:-1], valid, whole=whole)
-        if (
-            occupied
-            and not self.switched_off
-            and not self.muted
-            and not self.foreign
-            and self._fast(self.force[1])
-        ):
-            self.broken("L3", "something is in the zone, and the base is not stopped at once")
 
     def _fast(self, legs: Legs) -> bool:
         return not math.hypot(*legs[:3]) <= self.slow * (1 + 1e-6)
@@ -198,7 +224,10 @@ class ZoneWorld(SeparationWorld):
         self.only_fresh()
         if self.muted or self.switched_off or self.now <= self.fresh_from + 100 + SLACK:
             return
-        if not self.slow and self.muted_until == NEVER:
+        if not self.slow and self.muted_until == NEVER and self.around:
             self.harm()
         if self._fast(self.force[1]):
+            since = self.now if self.occupied_since is None or self.foreign else self.occupied_since
+            if self.now > since + self.tick + SLACK:
+                self.broken("L3", f"something is in the zone since {since} ms, and the base is not stopped")
             self.evidence(self.silent)

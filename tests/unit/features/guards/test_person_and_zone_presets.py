@@ -22,7 +22,9 @@ def odometry(v: float = 0.0, w: float = 0.0) -> bytes:
     return message("nav_msgs/Odometry", twist__twist__linear__x=v, twist__twist__angular__z=w)
 
 
-def scan(ranges: list[float], start: float = -1.5, step: float = 0.1, far: float = 10.0, low: float = 0.1) -> bytes:
+def scan(
+    ranges: list[float], start: float = -1.5, step: float = 0.1, far: float = 10.0, low: float = 0.1
+) -> bytes:
     return message(
         "sensor_msgs/LaserScan",
         angle_min=start,

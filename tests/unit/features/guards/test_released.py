@@ -143,6 +143,21 @@ def test_a_guard_of_an_old_release_is_recognised_and_made_again(name: str, versi
     assert {one: values_in(new.text)[one] for one in kept} == {one: values_in(text)[one] for one in kept}
 
 
+@pytest.mark.parametrize(("name", "version"), [("separation", 2), ("zone", 1), ("joints", 2)])
+def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, version: int) -> None:
+    base = released.released(name, version)
+    for guard in (made(base), replace(made(base), values={})):
+        text = text_of(guard)
+        assert origin_of(text) == "older"
+        new = upgraded(
+            text,
+            {},
+            [TopicFacts(topic, types_in(text)[one], (), ()) for one, topic in topics_in(text).items()],
+        )
+        assert origin_of(new.text) == "current" and topics_in(new.text) == topics_in(text)
+        assert values_in(new.text).items() >= values_in(text).items()
+
+
 def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet() -> None:
     base = released.released("joints", 1)
     with pytest.raises(GuardError, match="joints needs a topic for state: give --topic state=TOPIC"):

@@ -552,7 +552,14 @@ def test_samples_of_a_motion_that_ends_at_a_limit_pass() -> None:
 
 
 def streamed(
-    guard: Guarded, period: int, after: int, ahead: float, *, reports: int = 8, lag: int = 0, moving: int = 1500
+    guard: Guarded,
+    period: int,
+    after: int,
+    ahead: float,
+    *,
+    reports: int = 8,
+    lag: int = 0,
+    moving: int = 1500,
 ) -> tuple[float, float, int, int]:
     """Send a point every `period` ms, `after` ms in the future and `ahead` rad beyond the place of a joint then.
 
@@ -592,7 +599,9 @@ def test_a_stream_of_points_is_no_faster_than_one_trajectory(period: int, after:
     ("period", "reports", "lag", "part"),
     [(4, 2, 4, 1.0), (8, 8, 8, 0.9), (20, 8, 8, 0.1), (20, 8, 8, 1.0), (33, 10, 5, 1.0), (100, 8, 8, 0.5)],
 )
-def test_a_stream_of_points_that_keeps_the_velocity_passes(period: int, reports: int, lag: int, part: float) -> None:
+def test_a_stream_of_points_that_keeps_the_velocity_passes(
+    period: int, reports: int, lag: int, part: float
+) -> None:
     guard = Guarded("joints", low=-100, high=100)
     ahead = part * 3.2 * period / 1000
     place, _fastest, sent, passing = streamed(guard, period, period, ahead, reports=reports, lag=lag)
