@@ -296,7 +296,7 @@ HIDDEN: list[tuple[str, float]] = [
     (HORSESHOE, 0.3),
     (HORSESHOE, 1.2),
 ]
-"""Polygons before, beside, behind and around the scanner, and at what distance all around is a thing that hides them."""
+"""Polygons before, beside, behind and around the scanner, and the distance of a thing all round that hides them."""
 
 
 @pytest.mark.parametrize(("polygon", "near"), HIDDEN)

@@ -149,11 +149,7 @@ def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, ve
     for guard in (made(base), replace(made(base), values={})):
         text = text_of(guard)
         assert origin_of(text) == "older"
-        new = upgraded(
-            text,
-            {},
-            [TopicFacts(topic, types_in(text)[one], (), ()) for one, topic in topics_in(text).items()],
-        )
+        new = upgraded(text, {}, [TopicFacts(topic, kind, (), ()) for topic, kind in old_types(text)])
         assert origin_of(new.text) == "current" and topics_in(new.text) == topics_in(text)
         assert values_in(new.text).items() >= values_in(text).items()
 
