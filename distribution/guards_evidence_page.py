@@ -224,7 +224,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     ),
     "zone": Evidence(
         ("IEC 61496-3, scanners", "ISO 13855, approach of persons"),
-        "`points` rays that end in the zone or before it, within 20 ms of that scan; a scanner that is silent for `silent`",
+        "`points` rays that end in the zone or before it, within 20 ms of it; a scanner that is silent for `silent`",
         "silent",
         (
             "the zone covers the way of the base until it stands, and of a person who approaches",
