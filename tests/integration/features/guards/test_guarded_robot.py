@@ -43,6 +43,7 @@ def survive(
         robot.lost()  # before the nodes were connected
         assert robot.moves(time.monotonic()) < math.inf
         passages = [robot.after(act) for act in acts]
+        assert robot.judged()
     assert all(passage.holds for passage in passages), "\n".join(["", *map(str, passages)])
 
 

@@ -1,6 +1,6 @@
 """A robot of real rospy nodes behind guards in a deployed appliance, and the acts that guards have to survive.
 
-`ROWS` has what honest nodes send on the topics of each preset: the largest messages of real robots, at real rates.
+`rows` has what honest nodes send on the topics of each preset: the largest messages of real robots, at real rates.
 `ACTS` is what happens to a guard in the life of a robot. After each act the robot moves again, nothing has faulted, and
 a node that listens to the topics that a guard observes has got all of their messages.
 """
@@ -170,6 +170,10 @@ def rows(rays: int = RAYS[-1]) -> list[Row]:
     ]  # fmt: skip
 
 
+WAIT = {"arm", "joints", "withhold"}
+"""Presets that wait for a node that is gone until they begin again, `arm` for as long as a check counts."""
+
+
 class GuardedRobot:
     """The nodes of a robot behind guards: `/driver` sends on the guarded topic, `/sensors` on what the guards observe.
 
@@ -264,6 +268,10 @@ class GuardedRobot:
         reasons = [one["reason"] for one in self.appliance.audit(event="monitor fault")]
         self.appliance.ignore_earlier_records()
         return [one for one in reasons if "the bytes are not a message" not in one]
+
+    def judged(self) -> bool:
+        """Return whether each guard is in force and has got messages since its relay started."""
+        return all(one.enabled and one.events for one in self.ask(admin.MonitorsWanted()).monitors)
 
     def after(self, act: "Act") -> "Passage":
         """Return what became of the robot after the act."""
@@ -389,8 +397,6 @@ def restart(robot: GuardedRobot) -> None:
     robot.appliance.start()
 
 
-WAIT = {"arm", "joints", "withhold"}
-"""Presets that wait for a node that is gone until they begin again, `arm` for as long as a check counts."""
 ACTS = (
     Act(load), Act(reload), Act(resume), Act(disable), Act(shadow), Act(set_value), Act(malformed), Act(silence),
     Act(another_node, within=2.0), Act(kill_relay, within=2.0, cuts=True),
