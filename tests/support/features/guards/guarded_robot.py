@@ -397,8 +397,9 @@ def restart(robot: GuardedRobot) -> None:
     robot.appliance.start()
 
 
+# Another node counts for a second after its end. rospy connects again after 0.5 s, and then after another second.
 ACTS = (
     Act(load), Act(reload), Act(resume), Act(disable), Act(shadow), Act(set_value), Act(malformed), Act(silence),
-    Act(another_node, within=2.0), Act(kill_relay, within=2.0, cuts=True),
+    Act(another_node, within=2.0), Act(kill_relay, within=3.0, cuts=True),
     Act(kill_control), Act(restart, within=2.0, cuts=True)
 )  # fmt: skip
