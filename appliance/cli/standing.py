@@ -3,7 +3,7 @@
 1. A robot stands if the last command of each of its command topics was zero, and, where it measures its own speed, that
    was zero too, both for some seconds.
 2. Silence is not standing: without a commanded zero, or while odometry is silent, the robot is not known to stand. A
-   topic without a command is no obstacle beside another with a zero if each of its drivers measures zero; it is named.
+   topic without a command may stand beside another with a zero if each of its drivers measures zero; it is named.
 3. Only topics of the robot count: its nodes drive by them, or publish them to a driver elsewhere. Topics of other hosts
    neither prevent nor prove anything; they are named.
 4. The wait has an end, with a reason.
@@ -12,19 +12,17 @@
 """
 
 import asyncio
-import functools
 import math
-import re
 import threading
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
-from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
+import msgspec
 import typer
 
 from appliance.base import clock
@@ -38,46 +36,38 @@ from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import usage_error
+from appliance.cli.robot_motions import (
+    STILL_SECONDS,
+    MotionTopics,
+    StandingJudge,
+    motion_topics,
+    some,
+    speed_in,
+    speed_of,
+    unseen,
+)
 from appliance.network.interfaces import addresses_by_interface
 from appliance.network.namespaces import Namespace
 from appliance.rpc.graph_reader import is_here
 from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph, MasterReader, MasterReadError
 from rosmop.tool.terminal import printable, refused, say
-from roswire.definitions import Definitions
 from roswire.errors import RosError
-from roswire.message_view import read_fields
 from roswire.node.network import SourceNetwork
 from roswire.node.ros_node import RosNode
 from roswire.node.tcpros_streams import NodeLimits
 from roswire.node.topics import Received
-from roswire.standard import standard_definitions
 from roswire.tcpros import Body
 from roswire.uris import node_uri, parse_node_uri
 
 A = TypeVar("A")
-STILL_SECONDS = 3.0
 _NAME = "/rosrv_standing"
 _LINK = "veth-rosrv"
-_SPEED = 0.01  # m/s, rad/s
 _LOOK_SECONDS = 0.2
 _MOST_OF_LOOK = 20  # messages
 _COUNTED_SECONDS = 1.5  # after which the appliance's numbers have what passed
 _MOST = 16  # topics of each kind
-_SHOWN = 3
 WITHIN = 120.0
 """The seconds that a verb waits unless the operator says otherwise."""
-_COMMANDS: Mapping[str, tuple[str, ...]] = {
-    "geometry_msgs/Twist": (),
-    "geometry_msgs/TwistStamped": ("twist",),
-}
-_ODOMETRY: Mapping[str, tuple[str, ...]] = {"nav_msgs/Odometry": ("twist", "twist")}
-"""The fields above the twist, by the type of the topic."""
-_COMMAND_NAME = re.compile(r"cmd|command|setpoint|drive", re.IGNORECASE)
-_OBSERVER = re.compile(r"/(?:record_\d|rosbag|rqt|rviz|plotjuggler)[^/]*$")
-"""Nodes that record or show topics, and drive nothing."""
-_OTHER_COMMANDS = ("ackermann_msgs/", "control_msgs/", "mavros_msgs/", "std_msgs/Float64", "trajectory_msgs/")
-"""The beginnings of types that command a motion in a way that is not read here."""
-
 WhenStanding = Annotated[
     bool,
     typer.Option(
@@ -109,71 +99,6 @@ Within = Annotated[float, longest_wait("of --when-standing")]
 
 class NotStandingError(Exception):
     """The robot did not stop before the end of the wait, or its topics cannot be heard; the message says why."""
-
-
-@dataclass(frozen=True)
-class MotionTopics:
-    """The topics that tell of a robot's motions. `commands` has the odometry of the drivers of each command topic.
-
-    The odometry is empty if a driver measures none. `others` are command topics of other hosts.
-    """
-
-    commands: Mapping[str, frozenset[str]]
-    odometry: frozenset[str]
-    others: tuple[str, ...] = ()
-
-
-@dataclass
-class StandingJudge:
-    """Decides whether a robot stands, by the speeds that its topics say. Times are in seconds of one clock."""
-
-    topics: MotionTopics
-    seconds: float = STILL_SECONDS
-    deaf: str = ""
-    """Why a topic cannot be heard."""
-    _moved: dict[str, float] = field(default_factory=dict, init=False)
-    _still_since: dict[str, float] = field(default_factory=dict, init=False)
-    _heard: dict[str, float] = field(default_factory=dict, init=False)
-
-    def hear(self, topic: str, speed: float, now: float) -> None:
-        self._heard[topic] = now
-        if speed <= _SPEED:  # a speed that is not a number moves
-            self._still_since.setdefault(topic, now)
-        else:
-            self._moved[topic] = now
-            self._still_since.pop(topic, None)
-
-    @property
-    def commanded(self) -> list[str]:
-        """The command topics whose last command was zero."""
-        return sorted(self.topics.commands.keys() & self._still_since)
-
-    @property
-    def silent(self) -> list[str]:
-        """The command topics without a command."""
-        return sorted(self.topics.commands.keys() - self._heard)
-
-    def why_not(self, now: float) -> str:
-        """Return why the robot is not known to stand; empty if it stands."""
-        commands, odometry = self.topics.commands, self.topics.odometry
-        if self.deaf:
-            return self.deaf
-        if not commands:
-            elsewhere = f"; of other hosts: {_some(self.topics.others)}" if self.topics.others else ""
-            return f"no topic commands a base of this robot (geometry_msgs/Twist){elsewhere}"
-        for topic in sorted((commands.keys() | odometry) & self._moved.keys()):
-            if topic not in self._still_since:
-                return f"{topic} says that it moves"
-        commanded = self.commanded
-        unknown = [topic for topic in self.silent if not commanded or not commands[topic]]
-        if unknown:
-            return f"no zero was commanded on {', '.join(unknown)}"
-        for topic in sorted(odometry):
-            if now - self._heard.get(topic, -math.inf) > self.seconds:
-                return f"{topic} is silent"
-        still = max(self._still_since[topic] for topic in {*commanded, *odometry})
-        left = self.seconds - (now - still)
-        return f"it stands for less than {self.seconds:g} s" if left > 0 else ""
 
 
 def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
@@ -342,13 +267,25 @@ def _by_node(master: str, source: str) -> Hearing:
     return hear
 
 
+class _SeenMessage(msgspec.Struct):
+    fields: dict[str, object]
+    why: str
+
+
+class _Seen(msgspec.Struct):
+    """The part that is used of an answer to a look."""
+
+    messages: list[_SeenMessage]
+
+
 def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
     """Hear by looks of the appliance, one after the other for each topic. Between two looks, a message may pass.
 
     The appliance counts the messages of each publisher, and reports each second: a command that passed unheard, and was
     followed by none that was heard, is found by the numbers.
     """
-    look: Any = request_named("topic look")
+    look = request_named("topic look")
+    assert look is not None  # noqa: S101  the feature `topics` has it
     before = _messages(began)
 
     @asynccontextmanager
@@ -359,16 +296,19 @@ def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
         def follow(topic: str, kind: str) -> None:
             try:
                 while not over.is_set():
-                    seen = _asked(appliance, look(topic, _MOST_OF_LOOK, 1.0)).messages
+                    order = {"verb": "topic look", "topic": topic, "messages": _MOST_OF_LOOK, "seconds": 1.0}
+                    seen = msgspec.convert(
+                        _asked(appliance, msgspec.convert(order, look)), _Seen, from_attributes=True
+                    )
                     loop.call_soon_threadsafe(note, topic, kind, seen)
             except NotStandingError as error:
                 loop.call_soon_threadsafe(setattr, judge, "deaf", f"{topic} cannot be heard: {error}")
 
-        def note(topic: str, kind: str, seen: list[Any]) -> None:
-            for message in seen:
+        def note(topic: str, kind: str, seen: _Seen) -> None:
+            for message in seen.messages:
                 heard[topic] += 1
                 last[topic] = clock.now()
-                judge.hear(topic, math.inf if message.why else _speed(kind, message.fields), clock.now())
+                judge.hear(topic, math.inf if message.why else speed_of(kind, message.fields), clock.now())
 
         async def unheard() -> str:
             await asyncio.sleep(_COUNTED_SECONDS)
@@ -379,7 +319,7 @@ def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
                 if clock.now() - last.get(topic, -math.inf) > STILL_SECONDS
             ]
             missed = [topic for topic in sorted(quiet) if now[topic] - before[topic] > heard[topic]]
-            return f"a command on {_some(missed)} was not heard" if missed else ""
+            return f"a command on {some(missed)} was not heard" if missed else ""
 
         with ThreadPoolExecutor(max(1, len(types)), "looks") as threads:
             for row in types.items():
@@ -396,85 +336,8 @@ def _messages(graph: Graph) -> Counter[str]:
     return Counter({topic.name: sum(one.messages for one in topic.publishers) for topic in graph.topics})
 
 
-def unseen(graph: MasterGraph, topics: MotionTopics, silent: Collection[str] = ()) -> str:
-    """Return in words what the topics of a graph do not tell about motions."""
-    parts = [] if topics.odometry else ["the real speed, because no node publishes odometry"]
-    if silent:
-        parts.append(f"a command on {_some(silent)}")
-    used = {resource for kind, resource, _name in graph.entries if kind == SUBSCRIPTION}
-    others = sorted(topic for topic in used if graph.types.get(topic, "").startswith(_OTHER_COMMANDS))
-    if others:
-        parts.append(f"what {_some(others)} may move")
-    if topics.others:
-        parts.append(f"what {_some(topics.others)} of other hosts may move")
-    parts.append("motions that no topic commands")
-    return "; ".join(parts)
-
-
-def _some(topics: Collection[str]) -> str:
-    listed = sorted(topics)
-    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
-    return f"{', '.join(listed[:_SHOWN])}{more}"
-
-
-def motion_topics(graph: MasterGraph, own: Collection[str]) -> MotionTopics:
-    """Return the topics that tell of the motions of a robot with these nodes.
-
-    A driver subscribes to a command, and passes it on to no other node of the robot, as a multiplexer does. A recorder
-    or a display is no driver.
-    """
-    ends: dict[str, dict[str, set[str]]] = {PUBLICATION: {}, SUBSCRIPTION: {}}
-    for kind, topic, name in graph.entries:
-        if kind in ends and not (kind == SUBSCRIPTION and _OBSERVER.search(name)):
-            ends[kind].setdefault(topic, set()).add(name)
-    publishers, subscribers = ends[PUBLICATION], ends[SUBSCRIPTION]
-    twists = [topic for topic in subscribers if graph.types.get(topic) in _COMMANDS]
-    measured = {topic: publishers[topic] for topic in publishers if graph.types.get(topic) in _ODOMETRY}
-    passing = {
-        name
-        for topic in twists
-        if _COMMAND_NAME.search(topic)
-        for name in publishers.get(topic, ())
-        if not subscribers[topic].isdisjoint({*own} - {name})
-    }
-    commands, others, driving = dict[str, frozenset[str]](), list[str](), set[str]()
-    for topic in sorted(twists):
-        drivers = subscribers[topic] - passing
-        if drivers.isdisjoint(own) and publishers.get(topic, set()).isdisjoint(own):
-            others += [topic] if drivers else []
-        elif drivers:
-            sources = [{one for one, names in measured.items() if name in names} for name in drivers]
-            commands[topic] = frozenset[str]().union(*sources) if all(sources) else frozenset()
-            driving |= drivers
-    odometry = {topic for topic, names in measured.items() if not names.isdisjoint(driving.union(own))}
-    return MotionTopics(commands, frozenset(odometry), tuple(others))
-
-
 def _listener(judge: StandingJudge, topic: str, kind: str) -> Received:
     def heard(data: Body, _header: Mapping[str, str]) -> None:
         judge.hear(topic, speed_in(kind, bytes(data)), clock.now())
 
     return heard
-
-
-def speed_in(kind: str, data: bytes) -> float:
-    """Return the largest component of a message's twist; infinity for a message that cannot be read."""
-    return _speed(kind, read_fields(_definitions(), kind, data))
-
-
-def _speed(kind: str, message: object) -> float:
-    fields = message
-    for name in {**_COMMANDS, **_ODOMETRY}.get(kind, ()):
-        fields = fields.get(name) if isinstance(fields, dict) else None
-    if not isinstance(fields, dict):
-        return math.inf
-    parts = [fields.get(part) for part in ("linear", "angular")]
-    values = [value for part in parts if isinstance(part, dict) for value in part.values()]
-    if not values or any(not isinstance(value, float) or math.isnan(value) for value in values):
-        return math.inf
-    return float(max(map(abs, values)))
-
-
-@functools.cache
-def _definitions() -> Definitions:
-    return standard_definitions()

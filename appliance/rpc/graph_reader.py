@@ -68,7 +68,7 @@ async def survey(uri: str, limits: SurveyLimits) -> GraphInventory:
 
 
 class _Asked(NamedTuple):
-    """What a node said; `problem` is why it could not be asked."""
+    """The answers of a node; `problem` is why it could not be asked."""
 
     problem: str = "it did not answer in the time of its host"
     pid: int | None = None

@@ -90,8 +90,8 @@ async def find_places(nodes: Mapping[str, str], facts: MachineFacts, call: NodeC
     """Return the places of nodes. `facts` has the sockets of their ports and the addresses of their hosts.
 
     Each place is asked once, whatever its names are. This machine's own places are asked first, and each of its ports
-    has a share of its own, so that no other host delays them. A host of which too many places fail is asked no further:
-    nobody can have its ports scanned by registering them.
+    has a share of its own, so that no other host delays them. A host of which too many places fail is not asked
+    further: registered URIs do not make it scan ports.
     """
     uris, missing = parsed(nodes)
     places: dict[str, list[NodePlace]] = {}

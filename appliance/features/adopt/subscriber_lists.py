@@ -107,8 +107,8 @@ async def reconnect(
     """Tell subscribers their lists, each once its connections to other publishers have ended.
 
     After a cut, a node still reads what its kernel had received, and lists the connection until then. roscpp lists it
-    until a list lacks it. Return the subscriptions, by `NODE TOPIC`, that were told although their connections were not
-    known to have ended, with the reasons.
+    until a list lacks it. Return the subscriptions, by `NODE TOPIC`, that got a list although their connections were
+    not known to have ended, with the reasons.
     """
 
     async def lose(row: Subscription) -> str:

@@ -168,7 +168,7 @@ def test_a_kill_of_everything_in_the_middle_ends_as_ordered(robot: Robot, applia
 
 @pytest.mark.nightly
 def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appliance, lab: Lab) -> None:
-    """All of its command topics: a zero on one says nothing of another. Those of another host do not count."""
+    """All of its command topics: a zero on one says nothing of another, and topics of another host do not count."""
 
     def publish(topic: str, kind: str, value: str) -> Process:
         command = ["/usr/bin/rostopic", "pub", "--rate", "10", topic, kind, value]

@@ -54,7 +54,7 @@ def test_time_never_goes_back_in_a_node_that_lags_behind(
         until_taken(robot, appliance)
         _require_time(sleepers)
         for number in range(1, CHANGES):
-            print(rosrv(robot, appliance, "release" if number % 2 else "adopt").splitlines()[0])  # noqa: T201
+            print(rosrv(robot, appliance, "release" if number % 2 else "adopt").splitlines()[0])  # noqa: T201  shown by pytest -s
             _require_time(sleepers)
         for sleeper in sleepers:
             times = [event["now"] for event in sleeper.seen(event="slept")]

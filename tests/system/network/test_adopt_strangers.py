@@ -1,4 +1,4 @@
-"""A stranger filled the robot's own master with names before an adoption, and before a start of an adopted robot."""
+"""An unknown host filled the robot's own master with names before an adoption, at a start and by an order."""
 
 import json
 import re
@@ -95,7 +95,7 @@ def _filled(stranger: Host, robot: Robot) -> Iterator[None]:
 
 
 def _require_served(robot: Robot, appliance: Appliance) -> None:
-    """All honest nodes are taken in time, their topics and services work, and the stranger's names are named."""
+    """All honest nodes are taken in time, their topics and services work, and the other names are named."""
     found = json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))
     took = float(
         re.findall(r'"seconds": ([0-9.]+), "event": "the robot\'s graph is adopted"', appliance.story())[-1]
@@ -114,7 +114,7 @@ def _require_served(robot: Robot, appliance: Appliance) -> None:
     assert took < _SECONDS
 
 
-def test_names_of_a_stranger_keep_no_node_of_the_robot_out(
+def test_names_of_an_unknown_host_keep_no_node_of_the_robot_out(
     robot: Robot, appliance: Appliance, lab: Lab
 ) -> None:
     """At a start that takes the graph over, and at an order while the appliance runs."""

@@ -3,7 +3,7 @@ import struct
 
 import pytest
 
-from appliance.cli.standing import (
+from appliance.cli.robot_motions import (
     STILL_SECONDS,
     MotionTopics,
     StandingJudge,

@@ -65,9 +65,9 @@ class RobotNode:
     most: dict[str, int] = field(default_factory=dict)
     """The most connections that a topic had at once."""
     tells: str = "port"
-    """What it says to `requestTopic`: `port`, `refusal` to a topic that it does not publish, or `nothing`."""
+    """The answer to `requestTopic`: `port`, `refusal` to a topic that it does not publish, or `nothing`."""
     lags: int = 0
-    """For so many looks after a cut it still reads, and lists, a connection that was cut."""
+    """The number of looks after a cut for which it still reads, and lists, a connection that was cut."""
     reads_on: dict[str, int] = field(default_factory=dict)
     """The looks that are left, by the topic of such a connection."""
     heard_both: set[str] = field(default_factory=set)

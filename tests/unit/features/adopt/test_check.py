@@ -112,7 +112,7 @@ def test_a_node_that_cannot_be_moved_is_named(
     assert node.name in found.text or node.host in found.text
 
 
-def test_names_of_a_stranger_stop_no_adoption() -> None:
+def test_names_of_an_unknown_host_stop_no_adoption() -> None:
     """Neither unknown hosts, nor ports of other programs of this machine, nor more names than can be read."""
     strangers = (
         *(SurveyedNode(f"/a{number}", f"http://a{number}.invalid:4000/") for number in range(520)),

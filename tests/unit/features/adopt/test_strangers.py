@@ -19,7 +19,7 @@ ODD = (
 
 
 def _fill(world: RobotWorld, silent: int, unknown: int) -> None:
-    """Register names of a stranger that come first in each order."""
+    """Register names of an unknown host that come first in each order."""
     uris = [f"http://{STRANGER}:{20_000 + number}/" for number in range(silent)]
     uris += [f"http://a{number}.invalid:4000/" for number in range(unknown)]
     for number, uri in enumerate((*uris, *ODD)):
@@ -31,7 +31,7 @@ def _fill(world: RobotWorld, silent: int, unknown: int) -> None:
 
 @pytest.mark.parametrize("ordered", [False, True], ids=["at a start", "by an order"])
 @pytest.mark.parametrize(("silent", "unknown"), [(300, 0), (0, 520), (300, 520)])
-def test_the_robots_nodes_are_taken_in_seconds_beside_names_of_a_stranger(
+def test_the_robots_nodes_are_taken_in_seconds_beside_names_of_an_unknown_host(
     silent: int, unknown: int, ordered: bool
 ) -> None:
     async def story(world: RobotWorld) -> None:
@@ -111,7 +111,7 @@ def test_the_connections_of_a_publisher_that_does_not_tell_its_port_are_cut_or_n
     run(story)
 
 
-def test_a_topic_that_a_stranger_registered_for_a_node_hides_no_port() -> None:
+def test_a_topic_that_an_unknown_host_registered_for_a_node_hides_no_port() -> None:
     async def story(world: RobotWorld) -> None:
         world.robot["/teleop"].tells = "refusal"
         for number in range(500):
@@ -156,7 +156,7 @@ def test_a_node_that_never_tells_of_its_clock_delays_no_other_and_is_named() -> 
     run(story)
 
 
-def test_ports_of_a_host_that_a_stranger_registered_are_not_scanned() -> None:
+def test_ports_of_a_host_that_an_unknown_host_registered_are_not_scanned() -> None:
     async def story(world: RobotWorld) -> None:
         world.add("/nuc", 4004, uri="http://192.168.50.2:4004/", publishes=("/nuc",))
         for number in range(500):

@@ -31,12 +31,12 @@ class FakeClient:
     asked: list[str]
 
     def __init__(self, uri: NodeUri, **_options: object) -> None:
-        self._master = uri.port == 11311
+        self.is_master, self.host = uri.port == 11311, uri.host
 
     async def call(self, method: str, *_parameters: object) -> Any:
         self.asked.append(method)
         await asyncio.sleep(0)
-        answer = self.answers.get(method, (MASTER if self._master else NODE).get(method))
+        answer = self.answers.get(method, (MASTER if self.is_master else NODE).get(method))
         if isinstance(answer, Exception):
             raise answer
         return [1, "", answer]
@@ -151,28 +151,22 @@ def test_an_address_of_another_machine_is_not_an_own_one(address: str, here: boo
     assert reader.is_here(address) is here
 
 
-class Crowd(FakeClient):
-    """A master with 500 names of a host that never answers, before two nodes that do."""
-
-    def __init__(self, uri: NodeUri, **options: object) -> None:
-        super().__init__(uri, **options)
-        self._host = uri.host
-
-    async def call(self, method: str, *parameters: object) -> Any:
-        if self._host == "10.0.0.66":
-            await asyncio.sleep(3.0)
-            raise UnansweredError("late")
-        if method == "lookupNode":
-            name = str(parameters[1])
-            host = {"/base": "127.0.0.1", "/nuc": "192.168.50.2"}.get(name, "10.0.0.66")
-            return [1, "", f"http://{host}:{4000 + len(name)}/{name.strip('/')}"]
-        return await super().call(method, *parameters)
+async def answer_of_a_crowd(client: FakeClient, method: str, *parameters: object) -> Any:
+    """Answer for a master with 500 names of a host that never answers, before two nodes that do."""
+    if client.host == "10.0.0.66":
+        await asyncio.sleep(3.0)
+        raise UnansweredError("late")
+    if method == "lookupNode":
+        name = str(parameters[1])
+        host = {"/base": "127.0.0.1", "/nuc": "192.168.50.2"}.get(name, "10.0.0.66")
+        return [1, "", f"http://{host}:{4000 + len(name)}/{name.strip('/')}"]
+    return [1, "", client.answers.get(method, (MASTER if client.is_master else NODE).get(method))]
 
 
 def test_names_of_a_silent_host_keep_no_other_out_and_make_no_host_a_target(
     run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "XmlRpcClient", Crowd)
+    monkeypatch.setattr(FakeClient, "call", answer_of_a_crowd)
     scanned: list[str] = []
 
     async def refused(host: str, _port: int) -> None:
