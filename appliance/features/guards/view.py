@@ -71,10 +71,11 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
         text = f"the guard {_since(guard)}: rosrv audit search --category monitor --text {guard.name}"
         yield Trouble("notice", f"guard-acts:{guard.name}", text)
     for name, idle in state.never_enabled.items():
-        how, verb = ("is disabled", "enable") if idle == "off" else ("only records (shadow mode)", "enforce")
+        why = "because neither an operator nor its file brought it into force"
         text = (
-            f"the guard {name} {how}, because neither an operator nor its file brought it into force: rosrv monitor"
-            f" {verb} {name}"
+            f"the guard {name} is disabled, {why}: rosrv monitor enable {name}"
+            if idle == "off"
+            else f"the guard {name} only records (shadow mode), {why}: rosrv monitor enforce {name}"
         )
         yield Trouble("warning", f"guard-off:{name}", text, "monitors")
     for old in state.older:

@@ -3,7 +3,6 @@
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -85,11 +84,8 @@ def test_the_file_has_each_switch_and_a_file_without_one_is_a_warning(packaged: 
     eventually(lambda: packaged.rosrv("status", check=False).returncode == 0, packaged.story)
 
 
-class Part(NamedTuple):
-    """A part of a state directory: the orders that change it, and a look at it."""
-
-    orders: Sequence[Sequence[str]]
-    look: Callable[[Appliance], object]
+Part = tuple[Sequence[Sequence[str]], Callable[[Appliance], object]]
+"""A part of a state directory: the orders that change it, and a look at it."""
 
 
 def names(*command: str, of: str) -> Callable[[Appliance], object]:
@@ -111,19 +107,19 @@ def log_key(appliance: Appliance) -> object:
 
 
 PARTS: dict[str, Part] = {
-    "switches": Part([("monitor", "enable", "own")], lambda one: states(one)["own"]),
-    "values": Part([("guard", "set", "speed", "vMax=0.2")], fastest),
-    "loaded specifications": Part([("monitor", "load", "loaded.rv")], lambda one: "loaded" in states(one)),
-    "policy revisions": Part([("policy", "reload")], names("policy", "revisions", of="revision")),
-    "blocks": Part([("host", "block", "10.77.0.99", "--for", "1h")], names("host", "blocks", of="address")),
-    "tokens": Part([("token", "add", "eve", "--for", "1d")], names("token", "list", of="name")),
-    "doors": Part([("door", "add", "eve")], names("door", "list", of="name")),
-    "registrations": Part([], parameter),
-    "handled alarms": Part(
+    "switches": ([("monitor", "enable", "own")], lambda one: states(one)["own"]),
+    "values": ([("guard", "set", "speed", "vMax=0.2")], fastest),
+    "loaded specifications": ([("monitor", "load", "loaded.rv")], lambda one: "loaded" in states(one)),
+    "policy revisions": ([("policy", "reload")], names("policy", "revisions", of="revision")),
+    "blocks": ([("host", "block", "10.77.0.99", "--for", "1h")], names("host", "blocks", of="address")),
+    "tokens": ([("token", "add", "eve", "--for", "1d")], names("token", "list", of="name")),
+    "doors": ([("door", "add", "eve")], names("door", "list", of="name")),
+    "registrations": ([], parameter),
+    "handled alarms": (
         [("alarm", "silence", "guard-off:speed", "--for", "1h")],
         lambda one: len(one.status()["handled_alarms"]),
     ),
-    "audit log": Part([], log_key),
+    "audit log": ([], log_key),
 }
 ELSEWHERE = {
     "enrolled hosts": "needs tunnels: tests/system/ipsec",
@@ -142,19 +138,19 @@ def test_a_new_state_directory_lacks_each_part_of_the_earlier_one_and_says_so(pa
     loaded = packaged.directory / "loaded.rv"
     loaded.write_text(OWN.replace("own()", "loaded()"))
     with_new_state(packaged)
-    first = {name: part.look(packaged) for name, part in PARTS.items()}
+    first = {name: look(packaged) for name, (_orders, look) in PARTS.items()}
     policy = packaged.policy_file.read_text()
     packaged.policy_file.write_text(f"{policy}# 2\n")
     call_on(packaged.host, packaged.master_uri, "setParam", "/t", "/there", 1)
-    for part in PARTS.values():
-        for order in part.orders:
+    for orders, _look in PARTS.values():
+        for order in orders:
             packaged.rosrv(*(str(loaded) if word == "loaded.rv" else word for word in order))
-    used = {name: part.look(packaged) for name, part in PARTS.items()}
+    used = {name: look(packaged) for name, (_orders, look) in PARTS.items()}
     assert [name for name in PARTS if used[name] == first[name] and name != "audit log"] == []
     named = packaged.row("backup", str(packaged.directory / "backup.tar.gz"))["only_in_state"]
     assert named == ["loaded.rv"]
     with_new_state(packaged)
-    new = {name: part.look(packaged) for name, part in PARTS.items()}
+    new = {name: look(packaged) for name, (_orders, look) in PARTS.items()}
     assert [name for name in PARTS if new[name] != first[name]] == ["audit log"]
     [record] = packaged.recorded(event="state directory new")
     assert record["detail"]["parts"] == dict(LACKS)

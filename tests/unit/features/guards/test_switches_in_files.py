@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import pytest
@@ -98,10 +98,10 @@ async def test_the_stored_switch_wins_over_each_later_file(tmp_path: Path, what:
     async with monitors_of(tmp_path, {"deadman.rv": said("on")}, enable="none") as first:
         await order(first)
         assert first.lasting("deadman") == then
-        desk = cast(WaitingManager, first).desk
+        assert isinstance(first, WaitingManager)
         for word in WORDS:
-            (desk.folder / "deadman.rv").write_text(said(word))
-            assert (await desk.monitors("none")).lasting("deadman") == then
+            (first.desk.folder / "deadman.rv").write_text(said(word))
+            assert (await first.desk.monitors("none")).lasting("deadman") == then
 
 
 async def test_a_load_that_is_taken_back_leaves_the_switch_as_it_was(tmp_path: Path) -> None:
