@@ -28,7 +28,6 @@ from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.specifications import in_force
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.change_records import off_in
-from appliance.specifications.file_switches import Word, file_switch
 from appliance.specifications.givens import Givens, parsed, split
 from appliance.specifications.in_force import InForce, Wanted, unknown_monitors
 from appliance.specifications.judgement import Checks, Consent, Judge, broken, in_shadow
@@ -61,6 +60,7 @@ from appliance.store.ends import EndTable
 from appliance.store.revisions import reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from rosmop.text.switch_words import Word, file_switch
 
 _NO_FOLDER = (
     "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"

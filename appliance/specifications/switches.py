@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from appliance.specifications.file_switches import Word
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
+from rosmop.text.switch_words import Word
 
 SHADOW: Literal["shadow"] = "shadow"
 Switch = bool | Literal["shadow"]

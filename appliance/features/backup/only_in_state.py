@@ -9,10 +9,17 @@ import msgspec
 
 from appliance.base.input_files import read_given_text
 from appliance.configuration.settings import load_resolved
-from appliance.specifications.file_switches import without_file_switch
-from appliance.specifications.specification_files import Sources
+from rosmop.text.switch_words import without_file_switch
 
 _STATE = "control/state.db"
+
+
+class _Stored(msgspec.Struct, frozen=True):
+    """The part of a stored revision that is compared."""
+
+    files: dict[str, str] = {}
+
+
 _LAST = "SELECT sources FROM monitor_revision ORDER BY revision DESC LIMIT 1"
 
 
@@ -24,7 +31,7 @@ def specifications_in(name: str, copy: Path) -> Mapping[str, str]:
         if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'monitor_revision'").fetchone():
             return {}
         row = database.execute(_LAST).fetchone()
-    return msgspec.json.decode(row[0], type=Sources).files if row else {}
+    return msgspec.json.decode(row[0], type=_Stored).files if row else {}
 
 
 def lacking_in_folder(state: Path, texts: Mapping[str, str]) -> list[str]:

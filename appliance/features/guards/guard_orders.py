@@ -50,7 +50,6 @@ from appliance.features.guards.upgrades import Upgrade, same, upgraded
 from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState, OlderGuard
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
-from appliance.specifications.switches import word_of
 from appliance.telemetry.audit_trail import AuditTrail
 
 STOPPING_SECONDS = 2.0
@@ -150,7 +149,7 @@ class GuardOrders:
             place.elsewhere,
             place.bypassed,
             place.unanswered,
-            {name: word_of(switches.states[name]) for name in guards
+            {name: self._monitors.lasting(name) for name in guards
              if name not in switches.said and not switches.enabled(name)},
             [*self._older(guards)],
         )  # fmt: skip

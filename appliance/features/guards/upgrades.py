@@ -18,7 +18,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import order_of, origin_of, released
 from appliance.features.guards.robot_graph import TopicFacts
-from appliance.specifications.file_switches import Word
+from rosmop.text.switch_words import Word
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,15 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
-from appliance.cli.output import refuse_beside_dry_run, say_json, say_row, usage_error
-from appliance.cli.specification_folder import (
+from appliance.cli.monitor_changes import (
     folder_of,
     say_obstacle,
+    say_replaced,
+    say_shadow_deadline,
     write_specification,
     write_switches,
 )
+from appliance.cli.output import refuse_beside_dry_run, say_json, say_row, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.guards.guard_answers import GuardList, GuardRow
 from appliance.features.guards.guard_facts import preset_row, values_of

@@ -13,9 +13,8 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
-from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline
+from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline, write_switches
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
-from appliance.cli.specification_folder import write_switches
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import printable, say

@@ -16,9 +16,8 @@ from appliance.channel.admin import (
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor_changes import say_replaced
+from appliance.cli.monitor_changes import say_replaced, write_switches
 from appliance.cli.output import say_diff, say_json, usage_error
-from appliance.cli.specification_folder import write_switches
 from rosmop.tool.terminal import say
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision (default: the one in force)")]

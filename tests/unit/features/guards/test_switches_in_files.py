@@ -10,7 +10,7 @@ import pytest
 
 from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import Monitors, MonitorState
-from appliance.cli.specification_folder import write_switches
+from appliance.cli.monitor_changes import write_switches
 from appliance.control.operators.new_state import LACKS
 from appliance.features.guards import released as released_presets
 from appliance.features.guards import requests as guard_requests
@@ -21,8 +21,8 @@ from appliance.features.guards.presets import PRESETS, Guard, text_of, with_valu
 from appliance.features.guards.released import origin_of
 from appliance.features.guards.view import GUARDS_VIEW, GuardsState
 from appliance.specifications.checking import contents
-from appliance.specifications.file_switches import Word, file_switch, with_file_switch, without_file_switch
 from appliance.specifications.specification_manager import SpecificationManager
+from rosmop.text.switch_words import Word, file_switch, with_file_switch, without_file_switch
 from tests.support.answers import example
 from tests.support.memory_call import call_of
 from tests.unit.features.guards.guard_desk import monitors_of
