@@ -34,7 +34,12 @@ class ScriptedNodes(NodeApiClient):
         self.closed: list[str] = []
 
     def client(
-        self, incarnation: Incarnation, *, pool: int = 0, limits: XmlRpcLimits = ANSWER
+        self,
+        incarnation: Incarnation,
+        *,
+        pool: int = 0,
+        limits: XmlRpcLimits = ANSWER,
+        patience: float = 1.0,
     ) -> XmlRpcClient:
         self.used.append(UsedClient(incarnation.name, pool, limits))
         return _Client(self, incarnation)

@@ -31,7 +31,7 @@ FAILURES = {
     "appliance/channel/admin.py::_decoder": OURS,
     "appliance/channel/rest_operation.py::_fields": OURS,
     "appliance/cli/verb_table.py::_text": OURS,
-    "appliance/cli/standing.py::_definitions": NEVER,
+    "appliance/cli/robot_motions.py::_definitions": NEVER,
     "appliance/configuration/config_sources.py::_reader": OURS,
     "appliance/configuration/inventory.py::inventory": OURS,
     "appliance/features/doors/rosbridge_frames.py::_publish_head": NEVER,
