@@ -15,6 +15,7 @@ from rosmop.fast.codegen_access import MOST_TEXTS
 from rosmop.fast.memory_layout import LINES
 from rosmop.fast.wasm_runner import BEGINNING
 from rosmop.form.findings import SpecificationError
+from rosmop.run.fast_path import Tried
 from rosmop.run.outcomes import MessageSender, Outcome
 from rosmop.runtime.wire import Buffer
 from rosmop.tests.acting import message
@@ -71,9 +72,11 @@ def test_only_changes_faults_and_large_messages_reach_the_engine(monkeypatch: py
     asked = []
     process = both.monitors.process
 
-    def counted(topic: str, buffer: Buffer, time_ns: int, sender: MessageSender) -> Outcome:
+    def counted(
+        topic: str, buffer: Buffer, time_ns: int, sender: MessageSender, tried: Tried = ""
+    ) -> Outcome:
         asked.append(bytes(buffer))
-        return process(topic, buffer, time_ns, sender)
+        return process(topic, buffer, time_ns, sender, tried=tried)
 
     monkeypatch.setattr(both.monitors, "process", counted)
     told, engine = (

@@ -255,7 +255,7 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
     publisher, subscriber = world.typed()
     monitors = world.engine.interceptor.monitors
     assert monitors is not None
-    monkeypatch.setattr(monitors, "process", lambda *_args: 1 / 0)
+    monkeypatch.setattr(monitors, "process", lambda *_args, **_named: 1 / 0)
     publisher.send(string("a"))
     assert "a defect of rosrv" in world.event("fault").text
     monkeypatch.undo()
