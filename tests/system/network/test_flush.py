@@ -97,7 +97,9 @@ def test_only_what_began_without_the_rules_ends(lab: Lab, isolation: Isolation) 
     for port, env in ((node, {"ROS_MASTER_URI": "x"}), (other, {}), (listener, {})):
         command = [sys.executable, "-c", PROGRAM, str(port)]
         programs.append(robot.popen(command, env=env, stdout=subprocess.PIPE, text=True))
-        assert programs[-1].stdout.readline() == "ready\n"
+        output = programs[-1].stdout
+        assert output is not None
+        assert output.readline() == "ready\n"
 
     def connect(port: int) -> socket.socket:
         with stranger.entered():
