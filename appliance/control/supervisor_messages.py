@@ -88,7 +88,7 @@ class SupervisorMessages:
                 self._base.policies.hosts_changed()
             case messages.RulesRestored():
                 record_removal(self._base.trail, message)
-                for work in self._base.lifeline.after_removal:
+                for work in self._base.lifeline.surroundings.after_removal:
                     work()
             case messages.ProbeFailed(reason):
                 self._base.listener_limits.probed(reason)

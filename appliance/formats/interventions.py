@@ -63,6 +63,7 @@ NO_INTERVENTION = frozenset(
         "recording missed", "ports checked",
         # the appliance itself
         "topics moved", "monitors restarted", "door failed", "adoption failed", "process failing", "probe failed",
+        "firewall restored", "graph restored",
         "probe passed", "reconciled", "checkpoint", "fleet not joined", "forwarding failed", "forwarding resumed",
         "forwarding gap", "disk has room", "clock synchronised", "protection forgotten", "certificate ends soon",
         "ended by the clock",

@@ -134,7 +134,7 @@ class DisturbedConnections:
         """End these; return the number of connections that began. Raises `NetworkError`.
 
         1. Between nodes and other machines, if they began since. `nodes` has keys of nodes (`is_node`).
-        2. Of other machines, to a program of this one on a `forwarded` port.
+        2. From other machines to a program of this one on a `forwarded` port.
         3. To the robot's own `master`: its callers, also of this machine, shall find RVMaster.
         4. From this machine to the appliance (`near`), if the appliance has lost its end: a rospy subscriber would wait
            for ever.

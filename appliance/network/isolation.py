@@ -44,7 +44,7 @@ from appliance.network.firewall.firewall_rules import (
     family_of,
 )
 from appliance.network.firewall.nft import TABLE, NftBackend
-from appliance.network.firewall.rule_watch import RuleWatch
+from appliance.network.firewall.rule_watch import RuleWatch, subscribed
 from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
 from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
@@ -302,7 +302,7 @@ class Isolation:
         )  # fmt: skip
 
     def watch_rules(self) -> RuleWatch:
-        return RuleWatch(self._host, frozenset({TABLE, close_ports.TABLE}))
+        return RuleWatch(subscribed(self._host), frozenset({TABLE, close_ports.TABLE}))
 
     def put_rules_back(self) -> list[str]:
         """Install the rules again if the kernel lacks some; return the purposes of these. Raises `NetworkError`.

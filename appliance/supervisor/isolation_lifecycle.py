@@ -36,7 +36,7 @@ from appliance.network.firewall.firewall_rules import (
     PeerAccess,
     PortRange,
 )
-from appliance.network.firewall.rule_watch import RuleWatch
+from appliance.network.firewall.rule_watch import RuleWatch, subscribed
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import (
     Namespace,
@@ -328,7 +328,7 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def watch_rules(self) -> list[RuleWatch]:
-        return [RuleWatch(self._namespace)]
+        return [RuleWatch(subscribed(self._namespace))]
 
     def restore(self) -> RestoredRules:
         found = [] if self.firewall is None else self.firewall.restore()

@@ -226,6 +226,7 @@ LISTENERS = {
     "appliance/features/fleet/process.py": "- the word `listen` is of an event stream that it reads",
     "appliance/features/selftest/probe_nodes.py": "- nodes of a self-test, for its seconds",
     "appliance/network/firewall/backend_check.py": "- it tries the firewall in a namespace of its own",
+    "appliance/network/firewall/rule_watch.py": "- it hears the kernel",
     "appliance/supervisor/port_check.py": "- it binds to see whether a port is free",
     "appliance/supervisor/state_directory.py": "- a lock, not a server",
     "fleet/rosrv_fleet/bundles/robot_routes.py": "collector",

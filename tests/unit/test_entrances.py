@@ -29,6 +29,7 @@ _NO_WAY_IN = frozenset(
         "links.start",
         "links.kill",
         "links.before_end",
+        "links.after_removal",
         "policy.provide",
         "policy.on_change",
         "policy.on_first",

@@ -43,6 +43,8 @@ class Surroundings:
         self.machine: tuple[Address, ...] = ()  # addresses of the robot's machine
         self.probe = ""
         self.master = ""
+        self.after_removal: list[Callable[[], None]] = []
+        """Called when rules of the firewall are in force again that another program had removed."""
 
 
 class SupervisorQuestions:
@@ -149,8 +151,6 @@ class ControlLifeline:
         self.announced = False
         self.questions = SupervisorQuestions(self.say)
         self._before_end: list[Callable[[], Awaitable[None]]] = []
-        self.after_removal: list[Callable[[], None]] = []
-        """Called when rules of the firewall are in force again that another program had removed."""
         self._early: dict[tuple[object, ...], tuple[object, tuple[int, ...]]] = {}
         self._heard: Heard = self.queue
 

@@ -444,7 +444,7 @@ class AdoptOperation:
     async def _clear_master(self, facts: MachineFacts) -> None:
         """Undo what was registered at the robot's own master only: other machines may have reached it.
 
-        A node of this machine that started meanwhile is taken over. Parameters get the present values.
+        A node of this machine that started in the meantime is taken over. Parameters get the present values.
         """
         if facts.master is None or facts.foreign_master:
             return

@@ -24,12 +24,12 @@ _BUFFER = 1 << 20
 
 
 class RuleWatch:
-    """Hears changes of some tables in a namespace; without names, of all."""
+    """Hears changes of some tables by a socket of `subscribed`; without names, of all."""
 
-    def __init__(self, namespace: Namespace, tables: frozenset[str] = frozenset()) -> None:
+    def __init__(self, opened: socket.socket, tables: frozenset[str] = frozenset()) -> None:
         self._tables = tables
         self._touched = False  # in the transaction whose messages are being read
-        self._socket = namespace.run(_subscribed)
+        self._socket = opened
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -62,6 +62,11 @@ class RuleWatch:
             elif kind not in _ELEMENTS:
                 table = _text(attributes.get(_TABLE, b""))
                 self._touched = self._touched or not self._tables or table in self._tables
+
+
+def subscribed(namespace: Namespace) -> socket.socket:
+    """Return a socket that hears the changes in a namespace. Raises `OSError`."""
+    return namespace.run(_subscribed)
 
 
 def _subscribed() -> socket.socket:

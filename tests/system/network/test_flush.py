@@ -90,7 +90,7 @@ def isolation(lab: Lab, tmp_path: Path) -> Iterator[Isolation]:
 
 @pytest.mark.nightly
 def test_only_what_began_without_the_rules_ends(lab: Lab, isolation: Isolation) -> None:
-    """And only of nodes, or of programs on the appliance's ports. A half-open connection ends, too."""
+    """And only of nodes, or of programs on the appliance's ports. A half-open connection also ends."""
     robot, stranger = lab.hosts["robot"], lab.host("stranger", "10.77.0.66/24")
     node, other, listener = 40001, 40002, 20001
     programs = []

@@ -836,7 +836,7 @@ def test_a_kill_between_two_calls_to_the_own_master_loses_nothing(calls: int, wa
     run(story)
 
 
-def test_nothing_of_a_stranger_stays_at_the_own_master() -> None:
+def test_nothing_of_an_unknown_host_stays_at_the_own_master() -> None:
     """Neither a new name, nor a name of the robot with another URI, nor a changed parameter."""
 
     async def story(world: RobotWorld) -> None:
@@ -876,7 +876,7 @@ def test_a_node_that_starts_while_the_rules_are_removed_is_taken_over() -> None:
     run(story)
 
 
-def test_a_rest_without_strangers_is_no_record() -> None:
+def test_a_second_taking_without_unknown_hosts_leaves_no_record() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()
         await taken_again(world)

@@ -1,14 +1,10 @@
 import socket
-from collections.abc import Callable, Iterator
-from typing import TypeVar, cast
+from collections.abc import Iterator
 
 import pytest
 
 from appliance.network.firewall.rule_watch import RuleWatch
-from appliance.network.namespaces import Namespace
 from tests.support.nftables_reports import CHAIN_REMOVED, ELEMENT_ADDED, RULE_ADDED, generation, report
-
-T = TypeVar("T")
 
 
 @pytest.fixture
@@ -16,12 +12,8 @@ def kernel(sockets: None) -> Iterator[tuple[RuleWatch, socket.socket]]:
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     here.setblocking(False)
 
-    class Host(Namespace):
-        def run(self, _function: Callable[[], T]) -> T:
-            return cast(T, here)
-
     with here, there:
-        yield RuleWatch(Host("host"), frozenset({"rosrv"})), there
+        yield RuleWatch(here, frozenset({"rosrv"})), there
 
 
 def test_a_transaction_is_heard_with_its_program_once_it_is_complete(
