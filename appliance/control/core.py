@@ -95,7 +95,7 @@ class Links:
 
     def after_removal(self, work: Callable[[], None]) -> None:
         """Call `work` when rules of the firewall are in force again that another program had removed."""
-        self._lifeline.surroundings.after_removal.append(work)
+        self._lifeline.after_removal(work)
 
     def processes(self) -> list[ProcessInfo]:
         return self._lifeline.surroundings.processes

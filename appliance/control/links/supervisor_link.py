@@ -169,6 +169,9 @@ class ControlLifeline:
     def before_end(self, work: Callable[[], Awaitable[None]]) -> None:
         self._before_end.append(work)
 
+    def after_removal(self, work: Callable[[], None]) -> None:
+        self.surroundings.after_removal.append(work)
+
     async def finish(self) -> None:
         """Finish the work of features before an ordered end."""
         for work in self._before_end:
