@@ -356,7 +356,7 @@ COUNTS = (
     Count("spoken", f"core files with an identifier of {_NAMED}", 9, 9, core_files_that_name_features),
     Count("walkers", "modules with SQL of their own that reads the audit log", 3, 3, walkers_of_the_audit_log),
     Count("registration", "files of one registerPublisher", 48, 48, files_of_a_registration),
-    Count("wide", "classes with 15 attributes or more", 30, 30, classes_with_many_attributes),
+    Count("wide", "classes with 15 attributes or more", 32, 30, classes_with_many_attributes),
     Count("any", "uses of `Any` in product code", 494, 494, uses_of_any),
 )  # fmt: skip
 
