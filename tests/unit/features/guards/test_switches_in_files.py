@@ -185,7 +185,7 @@ def written(
     folder: Path | None, text: str, *, lasting: str = "off", place: str | None = None, **loaded: Any
 ) -> None:
     row = example(MonitorState, name="deadman", file="deadman.rv", lasting=lasting)
-    plain = {"folder": None if folder is None else str(folder), "site_keys": []}
+    plain: dict[str, Any] = {"folder": None if folder is None else str(folder), "site_keys": []}
     answer = example(Monitors, monitors=[row], files={"deadman.rv": text}, **plain | loaded)
     write_switches(call_of(lambda _request: answer, place=place), ["deadman"])
 
@@ -216,7 +216,7 @@ def test_a_switch_that_is_only_in_the_state_directory_is_named(
         None if why == "no folder" else tmp_path,
         PLAIN,
         place="https://10.0.0.2:8443" if why == "rest" else None,
-        **({"site_keys": ["ours"]} if why == "signed" else {}),
+        site_keys=["ours"] if why == "signed" else [],
     )
     told = " ".join(capsys.readouterr().out.split())
     assert "the switch of deadman is only in the state directory" in told
