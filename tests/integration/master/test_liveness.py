@@ -8,9 +8,8 @@ from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import Client, RosSession, has_ros
-from tests.support.processes import Process, ThisMachine
+from tests.support.processes import LIMIT, Process, ThisMachine
 from tests.support.requirements import needs
-from tests.support.waiting import LIMIT
 
 MONITORS = Path(__file__).parents[3] / "monitors"
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -53,8 +52,13 @@ def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(lab: Lab, robot: Ho
 
         def live_and_die() -> None:
             asked: list[str] = []
+
+            def get_pid(caller_id: str) -> list[object]:
+                asked.append(caller_id)
+                return [1, "", 7]
+
             with SimpleXMLRPCServer(("10.77.0.10", 0), _AnyPath, logRequests=False) as server:
-                server.register_function(lambda caller: asked.append(caller) or [1, "", 7], "getPid")
+                server.register_function(get_pid, "getPid")
                 server.timeout = LIMIT
                 with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
                     for name, path in paths.items():

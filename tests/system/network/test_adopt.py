@@ -1,6 +1,7 @@
 """Adopt and release a running robot of unmodified nodes and its stock master, in a namespace, without a restart."""
 
 import os
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -86,6 +87,36 @@ def test_cycles_of_adopt_and_release_restart_nothing_and_lose_little(
     for name, (good, bad) in calls.items():
         assert good > 100
         assert bad <= (2 * CYCLES if name.endswith("persistent") else 0), name
+
+
+_ODD = """
+import os, xmlrpc.client, xmlrpc.server
+
+class AnyPath(xmlrpc.server.SimpleXMLRPCRequestHandler):
+    rpc_paths = ()
+
+server = xmlrpc.server.SimpleXMLRPCServer(("127.0.0.1", 0), AnyPath, logRequests=False)
+uri = f"http://127.0.0.1:{server.server_address[1]}/%d%s%n/"
+answers = {"getPid": os.getpid(), "getBusInfo": [], "getPublications": [], "getSubscriptions": [], "publisherUpdate": 0}
+for name, value in answers.items():
+    server.register_function(lambda *_given, value=value: [1, "", value], name)
+xmlrpc.client.ServerProxy("http://127.0.0.1:11311").registerSubscriber("/odd", "/rospy", "std_msgs/String", uri)
+print('{"event": "ready"}', flush=True)
+server.serve_forever()
+"""
+
+
+@pytest.mark.nightly
+def test_a_percent_sign_in_the_uri_of_a_node_ends_no_adoption(robot: Robot, appliance: Appliance) -> None:
+    odd = robot.ros.start([sys.executable, "-c", _ODD], label="a node with an odd URI")
+    odd.wait_for(event="ready")
+    for arguments in (("adopt", "--check"), ("adopt",)):
+        assert "defect" not in rosrv(robot, appliance, *arguments)
+    appliance.start()
+    until_taken(robot, appliance)
+    robot.hears()
+    rosrv(robot, appliance, "release")
+    robot.hears()
 
 
 @pytest.mark.nightly
