@@ -2,6 +2,7 @@ import os
 import signal
 import xmlrpc.client
 from pathlib import Path
+from typing import Any
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from examples.landshark.lab import Host, Lab
@@ -53,7 +54,7 @@ def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(lab: Lab, robot: Ho
         def live_and_die() -> None:
             asked: list[str] = []
 
-            def get_pid(caller_id: str) -> list[object]:
+            def get_pid(caller_id: Any) -> Any:
                 asked.append(caller_id)
                 return [1, "", 7]
 
