@@ -58,7 +58,9 @@ def _lost(lines: int, since: str) -> str:
     return f"{log.warning(f'lines of the log were lost since {since}', lines=lines)}\n"
 
 
-def _printable(_logger: Any, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+def _printable(
+    _logger: object, _method: str, event: structlog.typing.EventDict
+) -> structlog.typing.EventDict:
     return {name: _shown(value) if isinstance(value, str) else value for name, value in event.items()}
 
 

@@ -335,7 +335,7 @@ class DoorProcesses:
             caller_id=found.later[0][:200],
             category="topic",
             resource=found.later[1][:200],
-            reads=True,
+            reads=hosts[1] is None,  # without a host there is no quota, so repetitions are only counted
             earlier=found.earlier[0][:200],
             type=found.type[:200],
         )

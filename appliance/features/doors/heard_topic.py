@@ -29,7 +29,7 @@ class HeardTopic(Generic[Client]):
     clients: dict[Client, SubscribeTopic] = field(default_factory=dict)
     header: Mapping[str, str] | None = None
     told: dict[TypeKey, str] = field(default_factory=dict)
-    """What clients got to know about types that do not count."""
+    """The reasons that clients got, by types that do not count."""
     doubtful: bool = False
     """Whether the policy has changed since the master last granted the subscription."""
     _known: tuple[Mapping[str, str], KnownType] | None = None

@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
+import pytest
+
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
@@ -15,10 +17,6 @@ from tests.support.requirements import needs
 MONITORS = Path(__file__).parents[3] / "monitors"
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 NOBODY = "http://10.77.0.10:1/"
-
-
-class _AnyPath(SimpleXMLRPCRequestHandler):
-    rpc_paths = ()
 
 
 def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
@@ -45,8 +43,11 @@ def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
         assert [record["caller_id"] for record in appliance.recorded("--event", "node lost")] == ["/brief"]
 
 
-def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(lab: Lab, robot: Host) -> None:
+def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(
+    lab: Lab, robot: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A node chooses the path of its own URI, and dies like any other."""
+    monkeypatch.setattr(SimpleXMLRPCRequestHandler, "rpc_paths", ())  # any path
     middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 0.1}\n"
     paths = {"/one": "%d/", "/two": "%s%s/", "/three": "%/"}
     with Appliance(middle, settings=settings, options=("--api", "off")) as appliance:
@@ -58,7 +59,7 @@ def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(lab: Lab, robot: Ho
                 asked.append(caller_id)
                 return [1, "", 7]
 
-            with SimpleXMLRPCServer(("10.77.0.10", 0), _AnyPath, logRequests=False) as server:
+            with SimpleXMLRPCServer(("10.77.0.10", 0), logRequests=False) as server:
                 server.register_function(get_pid, "getPid")
                 server.timeout = LIMIT
                 with xmlrpc.client.ServerProxy(appliance.master_uri) as master:

@@ -18,7 +18,7 @@ _EVERY = "/aZ09_.~!$&'()*+,;=:@%/-/"  # each character that a path may have
 @pytest.mark.usefixtures("sockets")
 @pytest.mark.parametrize("path", ["/%d/%s/%n", "/%", "/%%%(a)s", _EVERY])
 async def test_a_path_is_sent_as_the_node_wrote_it(path: str) -> None:
-    """A path belongs to its node, so it is no part of a format string."""
+    """A path belongs to its node, so a format string must not contain it."""
     heads: list[bytes] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -390,11 +390,8 @@ def test_a_terminal_gets_no_control_characters(text: str, capsys: pytest.Capture
 @texts
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_line_of_the_log_is_one_line(text: str, terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Stream(io.StringIO):
-        def isatty(self) -> bool:
-            return terminal
-
-    stream = Stream()
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: terminal)
     monkeypatch.setattr("sys.stderr", stream)
     before, handlers = structlog.get_config(), logging.root.handlers[:]
     try:

@@ -289,7 +289,7 @@ async def next_warning(client: WebSocketClient) -> str:
 
 
 async def test_a_definition_with_the_same_md5sum_changes_nothing_on_another_topic() -> None:
-    """A guest sent its definition first. What clients hear and send, they do with that of the topic's own publisher."""
+    """A guest sent its definition first. Clients still read and write with that of the topic's own publisher."""
     async with door_world() as world:
         guest, robot = await world.robot("10.0.0.66", "/guest"), await world.robot("10.0.0.3", "/robot")
         await publishes(guest, "/guest/drive", "own/Drive", LEFT)
