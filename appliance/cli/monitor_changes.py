@@ -15,7 +15,7 @@ from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Re
 from appliance.cli.commit_confirm import say_deadline
 from appliance.cli.connection.target import Appliance
 from appliance.cli.output import moment
-from rosmop.text.switch_words import with_file_switch
+from rosmop.form.switch_words import with_file_switch
 from rosmop.tool.terminal import say
 
 

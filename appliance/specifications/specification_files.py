@@ -10,7 +10,7 @@ import msgspec
 from appliance.base.input_files import entries_of, files_below, read_given_text, stat_given
 from appliance.channel import messages
 from appliance.signing.site_keys import UnsignedError, read_signature, signer
-from rosmop.text.switch_words import without_file_switch
+from rosmop.form.switch_words import without_file_switch
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_view import read_fields

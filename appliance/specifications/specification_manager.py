@@ -60,7 +60,7 @@ from appliance.store.ends import EndTable
 from appliance.store.revisions import reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
-from rosmop.text.switch_words import Word, file_switch
+from rosmop.form.switch_words import Word, file_switch
 
 _NO_FOLDER = (
     "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
-from rosmop.text.switch_words import Word
+from rosmop.form.switch_words import Word
 
 SHADOW: Literal["shadow"] = "shadow"
 Switch = bool | Literal["shadow"]

@@ -9,7 +9,7 @@ import msgspec
 
 from appliance.base.input_files import read_given_text
 from appliance.configuration.settings import load_resolved
-from rosmop.text.switch_words import without_file_switch
+from rosmop.form.switch_words import without_file_switch
 
 _STATE = "control/state.db"
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 
 from appliance.features.guards.presets import Preset
-from rosmop.text.switch_words import without_file_switch
+from rosmop.form.switch_words import without_file_switch
 
 _DIGITS = 16
 

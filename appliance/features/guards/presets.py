@@ -17,7 +17,7 @@ from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import meant
 from appliance.features.guards import old_form
 from appliance.features.guards.old_form import Head
-from rosmop.text.switch_words import Word
+from rosmop.form.switch_words import Word
 from rosmop.types import given_lists
 from rosmop.types.roles import ANY_TYPE, types_of_roles
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 from appliance.features.guards import old_form, presets
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, Preset, head_of
-from rosmop.text.switch_words import file_switch
+from rosmop.form.switch_words import file_switch
 from rosmop.types.roles import ANY_TYPE
 
 FOLDER = presets.FOLDER / "released"

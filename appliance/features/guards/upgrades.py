@@ -18,7 +18,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import order_of, origin_of, released
 from appliance.features.guards.robot_graph import TopicFacts
-from rosmop.text.switch_words import Word
+from rosmop.form.switch_words import Word
 
 
 @dataclass(frozen=True)

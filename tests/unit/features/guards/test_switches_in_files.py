@@ -22,7 +22,7 @@ from appliance.features.guards.released import origin_of
 from appliance.features.guards.view import GUARDS_VIEW, GuardsState
 from appliance.specifications.checking import contents
 from appliance.specifications.specification_manager import SpecificationManager
-from rosmop.text.switch_words import Word, file_switch, with_file_switch, without_file_switch
+from rosmop.form.switch_words import Word, file_switch, with_file_switch, without_file_switch
 from tests.support.answers import example
 from tests.support.memory_call import call_of
 from tests.unit.features.guards.guard_desk import monitors_of
