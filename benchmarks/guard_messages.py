@@ -6,8 +6,8 @@ on that topic, caches warm, without the guard's ticks. Where the last release ha
 present one, message by message: the ratio is what the changes cost.
 
 With `--deployed`, lone scans of 1,080 rays go from a rospy node to another through an appliance, in turns on a topic
-that no monitor reads, and on one for each preset that reads scans. Before each, a motion is commanded. The delay is
-from `publish` until the callback, and its ratio is to that without a monitor.
+that no monitor reads, on one for each preset that reads scans, and on one with a monitor that does nothing. Before
+each, a motion is commanded. The delay is from `publish` until the callback, and its ratio is to that without a monitor.
 """
 
 import argparse
@@ -223,6 +223,7 @@ def deployed(rays: int, scans: int) -> int:
         )
         for preset, name in reading
     }  # fmt: skip
+    texts["idle"] = "idle() { event scan() /idle sensor_msgs/LaserScan '{}' { } }"
     topics = ["/none", *(f"/{name}" for name in texts)]
     with (
         Appliance(monitors=texts) as appliance,
