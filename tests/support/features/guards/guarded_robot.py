@@ -30,7 +30,7 @@ from tests.support.processes import Event, Process
 from tests.support.waiting import eventually
 
 RAYS = (180, 360, 720, 1080, 1650)
-"""Of the scanners in use."""
+"""Numbers that scanners in use have."""
 JOINTS = [f"joint_{number}" for number in range(7)]
 POINTS = 50
 GARBAGE = (b"\xff" * 7).hex()
@@ -171,7 +171,7 @@ def rows(rays: int = RAYS[-1]) -> list[Row]:
 
 
 WAIT = {"arm", "joints", "withhold"}
-"""Presets that wait for a node that is gone until they begin again, `arm` for as long as a check counts."""
+"""Presets that wait for a node that has ended until they begin again, `arm` for as long as a check counts."""
 
 
 class GuardedRobot:
@@ -301,7 +301,7 @@ class Passage:
     lost: Mapping[str, int]
     faults: Sequence[str]
     again: float
-    """The seconds until the base moved after the sensors had fallen silent once more."""
+    """The seconds until the base moved after the sensors were silent once more."""
 
     def __str__(self) -> str:
         lost = ", ".join(f"{count} of {topic} lost" for topic, count in self.lost.items())
@@ -365,7 +365,7 @@ def silence(robot: GuardedRobot) -> None:
 
 
 def another_node(robot: GuardedRobot) -> None:
-    """Let other nodes send on all topics and go. Guards that have to be told that a node is gone are told it."""
+    """Let other nodes send on all topics and end. Guards with `forget` forget them, and those in `WAIT` begin again."""
     guests = [robot.talker(f"other_{sender}", sender) for sender in robot.streams]
     threading.Event().wait(0.5)
     for guest in guests:
