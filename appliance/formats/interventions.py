@@ -54,7 +54,7 @@ NO_INTERVENTION = frozenset(
         "monitor log", "monitor called", "monitor published", "shadow observed", "stop begun", "stop ended",
         "publication refused", "malformed", "connection opened", "connection closed", "connection refused",
         "limit exceeded", "rate limited", "denials folded", "repetitions folded", "door connected",
-        "door disconnected", "door entry refused", "tunnel up", "tunnel moved", "tunnel down", "tunnel refused",
+        "definitions differ", "door disconnected", "door entry refused", "tunnel up", "tunnel moved", "tunnel down", "tunnel refused",
         "packets refused", "enrolment refused", "renewal refused", "sign-on refused", "order refused",
         # orders that were refused, and looks
         "policy refused", "specifications refused", "bundle metadata rejected", "switchover failed", "rest call",
@@ -66,7 +66,7 @@ NO_INTERVENTION = frozenset(
         "firewall restored", "graph restored",
         "probe passed", "reconciled", "checkpoint", "fleet not joined", "forwarding failed", "forwarding resumed",
         "forwarding gap", "disk has room", "clock synchronised", "protection forgotten", "certificate ends soon",
-        "ended by the clock",
+        "ended by the clock", "state directory new",
         "certificate ended",
     }
 )  # fmt: skip

@@ -61,12 +61,12 @@ class XmlRpcClient:
         more = "" if bare else "User-Agent: rosrv\r\nContent-Type: text/xml\r\n"
         more += "" if pool else "Connection: close\r\n"
         head = f"POST {uri.path} HTTP/1.1\r\nHost: {host}:{uri.port}\r\n{more}Content-Length: "
-        self._head = head.encode("ascii")
+        self.head = head.encode("ascii")
 
     async def call(self, method: str, *params: Value) -> Value:
         """Make a call. Raises `CallFailedError`, even if the peer is slow, silent or misbehaves."""
         body = await self._written(method, params)
-        request = b"%b%d\r\n\r\n%b" % (self._head, len(body), body)  # no format has a path of the peer
+        request = b"%b%d\r\n\r\n%b" % (self.head, len(body), body)  # no format has a path of the peer
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
         try:
             response = await self._exchange(request, seconds)

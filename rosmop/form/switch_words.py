@@ -7,7 +7,9 @@ import re
 from typing import Literal, cast
 
 Word = Literal["on", "shadow", "off"]
-_STATEMENT = re.compile(r"(preset\s+\w+\s+\d+\s+as\s+(\w+))(?:\s+(on|shadow|off))?(?=\s*\{)", re.ASCII)
+_STATEMENT = re.compile(
+    r"(preset\s++\w++\s++\d++\s++as\s++(\w++))(?:\s++(on|shadow|off))?+(?=\s*+\{)", re.ASCII
+)
 
 
 def file_switch(text: str) -> Word | None:

@@ -428,7 +428,7 @@ class ControlParts:
             nodes=self.nodes,
             redecide_for=self.enforcement.redecide_for,
         )
-        self._serve = self._api.handler()
+        self.serve = self._api.handler()
 
     def surround(self) -> None: ...
 
@@ -466,7 +466,7 @@ class ControlParts:
     ) -> Value:
         """Make a call: of RVMaster, of the node `target`, or by the appliance's own node (`own`)."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
-        serve = self._api.handler(own=own, target=target) if own or target is not None else self._serve
+        serve = self._api.handler(own=own, target=target) if own or target is not None else self.serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "4001") -> None:

@@ -46,6 +46,7 @@ LIMITED = {
     "roswire.xmlrpc.common_documents:_ANSWER": "32 KiB, `_LONGEST`",
     "roswire.xmlrpc.common_documents:_ANSWER_IN": "32 KiB, `_LONGEST`",
     "roswire.xmlrpc.common_documents:_VALUE": "finds one value behind the other, in what another pattern has matched",
+    "rosmop.form.switch_words:_STATEMENT": "an operator's file; each part is possessive, so a character is read once",
 }
 """The value is the limit of the text or the reason why the bound is too high."""
 

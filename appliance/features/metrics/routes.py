@@ -58,16 +58,16 @@ def routes(services: Services) -> Routes:
 
 
 def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
-    return _page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
+    return page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
 
 
 def rendered_standby(state: Any, calls: Mapping[tuple[str, str], int]) -> bytes:
     """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
     samples = {**pair_view().samples(state), "rosrv_rest_calls_total": calls.items()}
-    return _page(samples, [metric for metric in METRICS if metric.name in samples])
+    return page(samples, [metric for metric in METRICS if metric.name in samples])
 
 
-def _page(samples: Mapping[str, _Samples], metrics: Iterable[Metric]) -> bytes:
+def page(samples: Mapping[str, _Samples], metrics: Iterable[Metric]) -> bytes:
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Once([_family(metric, samples[metric.name]) for metric in metrics]))
     return generate_latest(registry)

@@ -13,6 +13,7 @@ PUBLISHED = {
     "_exit": "of os: a process that ends as if it were killed",
     "_set_running_loop": "of asyncio: for authors of event loops",
     "_create_unverified_context": "of ssl: a browser's user who clicks the warning away",
+    "_buff": "of rospy.AnyMsg: the bytes of a message",
     "_connection_header": "of rospy: how a node learns who sent a message",
     "_marshaled_dispatch": "of xmlrpc.server: what its own request handler calls",
     "_run": "of asyncio.Handle: what an event loop calls",

@@ -107,7 +107,7 @@ async def calls_of_the_master(text: str) -> None:
     for name, count in [(name, count) for name in names for count in range(1, 6)]:
         request = HttpRequest(Peer(HOST, str(HOST), "10.0.0.1"), "/", body % (name, value * count), 0)
         try:
-            answer = parse_response(await parts._serve(request))
+            answer = parse_response(await parts.serve(request))
         except FaultReceived as fault:
             assert "Traceback" not in fault.text and "defect" not in fault.text
         except PeerError as error:  # the server answers it with the status 400
@@ -126,7 +126,7 @@ def answers_of_nodes(text: str) -> None:
             except InvalidUriError as error:
                 assert str(error).isprintable()
                 continue
-            first, *fields = XmlRpcClient(uri, timeout=1.0)._head.split(b"\r\n")
+            first, *fields = XmlRpcClient(uri, timeout=1.0).head.split(b"\r\n")
             assert first.startswith(b"POST ") and first.count(b" ") == 2 and len(fields) == 5
     document = build_response([1, "x", 0]).replace(b"x", raw(html.escape(text)), 1)
     try:
@@ -346,7 +346,7 @@ def record_of(text: str) -> None:
 def label_of(text: str) -> None:
     metric = gauge("rosrv_x", "of a test", "host")
     try:
-        page = metric_routes._page({"rosrv_x": [((text,), 1.0)]}, [metric])
+        page = metric_routes.page({"rosrv_x": [((text,), 1.0)]}, [metric])
     except UnicodeEncodeError:
         assert not text.isascii()  # no record or registration has it: names are ASCII
         return

@@ -16,6 +16,7 @@ from appliance.features.doors.door_processes import ROLE, DoorProcesses
 from appliance.features.doors.door_rows import DoorRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import Doors
+from appliance.policy.model import address_of
 from appliance.policy.policy_compiler import compile_policy
 from appliance.specifications.in_force import InForce
 from appliance.specifications.specification_files import Sources
@@ -25,6 +26,13 @@ from tests.support.idle import idle
 from tests.support.memory_channel import memory_link
 
 ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
+
+
+HOSTS = {
+    "/base": address_of("127.0.0.1"),
+    "/guest": address_of("10.0.0.66"),
+    "/other": address_of("10.0.0.67"),
+}
 
 
 class DoorSite:
@@ -39,7 +47,9 @@ class DoorSite:
         lifeline = idle(ControlLifeline)
         monkeypatch.setattr(lifeline, "say", self.asked.append)
         links = Links(lifeline, lambda _sequence: None)
-        self.core = replace(idle_core(home), trail=self.trail, links=links)
+        core = idle_core(home)
+        graph = replace(core.graph, host_of=HOSTS.get)
+        self.core = replace(core, trail=self.trail, links=links, graph=graph)
         self.policies = self.core.policy.revisions
         self.policies.policy.set(compile_policy(f"{EMPTY}[Ports]\nrange = 19001-20000\n", file="policy"))
         self.table = DoorTable(self.core.store, Doors())

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -6,7 +5,6 @@ import pytest
 from appliance.channel import messages
 from appliance.features.doors import door_link
 from appliance.features.doors.view import DOORS_VIEW, DoorsState
-from appliance.policy.model import address_of
 from tests.support.virtual_clock import let_time_pass
 from tests.unit.features.doors.door_site import ALICE, DoorSite, settled
 
@@ -174,15 +172,7 @@ async def test_a_full_door_and_one_that_keeps_ending_are_alarms(site: DoorSite) 
     assert alarms() == []
 
 
-HOSTS = {
-    "/base": address_of("127.0.0.1"),
-    "/guest": address_of("10.0.0.66"),
-    "/other": address_of("10.0.0.67"),
-}
-
-
 async def test_two_definitions_are_recorded_with_their_nodes_and_hosts(site: DoorSite) -> None:
-    site.core = site.processes._core = replace(site.core, graph=replace(site.core.graph, host_of=HOSTS.get))
     await site.hears(
         door_link.DefinitionsDiffer("own/Drive", "1f" * 16, ("/base", "/drive"), ("/guest", "/guest/drive"))
     )
@@ -194,7 +184,6 @@ async def test_two_definitions_are_recorded_with_their_nodes_and_hosts(site: Doo
 async def test_the_robots_machine_has_the_first_number_and_no_number_is_used_twice(
     site: DoorSite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    site.core = site.processes._core = replace(site.core, graph=replace(site.core.graph, host_of=HOSTS.get))
     monkeypatch.setattr("appliance.features.doors.door_processes._MOST_HOSTS", 1)
     await site.hears(door_link.HostsWanted(1, ["/gone", "/base", "/guest", "/other", "/guest"]))
     [given] = [one for one in site.sent if isinstance(one, door_link.HostsGiven)]

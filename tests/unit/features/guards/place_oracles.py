@@ -267,7 +267,9 @@ def joint_limits(seed: int, events: int = 25) -> None:  # noqa: PLR0912  one bra
     for _ in range(events):
         trace.wait(pause(chance, silent, 100))
         if chance.random() < 0.5:
-            known = [chance.choice((-1.5, 0.1, 1.6)) for _ in joints]  # as far apart as no command moves a joint
+            known = [
+                chance.choice((-1.5, 0.1, 1.6)) for _ in joints
+            ]  # as far apart as no command moves a joint
             heard = trace.now
             trace.observe("state", message("sensor_msgs/JointState", name=joints, position=known), 3, known)
             continue

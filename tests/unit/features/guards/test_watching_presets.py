@@ -588,7 +588,9 @@ def streamed(
     ("period", "after", "ahead"),
     [(2, 1, 0.02), (10, 1, 0.06), (20, 1, 0.14), (20, 20, 0.16), (50, 1, 0.14), (20, 200, 0.74)],
 )
-def test_a_stream_of_points_is_no_faster_than_one_trajectory(period: int, after: int, ahead: float) -> None:
+def test_a_stream_of_points_keeps_the_velocity_of_one_trajectory(
+    period: int, after: int, ahead: float
+) -> None:
     """MoveIt Servo and jog nodes send points: each is within `jump`, and the joint must not gain it with each one."""
     guard = Guarded("joints", low=-100, high=100)
     _place, fastest, _sent, _passing = streamed(guard, period, after, ahead)
