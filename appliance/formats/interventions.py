@@ -54,8 +54,9 @@ NO_INTERVENTION = frozenset(
         "monitor log", "monitor called", "monitor published", "shadow observed", "stop begun", "stop ended",
         "publication refused", "malformed", "connection opened", "connection closed", "connection refused",
         "limit exceeded", "rate limited", "denials folded", "repetitions folded", "door connected",
-        "definitions differ", "door disconnected", "door entry refused", "tunnel up", "tunnel moved", "tunnel down", "tunnel refused",
-        "packets refused", "enrolment refused", "renewal refused", "sign-on refused", "order refused",
+        "door disconnected", "door entry refused", "tunnel up", "tunnel moved", "tunnel down", "tunnel refused",
+        "definitions differ", "packets refused",
+        "enrolment refused", "renewal refused", "sign-on refused", "order refused",
         # orders that were refused, and looks
         "policy refused", "specifications refused", "bundle metadata rejected", "switchover failed", "rest call",
         "topic looked into", "monitor looked into",
