@@ -157,7 +157,7 @@ EVIDENCE: Mapping[str, Evidence] = {
             "test_the_curve_of_a_controller_keeps_the_limits_of_joints",
             "test_samples_of_a_motion_that_ends_at_a_limit_pass",
             "test_a_trajectory_needs_the_present_position_of_each_joint",
-            "test_a_stream_of_points_is_no_faster_than_one_trajectory",
+            "test_a_stream_of_points_keeps_the_velocity_of_one_trajectory",
         ),
     ),
     "rate": Evidence(

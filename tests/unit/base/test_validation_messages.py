@@ -72,7 +72,7 @@ def test_rest_explains_valid_parameters(app: FastAPI) -> None:  # noqa: F811  th
                     refusal(one) for one in field.validate(value, {}, loc=("query", field.name))[1] or ()
                 }
     assert not [one for one in told if LIBRARY.search(one)]
-    assert any("'allow', 'deny' or 'would deny'" in one for one in told)
+    assert any("'allow', 'deny', 'would deny' or 'ask'" in one for one in told)
     assert len(told) > 50
 
 

@@ -416,6 +416,11 @@ def needed(
 def test_a_velocity_is_scaled_by_the_distance_in_its_direction(direction: float, metres: float) -> None:
     guard = Guarded("separation")
     at = seen(guard, wall(metres, direction))
+    guard.drive(
+        twist(0.01 * math.cos(direction), 0.01 * math.sin(direction)), at
+    )  # the next scan has its direction
+    guard.drive(STILL_LEGS, at)
+    at = seen(guard, wall(metres, direction), at + 100, 40)
     for speed in (0.05, 0.5, 9.0):
         at += 1
         legs = guard.drive(twist(speed * math.cos(direction), speed * math.sin(direction)), at)
