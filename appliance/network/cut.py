@@ -35,14 +35,16 @@ from appliance.network.socket_owners import NodeSockets, SocketOwner, is_node, o
 REFUSED_SECONDS = 60
 _TABLE, _CLOSED = "inet rosrv-cut", "inet rosrv-closed"
 _PIDFD_GETFD = 438  # the number of the system call on every architecture
-_NETLINK_SOCK_DIAG, _SOCK_DESTROY, _NLMSG_ERROR = 4, 21, 2
-_REQUEST_ACK = 0x5  # NLM_F_REQUEST | NLM_F_ACK
-_ANY_STATE, _NO_COOKIE = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF
+_NETLINK_SOCK_DIAG, _SOCK_DIAG_BY_FAMILY, _SOCK_DESTROY, _NLMSG_ERROR = 4, 20, 21, 2
+_REQUEST, _REQUEST_ACK = 0x1, 0x5  # NLM_F_REQUEST; with NLM_F_ACK
+_ANY_STATE, _NO_COOKIE, _OF_NO_SOCKET = 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 0
 _HEAD = struct.Struct("=IHHII")  # struct nlmsghdr
 _ERROR = struct.Struct("=i")
+_FOUND = struct.Struct("=xB42xQ")  # struct inet_diag_msg: the state and the cookie
+_ENDED_STATES = (6, 7, 10)  # TIME_WAIT, CLOSE, and LISTEN, which is the port's listener
 _SECONDS = 2.0
 _NO_INODE = "0"  # of a connection that its process has not accepted yet
-_GONE = (errno.ENOENT, errno.ECONNREFUSED)  # it ended before its removal
+_GONE = (errno.ENOENT, errno.ECONNREFUSED, errno.ESTALE)  # it ended before its removal
 
 
 class RemotePort(NamedTuple):
@@ -75,7 +77,7 @@ def can_end_connections(namespace: Namespace) -> bool:
 
     def attempt() -> bool:
         with _diagnosis() as diag:
-            return not _destroy(diag, nothing, 1)
+            return bool(_diagnosed(diag, _SOCK_DESTROY, nothing, 1, _OF_NO_SOCKET)[1])
 
     try:
         return namespace.run(attempt)
@@ -270,18 +272,40 @@ def _libc() -> ctypes.CDLL:
 
 
 def _destroy(diag: socket.socket, one: TcpSocket, number: int) -> bool:
+    """Destroy a connection; return whether it still existed.
+
+    For a connection that has ended the kernel finds the listener of its port, and would destroy that. So the cookie of
+    the connection itself comes first.
+    """
+    answer, _ = _diagnosed(diag, _SOCK_DIAG_BY_FAMILY, one, number, _NO_COOKIE)
+    if answer is None:
+        return False
+    state, cookie = _FOUND.unpack_from(answer)
+    if state in _ENDED_STATES:
+        return False
+    _, code = _diagnosed(diag, _SOCK_DESTROY, one, number, cookie)
+    return not code
+
+
+def _diagnosed(
+    diag: socket.socket, kind: int, one: TcpSocket, number: int, cookie: int
+) -> tuple[bytes | None, int]:
+    """Return what the kernel tells of a connection, and the error if it is gone. Raises `OSError` for others."""
     family = socket.AF_INET6 if one.version == 6 else socket.AF_INET
     source, target = (socket.inet_pton(family, text).ljust(16, b"\0") for text in (one.address, one.peer))
     body = struct.pack(
         "=BBBBI", family, socket.IPPROTO_TCP, 0, 0, _ANY_STATE
-    ) + struct.pack(">HH", one.port, one.peer_port) + source + target + struct.pack("=IQ", 0, _NO_COOKIE)  # fmt: skip
-    diag.send(_HEAD.pack(_HEAD.size + len(body), _SOCK_DESTROY, _REQUEST_ACK, number, 0) + body)
+    ) + struct.pack(">HH", one.port, one.peer_port) + source + target + struct.pack("=IQ", 0, cookie)  # fmt: skip
+    flags = _REQUEST if kind == _SOCK_DIAG_BY_FAMILY else _REQUEST_ACK
+    diag.send(_HEAD.pack(_HEAD.size + len(body), kind, flags, number, 0) + body)
     while True:
         answer = diag.recv(8192)
-        _length, kind, _flags, sequence, _process = _HEAD.unpack_from(answer)
+        _length, told, _flags, sequence, _process = _HEAD.unpack_from(answer)
         if sequence != number:
             continue
-        code = -_ERROR.unpack_from(answer, _HEAD.size)[0] if kind == _NLMSG_ERROR else 0
+        if told != _NLMSG_ERROR:
+            return answer[_HEAD.size :], 0
+        code = -_ERROR.unpack_from(answer, _HEAD.size)[0]
         if code and code not in _GONE:
             raise OSError(code, os.strerror(code))
-        return not code
+        return None, code

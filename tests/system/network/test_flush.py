@@ -5,6 +5,7 @@ ROSRV_FLUSHES is the number of removals of each kind.
 
 import os
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from appliance.network.close_ports import LocalCallers, protection
-from appliance.network.cut import run_nft
+from appliance.network.cut import end_connections, run_nft
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
-from appliance.network.listening_sockets import tcp_sockets
+from appliance.network.listening_sockets import TcpSocket, tcp_sockets
 from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import Robot, rosrv, until_taken
 from tests.support.appliance import Appliance
@@ -138,6 +139,25 @@ def test_only_what_began_without_the_rules_ends(lab: Lab, isolation: Isolation) 
         for program in programs:
             program.kill()
             program.communicate(timeout=20)
+
+
+@pytest.mark.real
+def test_a_connection_that_ends_first_leaves_its_listener_alone(lab: Lab) -> None:
+    """For such a connection the kernel offers the listener, so a hasty caller made the robot's master deaf."""
+    robot = lab.host("robot", "10.77.0.10/24")
+    with robot.entered(), socket.create_server((robot.address, 0)) as listener:
+        port = int(listener.getsockname()[1])
+        caller = socket.create_connection((robot.address, port))
+        accepted, _ = listener.accept()
+        caller.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+
+        def ends_first(one: TcpSocket) -> bool:
+            caller.close()
+            accepted.close()
+            return one.port == port
+
+        assert end_connections(robot.namespace, ends_first) == 0
+        socket.create_connection((robot.address, port), timeout=5).close()
 
 
 def half_open(host: Host) -> list[int]:
