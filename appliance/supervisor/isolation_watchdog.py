@@ -11,7 +11,7 @@ than once: a peer may be late.
 import asyncio
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from functools import partial
 from typing import TypeVar
@@ -255,17 +255,22 @@ class IsolationWatchdog:
         began, self._intact_at = self._intact_at, restored_at
         if missing:
             at, by = changes[0] if changes else (began, "")
-            await self._restored(missing, by, self._intact_at - at, reported=bool(changes))
+            self._begin(self._restored(missing, by, self._intact_at - at, reported=bool(changes)))
+
+    def _begin(self, work: Coroutine[None, None, None]) -> None:
+        """End connections while the rules are watched, or the next removal would wait for that."""
+        task = asyncio.create_task(work)
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
 
     async def _restored(self, missing: list[str], by: str, seconds: float, *, reported: bool) -> None:
         log.critical("another program removed rules of the firewall, which are in force again",
                      by=by, seconds=round(seconds, 3), rules=missing)  # fmt: skip
+        at = self._intact_at
         ended = await self._end_once()
-        later = asyncio.create_task(self._end_later())
-        self._ending.add(later)
-        later.add_done_callback(self._ending.discard)
+        self._begin(self._end_later())
         since = f"for {seconds:.2g} s" if reported else f"for at most {math.ceil(seconds)} s"
-        self._removed = self._intact_at, (
+        self._removed = at, (
             f"{by or 'another program'} removed {counted(len(missing), 'rule')} of the firewall {since}, which are in"
             f" force again; {counted(ended, 'connection')} of that time ended. Other machines could reach the robot:"
             " let that program replace only its own tables (rosrv audit search --event 'firewall restored')"
