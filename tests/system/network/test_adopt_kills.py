@@ -35,7 +35,17 @@ from tests.system.network.test_adopt_nodes import (
 ROUNDS = int(os.environ.get("ROSRV_ADOPT_KILLS", "2"))
 LATEST = 0.2  # seconds from a step to the kill
 STEPS = {
-    "release": ("silence", "give", "withdraw", "give again", "tell", "given", "forget", "released"),
+    "release": (
+        "silence",
+        "stand in",
+        "give",
+        "withdraw",
+        "give again",
+        "tell",
+        "given",
+        "forget",
+        "released",
+    ),
     "adopt": ("read", "register", "forward", "connect", "tell", "cut", "read again", "hidden", "taken"),
 }
 ENDS = {"adopt": "taken", "release": "free"}
