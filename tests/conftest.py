@@ -1,7 +1,4 @@
 import contextlib
-import gc
-import os
-import signal
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -9,13 +6,10 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from appliance.network.namespaces import has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.examples import examples
-from tests.support.long_files import LONG
 from tests.support.nodes import RosSession, has_ros
-from tests.support.own_namespace import own_loopback
 from tests.support.processes import ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.site import Masters, Site
@@ -96,38 +90,3 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         for name, said in running.values():
             report.sections.append((f"What {name} said", said.story()[-_LONGEST_STORY:]))
     return report
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Let programs hear SIGINT, and as root give each worker of pytest-xdist its own loopback.
-
-    A script's background process ignores SIGINT, and so does every program that it starts: a test that interrupts it
-    would wait until the time limit. On a common loopback, the port of a killed node could go to the next node, which
-    would answer for it.
-    """
-    # The collected tests stay in memory: the garbage collector would scan their millions of objects again and again.
-    gc.set_threshold(700, 10, 100)
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if not hasattr(config, "workerinput") or not has_privileges():
-        return
-    inside = contextlib.ExitStack()
-    inside.enter_context(own_loopback())
-    config.add_cleanup(inside.close)
-
-
-@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    cores = len(os.sched_getaffinity(0))
-    return cores + 1 if config.option.numprocesses == "logical" else 2 * cores
-
-
-def pytest_collection_finish() -> None:
-    """Leave the collected tests and their modules out of the garbage collector's scans."""
-    gc.freeze()
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the files of tests/long.txt first, in the order of the list."""
-    rank = {name: number for number, name in enumerate(LONG)}
-    items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(LONG)))

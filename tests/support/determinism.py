@@ -53,6 +53,13 @@ class Watch:
             setattr(owner, name, self._forbidding(what, getattr(owner, name)))
         for name in _CLOCKS:
             setattr(time, name, self._clock(name, getattr(time, name)))
+        self._times = {name: value for name, value in vars(time).items() if callable(value)}
+
+    def restore_times(self) -> list[str]:
+        """Restore the functions of `time`, and return the names of those that a test has replaced."""
+        replaced = [name for name, value in self._times.items() if vars(time).get(name) is not value]
+        vars(time).update({name: self._times[name] for name in replaced})
+        return replaced
 
     @contextmanager
     def watching(self) -> Iterator[list[str]]:
