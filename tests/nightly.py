@@ -1,13 +1,9 @@
-"""Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
+"""Run the lanes of the night that tests/lanes.toml lists: `make nightly` all, `make lane NAME=nodes` one.
 
-The stages are in two lines that run side by side, because stages with real parts wait most of their time. It never
-stops at a failure, and ends with a table of the stages and the list of the failures. `--from STAGE`
-(`make nightly FROM=nodes`) resumes: the results of the same commit stand for the stages before it.
-`build/nightly/results.json` has passes, failures and seconds of each test, and the commit, start, end and load average
-of each run. Runs of the same commit add up. Network namespaces that are left after all stages, and a robot's start
-(`benchmarks/launch.py`) or a delay of a lone message (`benchmarks/cold.py`) that differs by more than 20 % from the
-table in `benchmarks/RESULTS.md`, are printed as findings. The exit status is 1 if a test failed that
-`tests/unsteady.txt` does not list, or if one of these programs failed.
+A test that fails runs once more alone. If it passes then, it is printed as `flaky` and counted; if not, the run is red.
+A lane ends after 45 minutes with a failure. `build/nightly/results.json` has passes, failures and seconds of each test,
+and the commit, start, end and load average of each run. Runs of the same commit add up, and `make nightly` leaves out
+the lanes that are green on it. `--record` writes them to `tests/green.json`, which `make release` reads.
 """
 
 import argparse
@@ -20,12 +16,11 @@ import signal
 import stat
 import subprocess
 import sys
-import threading
 import time
+import tomllib
 import xml.etree.ElementTree
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,95 +28,81 @@ from tests.support.sources import ROOT
 
 FOLDER = ROOT / "build" / "nightly"
 RESULTS = FOLDER / "results.json"
-_LONE = ("benchmarks.cold", "--ordinary", "--findings", "--modes", "paced100,paced1000", "--rounds", "8")
-MEASUREMENTS = {
-    "start": ("benchmarks.launch",),
-    "lone message": _LONE,
-    "lone message, busy": (*_LONE, "--busy"),
-}
-_RESULTS_LOCK = threading.Lock()
-UNSTEADY = ROOT / "tests" / "unsteady.txt"
-_STAGE_SECONDS = 90 * 60.0  # a stage that hangs ends, and counts as failed
-_END_SECONDS = 60.0  # for an interrupted stage to write its report
-
-LANES = {
-    "console": ("tests/system/console/",),
-    "packages": (
-        "tests/package/",
-        "tests/smoke/",
-        "tests/system/containers/",
-        "tests/system/vm/",
-        "tests/unit/distribution/",
-    ),
-    "standby": ("standby", "two_appliances", "lease", "insertion_at_large"),
-    "fleet": ("fleet", "bundle", "collector", "rollout"),
-    "recorder": ("recorder", "evidence", "recording"),
-    "language": ("rosmop/", "tests/proofs/", "monitor", "specification", "compiler"),
-}
-"""Words of each lane. A file is in the first lane with a word that its path contains, and otherwise in `core`."""
+GREEN = ROOT / "tests" / "green.json"
+TABLE: dict[str, dict[str, Any]] = tomllib.loads((ROOT / "tests" / "lanes.toml").read_text(encoding="utf-8"))
+# No test of a lane runs these. A release sets the version after the night.
+_NOT_RUN = (
+    ":!*.md",
+    ":!docs",
+    ":!benchmarks",
+    ":!tests",
+    ":!*/tests",
+    ":!lab",
+    ":!.ci",
+    ":!appliance/__init__.py",
+)
+_LANE_SECONDS = 45 * 60.0
+_END_SECONDS = 60.0  # for an interrupted run to write its report
+_REMEDY = """Run `make lane NAME=…`, then `.venv/bin/python -m tests.nightly --record`, and commit tests/green.json.
+To release nevertheless, give the reason: make release DESPITE="…"
+"""
+_MOST_AGAIN = 10  # more failures are not by chance
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Tests that run side by side on `workers` of pytest-xdist, or one after the other.
-
-    The tests of a file share a worker, and what the file makes for all of them, unless `spread`. A stage that
-    `computes` leaves the processors to the other line.
-    """
+class Lane:
+    """A row of the table; `part` is `2/3` for the second of its three parts."""
 
     name: str
-    folders: tuple[str, ...]
+    tests: Sequence[str] = ()
+    programs: Sequence[str] = ()
+    product: str = "appliance"
+    setup: str = ""
     workers: str = ""
     spread: bool = False
-    computes: bool = False
+    timeout: int = 300
+    parts: int = 1
+    part: str = ""
+
+    @property
+    def row(self) -> str:
+        return self.name.rpartition("-")[0] if self.part else self.name
 
     def options(self) -> list[str]:
         distribution = ("load",) if self.spread else ("loadfile", "--no-loadscope-reorder")
-        return ["-n", self.workers, "--dist", *distribution] if self.workers else []
+        options = ["-n", self.workers, "--dist", *distribution] if self.workers else []
+        return [*options, *(["--part", self.part] if self.part else []), f"--timeout={self.timeout}"]
 
 
-# A worker has no network but a loopback of its own, so tests that fetch packages run without workers, as do those that
-# start many processes themselves.
-LINES = (
-    (
-        Stage(
-            "machine",
-            (
-                "tests/integration/examples/test_ros2.py",
-                "tests/system/features/doors",
-                "tests/system/network/test_adopt_nodes.py",
-                "tests/system/vm",
-                "tests/system/console/test_sign_on.py",
-                "tests/system/test_examples.py",
-                "tests/system/test_generated_client.py",
-                "tests/system/test_recordings_cluster.py",
-            ),
-        ),
-        Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical", computes=True),
-        Stage(  # files that each compute for a quarter of an hour or more
-            "worlds",
-            (
-                "rosmop/tests/prove/test_equality.py",
-                "tests/world",
-                "tests/integration/test_entrance_mutants.py",
-                "tests/unit/features/test_without_a_feature.py",
-            ),
-            "logical",
-            spread=True,
-            computes=True,
-        ),
-    ),
-    (
-        Stage("nodes", ("tests/integration",), "auto"),
-        Stage("containers", ("tests/smoke", "tests/system/containers")),
-        Stage("namespaces", ("tests/system",), "auto"),
-        Stage("packages", ("tests/package",)),
-    ),
-)
-STAGES = tuple(stage for line in LINES for stage in line)
+def lanes() -> dict[str, Lane]:
+    found: dict[str, Lane] = {}
+    for name, row in TABLE["lanes"].items():
+        lane = Lane(name, **row)
+        parts = range(1, lane.parts + 1) if lane.parts > 1 else ()
+        split = [replace(lane, name=f"{name}-{part}", part=f"{part}/{lane.parts}") for part in parts] or [
+            lane
+        ]
+        found |= {one.name: one for one in split}
+    return found
 
 
-STEPS = (*(stage.name for stage in STAGES), *MEASUREMENTS)
+def row_of_file(file: str) -> str:
+    """Return the name of the row whose longest word the path begins with, or an empty one."""
+    words = ((word, name) for name, row in TABLE["lanes"].items() for word in row.get("tests", ()))
+    fitting = ((len(word), name) for word, name in words if file.startswith(word))
+    return max(fitting, default=(0, ""))[1]
+
+
+def every_file() -> list[str]:
+    tops = ("tests", "rosmop", "fleet", "lab")
+    return sorted(
+        path.relative_to(ROOT).as_posix() for top in tops for path in (ROOT / top).rglob("test_*.py")
+    )
+
+
+def files_of(lane: Lane, words: Sequence[str] = ()) -> list[str]:
+    mine = [file for file in every_file() if row_of_file(file) == lane.row]
+    return [file for file in mine if not words or any(word in file for word in words)]
 
 
 # Tests run programs of this checkout as other users. In a mount namespace of its own, an open folder with the same
@@ -158,21 +139,6 @@ def open_folders_above(checkout: Path) -> None:
     os.execvp("unshare", command)  # noqa: S606  util-linux, and our own script
 
 
-def lane_of(file: str) -> str:
-    return next((lane for lane, parts in LANES.items() if any(part in file for part in parts)), "core")
-
-
-def files_of_stages() -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {stage.name: [] for stage in STAGES}
-    roots = {folder: stage.name for stage in STAGES for folder in stage.folders}
-    tests = [ROOT / "tests", ROOT / "rosmop" / "tests"]
-    for path in sorted(path for root in tests for path in root.rglob("test_*.py")):
-        file = path.relative_to(ROOT).as_posix()
-        folder = max((one for one in roots if file == one or file.startswith(f"{one}/")), key=len)
-        found[roots[folder]].append(file)
-    return found
-
-
 def outcomes_of(report: Path) -> Iterator[tuple[str, str, float]]:
     for case in xml.etree.ElementTree.parse(report).iter("testcase"):  # noqa: S314  written by pytest
         kinds = {child.tag for child in case}
@@ -180,33 +146,31 @@ def outcomes_of(report: Path) -> Iterator[tuple[str, str, float]]:
         yield f"{case.get('file')}::{case.get('name')}", outcome, float(case.get("time", 0))
 
 
-def unsteady() -> set[str]:
-    """Return the ids in the file, in which each line has an id, a date and the reason."""
-    lines = UNSTEADY.read_text(encoding="utf-8").splitlines()
-    return {line.split()[0] for line in lines if line and not line.startswith("#")}
-
-
-def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, float]], str]:
-    report = FOLDER / f"{stage.name}.xml"
+def run_tests(
+    lane: Lane, files: list[str], seconds: float
+) -> tuple[list[tuple[str, str, float]], list[str], str]:
+    """Return the outcome of each test, those that passed only when they ran again, and what else went wrong."""
+    deadline = time.monotonic() + seconds
+    report, log = FOLDER / f"{lane.name}.xml", FOLDER / f"{lane.name}.log"
     report.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
-    command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
-    command += ["--timeout=1200"] if stage.computes else []  # a test has a part of a processor only
-    environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2"}  # while the other line computes
-    log = FOLDER / f"{stage.name}.log"
-    # The other line may have the processors for an hour.
-    seconds = _STAGE_SECONDS * (2 if stage.computes else 1)
-    status = run_limited(command, log, seconds, environment, low=stage.computes)
-    wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"
-    wrong = _late(seconds) if status is None else wrong
-    return (list(outcomes_of(report)) if report.exists() else []), wrong
-
-
-def _late(seconds: float) -> str:
-    return f"not finished after {seconds / 60:.0f} minutes"
-
-
-_RUNNING: set[int] = set()  # leaders of process groups
+    # The seeds of a night have its date, also in a test that runs again after midnight.
+    day = os.environ.get("TESTS_DAY") or _moment()[:10]
+    environment = {"TESTS_EXAMPLES": "all", "TESTS_PATIENCE": "2", "TESTS_DAY": day}
+    pytest = [sys.executable, "-m", "pytest", "-c", "pyproject.toml", "--rootdir=.", "--quiet", "--tb=short"]
+    command = [*pytest, *files, *lane.options(), f"--junitxml={report}", "-o", "junit_family=xunit1"]
+    status = run_limited(command, log, seconds, environment)
+    outcomes = list(outcomes_of(report)) if report.exists() else []
+    if status is None:
+        return outcomes, [], f"not finished after {seconds / 60:.0f} minutes"
+    failed = [test for test, outcome, _seconds in outcomes if outcome == "failed"]
+    alone = [*pytest, *(["-n", "1"] if lane.workers else []), f"--timeout={lane.timeout}"]
+    flaky: list[str] = []
+    for number, test in enumerate(failed if len(failed) <= _MOST_AGAIN else (), 1):
+        again, left = log.with_suffix(f".again-{number}.log"), deadline - time.monotonic()
+        if left > 0 and run_limited([*alone, test], again, left, environment) == 0:
+            flaky.append(test)
+    explained = status in (0, 5) or (status == 1 and failed)
+    return outcomes, flaky, "" if explained else f"pytest ended with status {status}"
 
 
 def run_limited(
@@ -214,15 +178,11 @@ def run_limited(
     output: Path,
     seconds: float,
     environment: Mapping[str, str] | None = None,
-    *,
-    low: bool = False,
 ) -> int | None:
     """Run a program and return its status, or None if it was interrupted after `seconds`.
 
-    A `low` one has what other programs leave of the processors.
-
     An interrupted pytest reports the tests that have ended. A minute later all processes of the program are killed, so
-    that none disturbs the next stage.
+    that none disturbs the next lane.
     """
     with (
         output.open("wb") as log,
@@ -235,12 +195,6 @@ def run_limited(
             start_new_session=True,
         ) as program,
     ):
-        _RUNNING.add(program.pid)
-        if low:
-            os.setpriority(os.PRIO_PROCESS, program.pid, 10)
-            # Where the kernel groups processes by session, only the group's own value counts against other sessions.
-            with contextlib.suppress(FileNotFoundError):
-                Path(f"/proc/{program.pid}/autogroup").write_text("10")
         try:
             return program.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -249,22 +203,19 @@ def run_limited(
                 program.wait(_END_SECONDS)
             return None
         finally:
-            _RUNNING.discard(program.pid)
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(program.pid, signal.SIGKILL)
 
 
-def measure(name: str) -> tuple[list[str], str]:
-    """Run a program of `MEASUREMENTS`. Return its findings, or the reason why it has none."""
-    status = run_limited([sys.executable, "-m", *MEASUREMENTS[name]], _log_of(name), _STAGE_SECONDS)
-    if status is None:
-        return [], _late(_STAGE_SECONDS)
-    wrong = f"{MEASUREMENTS[name][0]} ended with status {status}" if status else ""
-    return findings_of(_log_of(name).read_text(encoding="utf-8")), wrong
-
-
-def _log_of(name: str) -> Path:
-    return FOLDER / f"{name.replace(', ', '-').replace(' ', '-')}.log"
+def run_programs(lane: Lane, seconds: float) -> tuple[list[tuple[str, str, float]], list[str]]:
+    outcomes: list[tuple[str, str, float]] = []
+    findings: list[str] = []
+    for number, program in enumerate(lane.programs, 1):
+        began, log = time.monotonic(), FOLDER / f"{lane.name}-{number}.log"
+        status = run_limited([sys.executable, "-m", *program.split()], log, seconds / len(lane.programs))
+        outcomes.append((program, "passed" if status == 0 else "failed", time.monotonic() - began))
+        findings += findings_of(log.read_text(encoding="utf-8"))
+    return outcomes, findings
 
 
 def findings_of(output: str) -> list[str]:
@@ -274,81 +225,77 @@ def findings_of(output: str) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
-        "--lane", choices=["core", *LANES], default="all", help="run the tests of one lane only"
+        "--lane",
+        choices=["names", "turn", *lanes()],
+        help="run one; `turn`: that whose turn it is at this commit",
     )
     parser.add_argument(
-        "--from", choices=STEPS, default=STEPS[0], dest="first", help="resume with this stage"
+        "--words", default="", help="run only the files whose path has one of these, by commas"
     )
-    arguments = parser.parse_args()
-    lane, first = arguments.lane, arguments.first
+    parser.add_argument("--record", action="store_true", help="write the green lanes to tests/green.json")
+    parser.add_argument("--release", action="store_true", help="print which lane was green on which commit")
+    parser.add_argument("--despite", default="", help="the reason to release although a lane is not green")
+    given = parser.parse_args()
+    if given.lane == "names":
+        print("\n".join(lanes()))
+    elif given.record:
+        record(_earlier(_commit()))
+    elif given.release:
+        return release(json.loads(GREEN.read_text(encoding="utf-8")), given.despite)
+    else:
+        name = turn(int(_git("log", "-1", "--format=%ct"))) if given.lane == "turn" else given.lane
+        return run(
+            [lanes()[name]] if name else [*lanes().values()], given.words.split(",") if given.words else []
+        )
+    return 0
+
+
+def run(asked: Sequence[Lane], words: Sequence[str]) -> int:
+    results = _earlier(_commit())
+    done = {
+        name
+        for name, row in results["green"].items()
+        if row["commit"] == results["commit"] and len(asked) > 1
+    }
+    waiting = [lane for lane in asked if lane.name not in done and (files_of(lane, words) or not words)]
+    for option in sorted({lane.setup for lane in waiting} - {""}):
+        subprocess.run([ROOT / "scripts" / "setup", option], check=True)
     open_folders_above(ROOT)
     for end in (signal.SIGINT, signal.SIGTERM):  # a script's background process ignores SIGINT
         signal.signal(end, _end)
     FOLDER.mkdir(parents=True, exist_ok=True)
-    results, steps = _earlier(_commit()), steps_of(lane)
-    resumes = first != STEPS[0]
-    ended = {run["stage"] for run in results["runs"] if run["lane"] == lane and resumes}
-    waiting = [step for step in steps if not is_before(step, first, ended)]
+    print("lanes:", *(lane.name for lane in waiting), flush=True)
     namespaces = _namespaces()
-    with ThreadPoolExecutor(len(LINES)) as lines:
-        runs = [lines.submit(run_line, line, waiting, lane, results) for line in LINES]
-    for run in runs:
-        run.result()
+    for lane in waiting:
+        run_lane(lane, words, results)
     left = sorted(_namespaces() - namespaces)
     results["findings"] += [f"finding: new network namespaces: {', '.join(left)}"] if left else []
-    for step in waiting:
-        if step in MEASUREMENTS:
-            run_step(step, lane, results)
-    return _report(rows_of(results["runs"], lane, steps), results["findings"])
+    runs = results["runs"][len(results["runs"]) - len(waiting) :]
+    print(
+        "\n".join(["", *(f"{name:<16} was green" for name in done), *map(row_of, runs), *results["findings"]])
+    )
+    if len(runs) == 1 and runs[0]["failed"]:  # CI keeps no file
+        for log in sorted(FOLDER.glob(f"{runs[0]['lane']}*.log")):
+            print(f"\n{log}:", log.read_text(encoding="utf-8", errors="replace")[-20_000:])
+    print("\n".join([*(f"FAILED {test}" for one in runs for test in one["failed"]), f"results: {RESULTS}"]))
+    return int(any(one["failed"] for one in runs))
 
 
 def _end(number: int, _frame: object) -> None:
-    """End the programs of both lines, then this one: a line that waits for its program would not end."""
-    for leader in _RUNNING.copy():
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(leader, signal.SIGKILL)
-    os._exit(128 + number)
+    sys.exit(128 + number)  # `run_limited` ends the lane's processes
 
 
-def is_before(step: str, first: str, ended: Collection[str]) -> bool:
-    """Return whether a run that resumes with `first` leaves out a step: an earlier one of its line, or one of the other
-    line that has `ended`. A measurement comes after both lines.
-    """
-    if first in MEASUREMENTS:
-        return STEPS.index(step) < STEPS.index(first)
-    [line] = ([stage.name for stage in line] for line in LINES if first in {stage.name for stage in line})
-    return step in line[: line.index(first)] or (step in ended and step not in line)
-
-
-def run_line(line: Sequence[Stage], waiting: Sequence[str], lane: str, results: dict[str, Any]) -> None:
-    for stage in line:
-        if stage.name in waiting:
-            run_step(stage.name, lane, results)
-
-
-def files_of(stage: str, lane: str) -> list[str]:
-    return [file for file in files_of_stages()[stage] if lane in ("all", lane_of(file))]
-
-
-def steps_of(lane: str) -> list[str]:
-    """Return the stages with tests of a lane, and the measurements of the core's."""
-    measured = MEASUREMENTS if lane in ("all", "core") else ()
-    return [*(stage.name for stage in STAGES if files_of(stage.name, lane)), *measured]
-
-
-def run_step(name: str, lane: str, results: dict[str, Any]) -> None:
+def run_lane(lane: Lane, words: Sequence[str], results: dict[str, Any]) -> None:
     began, clock, load = _moment(), time.monotonic(), os.getloadavg()[0]
-    findings: list[str] = []
-    outcomes: list[tuple[str, str, float]] = []
-    if name in MEASUREMENTS:
-        findings, wrong = measure(name)
+    findings, flaky, wrong = list[str](), list[str](), ""
+    if lane.programs:
+        outcomes, findings = run_programs(lane, _LANE_SECONDS)
     else:
-        [stage] = (stage for stage in STAGES if stage.name == name)
-        outcomes, wrong = run_stage(stage, files_of(name, lane))
-    failed = [test for test, outcome, _seconds in outcomes if outcome == "failed"]
-    run = {
-        "stage": name,
-        "lane": lane,
+        outcomes, flaky, wrong = run_tests(lane, files_of(lane, words), _LANE_SECONDS)
+    failed = [test for test, outcome, _ in outcomes if outcome == "failed" and test not in flaky]
+    this = {
+        "lane": lane.name,
+        "words": [*words],
         "began": began,
         "ended": _moment(),
         "minutes": round((time.monotonic() - clock) / 60, 1),
@@ -356,14 +303,19 @@ def run_step(name: str, lane: str, results: dict[str, Any]) -> None:
         "free_gigabytes": shutil.disk_usage(ROOT).free >> 30,
         "passed": sum(1 for _, outcome, _ in outcomes if outcome == "passed"),
         "skipped": sum(1 for _, outcome, _ in outcomes if outcome == "skipped"),
-        "failed": failed + ([f"{name}: {wrong} ({_log_of(name).relative_to(ROOT)})"] if wrong else []),
+        "flaky": flaky,
+        "failed": failed + ([f"{lane.name}: {wrong} ({FOLDER}/{lane.name}.log)"] if wrong else []),
     }
-    with _RESULTS_LOCK:
-        _add(results["tests"], outcomes)
-        results["findings"] += findings
-        results["runs"].append(run)
-        RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    print("\n".join([*findings, row_of(run)]), flush=True)
+    _add(results["tests"], outcomes + [(test, "passed", 0.0) for test in flaky])
+    results["findings"] += findings
+    results["runs"].append(this)
+    if not words and not results["commit"].endswith("-dirty") and _commit() == results["commit"]:
+        green = {key: this[key] for key in ("ended", "passed", "skipped", "flaky")}
+        results["green"][lane.name] = {"commit": results["commit"]} | green
+        if this["failed"] or not this["passed"]:
+            del results["green"][lane.name]
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    print("\n".join([*findings, *(f"flaky {test}" for test in flaky), row_of(this)]), flush=True)
 
 
 def _namespaces() -> set[str]:
@@ -371,39 +323,12 @@ def _namespaces() -> set[str]:
     return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
 
 
-def rows_of(runs: Sequence[dict[str, Any]], lane: str, steps: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the newest run of each step of a lane, or only its name."""
-    newest = {run["stage"]: run for run in runs if run["lane"] == lane}
-    return [newest.get(step, {"stage": step}) for step in steps]
-
-
-def row_of(run: dict[str, Any]) -> str:
-    if "minutes" not in run:
-        return f"{run['stage']:<20} not run"
-    counts = f"{run['passed']:>6} passed {len(run['failed']):>4} failed {run['skipped']:>4} skipped"
-    return f"{run['stage']:<20}{run['minutes']:>6.1f} min {counts}  {run['free_gigabytes']} GB free"
-
-
-def _report(runs: Sequence[dict[str, Any]], findings: Sequence[str]) -> int:
-    known = unsteady()
-    failed = [name for run in runs for name in run.get("failed", ())]
-    total = minutes_of(runs)
-    print("\n".join(["", *map(row_of, runs), f"{'all':<20}{total:>6.1f} min", *findings]))
-    for name in failed:
-        print(f"FAILED {name}" + (" (known to fail by chance)" if name in known else ""))
-    print(f"results: {RESULTS.relative_to(ROOT)}")
-    return int(any(name not in known for name in failed))
-
-
-def minutes_of(runs: Sequence[dict[str, Any]]) -> float:
-    """Return the minutes in which at least one of the runs went on."""
-    moments = ((run["began"], run["ended"]) for run in runs if "began" in run)
-    spans = sorted(tuple(datetime.datetime.fromisoformat(text) for text in pair) for pair in moments)
-    total, last = datetime.timedelta(), datetime.datetime.min.replace(tzinfo=datetime.UTC)
-    for began, ended in spans:
-        total += max(ended - max(began, last), datetime.timedelta())
-        last = max(last, ended)
-    return total.total_seconds() / 60
+def row_of(run: Mapping[str, Any]) -> str:
+    counts = f"{run['passed']:>6} passed {len(run['failed']):>4} failed {len(run['flaky']):>4} flaky"
+    return (
+        f"{run['lane']:<16}{run['minutes']:>6.1f} min {counts} {run['skipped']:>4} skipped"
+        f"  {run['free_gigabytes']} GB free"
+    )
 
 
 def _add(tests: dict[str, Any], outcomes: list[tuple[str, str, float]]) -> None:
@@ -413,17 +338,65 @@ def _add(tests: dict[str, Any], outcomes: list[tuple[str, str, float]]) -> None:
         row["seconds"].append(round(seconds, 3))
 
 
+def turn(moment: int) -> str:
+    names = [*lanes()]
+    return names[moment // 60 % len(names)]
+
+
+def record(results: Mapping[str, Any]) -> None:
+    known = json.loads(GREEN.read_text(encoding="utf-8")) | results["green"]
+    GREEN.write_text(json.dumps({name: known[name] for name in lanes() if name in known}, indent=1) + "\n")
+
+
+def release(green: Mapping[str, Mapping[str, Any]], reason: str) -> int:
+    """Print the commit of each lane, and the files that differ now. Without a reason, these are an error."""
+    stale: list[str] = []
+    for name, lane in lanes().items():
+        row = green.get(name)
+        later = changed_since(lane, row["commit"]) if row else []
+        words = " ".join(f"{key} {value or 'none'}," for key, value in (row or {}).items()).rstrip(",")
+        print(f"{name}: {words or 'was not green'}")
+        print("".join(f"  changed since: {file}\n" for file in later), end="")
+        changed = (
+            f"{', '.join(later[:3])}{', …' * bool(later[3:])} changed since {row['commit']}" if row else ""
+        )
+        stale += [f"  {name}: {changed or 'it was not green'}"] if later or not row else []
+    if stale and reason:
+        print(f"released although these lanes were not green on it: {reason}", *stale, sep="\n")
+    elif stale:
+        sys.stderr.write(
+            "\n".join(("release: these lanes of the night were not green on it:", *stale, _REMEDY))
+        )
+    return int(bool(stale and not reason))
+
+
+def changed_since(lane: Lane, commit: str) -> list[str]:
+    """Return the files that a lane's tests import or run and that differ between a commit and this one."""
+    own = [*(f"{word}*" for word in lane.tests), "conftest.py", "tests/conftest.py", "tests/support"]
+    own += ["benchmarks"] if lane.programs else []
+    parts = [*TABLE["products"][lane.product]["files"], *_NOT_RUN], own
+    try:
+        found = [_git("diff", "--name-only", commit, "HEAD", "--", *part) for part in parts]
+    except subprocess.CalledProcessError:
+        return ["(this clone lacks the commit: all)"]
+    return "\n".join(found).split()
+
+
 def _earlier(commit: str) -> dict[str, Any]:
-    if RESULTS.exists():
-        results: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8"))
-        if results["commit"] == commit:
-            return {"findings": []} | results
-    return {"commit": commit, "runs": [], "tests": {}, "findings": []}
+    """Return the results of earlier runs of a commit, and the newest green run of each lane, of any commit."""
+    fresh = {"commit": commit, "runs": [], "tests": {}, "findings": [], "green": {}}
+    kept = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else fresh
+    return fresh | (kept if kept["commit"] == commit else {"green": kept.get("green", {})})
 
 
 def _commit() -> str:
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+    return _git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(
+        ["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
 def _moment() -> str:

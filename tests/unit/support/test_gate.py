@@ -1,7 +1,8 @@
-import itertools
+import json
 import re
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,25 +12,23 @@ import pytest
 
 from benchmarks.cold import LONE
 from benchmarks.launch import RESULTS, findings, table_ratios
+from tests import nightly
 from tests.nightly import (
-    LANES,
-    LINES,
-    MEASUREMENTS,
-    STAGES,
-    STEPS,
-    UNSTEADY,
-    files_of_stages,
+    Lane,
+    changed_since,
+    every_file,
+    files_of,
     findings_of,
-    is_before,
-    lane_of,
-    minutes_of,
+    lanes,
     outcomes_of,
+    record,
+    release,
     row_of,
-    rows_of,
+    row_of_file,
     run_limited,
-    steps_of,
-    unsteady,
-)
+    run_tests,
+    turn,
+)  # fmt: skip
 from tests.steady import largest_chance
 from tests.support.determinism import WATCH, ChanceError
 from tests.support.sources import ROOT
@@ -59,25 +58,24 @@ def test_a_deterministic_test_may_not_depend_on_chance(act: Callable[[], object]
     assert "test_gate" in found[0]
 
 
-def test_every_test_file_runs_at_night_in_one_stage() -> None:
-    stages = files_of_stages()
-    files = [file for named in stages.values() for file in named]
-    assert len(files) == len(set(files)) > 500
-    assert all(stages[stage.name] for stage in STAGES)
-    assert {lane_of(file) for file in files} == {"core", *LANES}
+def test_every_test_file_is_in_one_lane() -> None:
+    files = every_file()
+    assert len(files) > 500
+    assert [file for file in files if not row_of_file(file)] == []
+    rows = {lane.row: files_of(lane) for lane in lanes().values() if lane.tests}
+    assert sorted(file for named in rows.values() for file in named) == files
+    assert all(rows.values())
 
 
-def test_the_worlds_of_a_file_are_spread_over_the_workers() -> None:
-    """On one worker, those of tests/world/closed_loop would take longer than a stage may."""
-    [worlds] = (stage for stage in STAGES if "tests/world" in stage.folders)
-    assert worlds.options() == ["-n", "logical", "--dist", "load"]
+def test_the_parts_of_a_row_are_all_of_its_tests() -> None:
+    worlds = [lane.part for lane in lanes().values() if lane.row == "worlds"]
+    assert worlds == [f"{number}/{len(worlds)}" for number in range(1, len(worlds) + 1)]
 
 
-def test_a_lane_has_the_stages_of_its_tests() -> None:
-    assert steps_of("all") == [*STEPS]
-    assert steps_of("console") == ["machine", "namespaces"]
-    assert MEASUREMENTS.keys().isdisjoint(steps_of("standby"))
-    assert MEASUREMENTS.keys() <= {*steps_of("core")}
+def test_each_lane_has_its_turn() -> None:
+    names = [*lanes()]
+    assert [turn(1_700_000_000 + 60 * minute) for minute in range(len(names))].count("nodes") == 1
+    assert {turn(1_700_000_000 + 60 * minute + 59) for minute in range(len(names))} == set(names)
 
 
 # A worker has no network, as tests/conftest.py says.
@@ -85,80 +83,120 @@ FETCHES = re.compile(r'npm, "ci"|"pip", "(sync|install)"|doors\.test_roslib impo
 
 
 def test_files_that_fetch_packages_run_where_there_is_a_network() -> None:
-    stages = files_of_stages()
     fetching = {
-        file: stage.name
-        for stage in STAGES
-        for file in stages[stage.name]
+        file: row_of_file(file)
+        for file in every_file()
         if file != "tests/unit/support/test_gate.py" and FETCHES.search((ROOT / file).read_text())
     }
     assert len(fetching) > 1
-    assert [
-        file for file, name in fetching.items() if name not in {"machine", "containers", "packages"}
-    ] == []
-    assert all(not stage.workers for stage in STAGES if stage.name in fetching.values())
+    assert all(not lane.workers for lane in lanes().values() if lane.row in fetching.values())
 
 
-def test_a_computing_stage_leaves_the_processors_to_others() -> None:
-    """A computing stage beside another one would take a processor from real parts that keep time."""
-    for beside in itertools.combinations(LINES, 2):
-        assert any(stage.computes for stage in itertools.chain(*beside))
-    [line] = (line for line in LINES if any(stage.computes for stage in line))
-    assert [stage.computes for stage in line] == sorted(stage.computes for stage in line)
-
-
-def test_a_night_resumes_in_the_line_of_its_stage() -> None:
-    assert [step for step in STEPS if is_before(step, "containers", ())] == ["nodes"]
-    assert [step for step in STEPS if is_before(step, "containers", {"machine"})] == ["machine", "nodes"]
-    assert [step for step in STEPS if is_before(step, "computing", {"computing"})] == ["machine"]
-    assert [step for step in STEPS if is_before(step, "start", ())] == [stage.name for stage in STAGES]
-
-
-def test_minutes_of_stages_side_by_side_count_once() -> None:
-    day = "2026-01-01T"
-    runs = [
-        {"began": f"{day}01:00:00+00:00", "ended": f"{day}01:30:00+00:00"},
-        {"began": f"{day}01:10:00+00:00", "ended": f"{day}01:20:00+00:00"},
-        {"began": f"{day}01:20:00+00:00", "ended": f"{day}01:45:00+00:00"},
-        {"began": f"{day}09:00:00+00:00", "ended": f"{day}09:05:00+00:00"},
-        {"stage": "machine"},
-    ]
-    assert minutes_of(runs) == 50
-
-
-@pytest.mark.nightly
-def test_a_low_program_yields_the_processors(tmp_path: Path) -> None:
-    command = ["sh", "-c", "sleep 0.5; nice; cat /proc/self/autogroup 2>/dev/null || echo nice 10"]
-    assert run_limited(command, tmp_path / "log", 60.0, low=True) == 0
-    value, group = (tmp_path / "log").read_text().splitlines()
-    assert value == "10"
-    assert group.endswith("nice 10")
-
-
-def test_a_resumed_night_has_the_newest_run_of_each_stage_of_its_lane() -> None:
-    runs = [
-        {"stage": "nodes", "lane": "all", "failed": ["a"]},
-        {"stage": "nodes", "lane": "fleet", "failed": ["b"]},
-        {"stage": "nodes", "lane": "all", "failed": []},
-    ]
-    assert rows_of(runs, "all", ["nodes", "machine"]) == [runs[2], {"stage": "machine"}]
-
-
-def test_the_table_of_a_night_names_what_did_not_run() -> None:
-    assert row_of({"stage": "machine"}) == "machine              not run"
+def test_the_row_of_a_run() -> None:
     run = {
-        "stage": "nodes",
-        "minutes": 41.26,
-        "passed": 400,
-        "failed": ["a"],
-        "skipped": 2,
+        "lane": "nodes", "minutes": 41.26, "passed": 400, "failed": ["a"], "skipped": 2, "flaky": [],
         "free_gigabytes": 60,
-    }
-    assert row_of(run) == "nodes                 41.3 min    400 passed    1 failed    2 skipped  60 GB free"
+    }  # fmt: skip
+    assert (
+        row_of(run)
+        == "nodes             41.3 min    400 passed    1 failed    0 flaky    2 skipped  60 GB free"
+    )
+
+
+CHANCE = """
+from pathlib import Path
+def test_by_chance():
+    path = Path(__file__).with_name("ran")
+    ran = path.exists()
+    path.touch()
+    assert ran
+def test_never():
+    assert False
+def test_always():
+    pass
+"""
 
 
 @pytest.mark.nightly
-def test_a_stage_that_hangs_writes_its_report_and_leaves_no_process(tmp_path: Path) -> None:
+def test_a_test_that_fails_runs_once_more_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nightly, "FOLDER", tmp_path)
+    (tmp_path / "test_chance.py").write_text(CHANCE)
+    outcomes, flaky, wrong = run_tests(Lane("one"), [str(tmp_path / "test_chance.py")], 60.0)
+    assert [outcome for _, outcome, _ in outcomes] == ["failed", "failed", "passed"]
+    assert [test.partition("::")[2] for test in flaky] == ["test_by_chance"]
+    assert wrong == ""
+
+
+@pytest.mark.nightly
+def test_a_lane_that_hangs_is_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nightly, "FOLDER", tmp_path)
+    (tmp_path / "test_hang.py").write_text(
+        "import threading\ndef test_hang():\n    threading.Event().wait()\n"
+    )
+    _, flaky, wrong = run_tests(Lane("one"), [str(tmp_path / "test_hang.py")], 6.0)
+    assert (flaky, wrong) == ([], "not finished after 0 minutes")
+
+
+LEAVING = """
+import time
+from appliance.base import clock
+from tests.support.virtual_clock import VirtualClock
+kept = clock.using(VirtualClock())
+def test_clock():
+    kept.__enter__()
+def test_time():
+    time.monotonic = lambda: 0.0
+def test_nothing():
+    assert time.monotonic() > 0 and not isinstance(clock.source(), VirtualClock)
+"""
+
+
+@pytest.mark.nightly
+def test_a_test_that_leaves_another_clock_fails(tmp_path: Path) -> None:
+    (tmp_path / "test_leaving.py").write_text("import pytest\npytestmark = pytest.mark.nightly\n" + LEAVING)
+    command = [sys.executable, "-m", "pytest", "-c", "pyproject.toml", "-p", "conftest", "-q"]
+    ran = subprocess.run([*command, tmp_path], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert "3 passed, 2 errors" in ran.stdout
+    assert "this test left replaced: appliance.base.clock\n" in ran.stdout
+    assert "this test left replaced: time.monotonic\n" in ran.stdout
+
+
+def test_a_release_names_each_lane_that_is_not_green(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        nightly, "changed_since", lambda lane, commit: ["appliance/x.py"] if lane.row == "units" else []
+    )
+    green = {
+        name: {"commit": "abc", "ended": "now", "passed": 3, "skipped": 0, "flaky": []}
+        for name in lanes()
+        if name != "nodes"
+    }
+    assert release(green, "") == 1
+    said = capsys.readouterr().err
+    assert "  nodes: it was not green\n" in said
+    assert "  units-1: appliance/x.py changed since abc\n" in said
+    assert "networks" not in said
+    assert release(green, "only a word changed") == 0
+    assert "only a word changed\n  nodes: it was not green\n" in capsys.readouterr().out
+    assert release(green | {"nodes": green["networks"]}, "") == 1
+
+
+def test_a_green_lane_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nightly, "GREEN", tmp_path / "green.json")
+    nightly.GREEN.write_text('{"nodes": {"commit": "old"}, "pairs": {"commit": "old"}, "gone": {}}')
+    record({"green": {"nodes": {"commit": "new"}}})
+    assert json.loads(nightly.GREEN.read_text()) == {"nodes": {"commit": "new"}, "pairs": {"commit": "old"}}
+
+
+@pytest.mark.nightly
+def test_a_lane_is_as_old_as_its_files() -> None:
+    assert changed_since(lanes()["nodes"], "HEAD") == []
+    assert changed_since(lanes()["nodes"], "0" * 40) == ["(this clone lacks the commit: all)"]
+
+
+@pytest.mark.nightly
+def test_a_program_that_hangs_writes_its_report_and_leaves_no_process(tmp_path: Path) -> None:
     script = "trap 'echo written; exit 2' INT; sleep 600 & echo $!; while true; do sleep 0.1; done"
     assert run_limited(["bash", "-c", script], tmp_path / "log", 2.0) is None
     child, word = (tmp_path / "log").read_text().split()
@@ -226,9 +264,3 @@ def test_the_bound_of_a_chance() -> None:
     assert largest_chance(0, 300) == pytest.approx(3 / 300, rel=0.01)
     assert largest_chance(5, 50) == pytest.approx(0.2, abs=0.005)
     assert largest_chance(7, 7) == pytest.approx(1.0)
-
-
-def test_few_tests_are_unsteady_each_with_a_date_and_a_reason() -> None:
-    lines = [line for line in UNSTEADY.read_text().splitlines() if line and not line.startswith("#")]
-    assert len(unsteady()) == len(lines) <= 10
-    assert all(re.fullmatch(r"\S+::\S+ 20\d\d-\d\d-\d\d \S.{20,}", line) for line in lines)
