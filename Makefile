@@ -8,13 +8,11 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
-CHECKED := conftest.py appliance roswire rosmop stubs fleet tests examples benchmarks distribution
-LONG_PROOFS := $(addprefix tests/proofs/test_,insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
-DETERMINISTIC := -m "not nightly and not real" tests/unit tests/world rosmop/tests
-# Files with tests that are marked `real`.
-REAL = $(shell grep --recursive --files-with-matches --include='test_*.py' 'mark\.real' tests/unit tests/integration tests/system)
+CHECKED := conftest.py appliance roswire rosmop stubs fleet tests examples benchmarks distribution $(wildcard lab)
+PRODUCTS := appliance rosmop fleet lab
+DETERMINISTIC := -c pyproject.toml --rootdir=. -m "not nightly and not real" tests/unit tests/world $(wildcard rosmop/tests fleet/tests lab/tests)
 
-.PHONY: help setup demo check static unit test units real smoke nightly lane steady pages mutants prove wheel constraints package image site fleet release bench clean
+.PHONY: help setup demo check static unit test units real $(PRODUCTS:%=test-%) smoke nightly lane steady pages mutants prove wheel constraints package image site fleet release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -41,12 +39,18 @@ unit:
 test: setup ## check, all tests that chance cannot fail, and at most 100 cases with real nodes (root: network namespaces)
 	$(MAKE) --jobs=3 --output-sync=target static units real
 
+test-appliance: setup ## of the gate, only the tests of the appliance; test-rosmop, test-fleet, test-lab: of that product
+	$(MAKE) --jobs=2 --output-sync=target units real ONLY=appliance
+
+$(filter-out test-appliance,$(PRODUCTS:%=test-%)): setup
+	$(MAKE) units ONLY=$(@:test-%=%)
+
 # The real cases wait half of their time: what computes has the processors then, and after them, for it is nice.
 units:
-	nice $(PYTEST) $(DETERMINISTIC) -n $$(nproc) --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	nice $(BIN)/python -m tests.gate $(or $(ONLY),$(PRODUCTS))
 
 real:
-	$(PYTEST) -m real $(REAL) -n $$(nproc) --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	$(BIN)/python -m tests.gate real
 
 smoke: setup ## the container as a user starts it: built, a denied call, a policy reload, an audit search
 	@scripts/setup --containers
@@ -107,7 +111,7 @@ bench: setup ## measure: every program in benchmarks/
 
 prove: ## check what is proved: the proofs in Coq, the code of events, the models of the insertion and the lease, their mutants and traces (docs/dev/assurance.md)
 	@scripts/setup --proofs
-	$(PYTEST) tests/proofs -n auto --dist loadfile --quiet --durations=5
+	$(PYTEST) $(wildcard tests/proofs lab/tests/proofs) -n auto --dist loadfile --quiet --durations=5
 
 clean: ## remove what was built, .venv included
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -13,6 +13,7 @@ import pytest
 from benchmarks.cold import LONE
 from benchmarks.launch import RESULTS, findings, table_ratios
 from tests import nightly
+from tests.gate import digest
 from tests.nightly import (
     Lane,
     changed_since,
@@ -193,6 +194,25 @@ def test_a_green_lane_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_lane_is_as_old_as_its_files() -> None:
     assert changed_since(lanes()["nodes"], "HEAD") == []
     assert changed_since(lanes()["nodes"], "0" * 40) == ["(this clone lacks the commit: all)"]
+
+
+@pytest.mark.nightly
+def test_a_digest_has_what_is_not_committed(tmp_path: Path) -> None:
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    found = {digest(["one"], tmp_path)}
+    (tmp_path / "one").mkdir()
+    (tmp_path / "other").write_text("no file of this product")
+    found.add(digest(["one"], tmp_path))
+    assert len(found) == 1
+    for text in ("new", "edited"):
+        (tmp_path / "one" / "file.py").write_text(text)
+        found.add(digest(["one"], tmp_path))
+    (tmp_path / "one" / "file.py").chmod(0o755)
+    found.add(digest(["one"], tmp_path))
+    subprocess.run(["git", "add", "one"], cwd=tmp_path, check=True)
+    (tmp_path / "one" / "file.py").unlink()
+    found.add(digest(["one"], tmp_path))
+    assert len(found) == 5
 
 
 @pytest.mark.nightly
