@@ -3,7 +3,6 @@
 import ast
 import asyncio
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,10 +34,10 @@ class Machine(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Machine:
     folder = tmp_path_factory.mktemp("machine")
     with clock.using(time := VirtualClock(wall=1_800_000_000)):
-        yield _machine(folder, time)
+        return _machine(folder, time)
 
 
 def _machine(folder: Path, time: VirtualClock) -> Machine:

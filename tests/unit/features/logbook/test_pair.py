@@ -1,7 +1,6 @@
 """`--other`: both appliances of a pair are one history, from the files of their logs."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ HISTORY: tuple[tuple[str, int, str, str, dict[str, Any]], ...] = (
 
 
 @pytest.fixture(scope="module")
-def states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+def states(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("pair")
     with clock.using(time := VirtualClock(wall=BEGIN)):
         logs = {}
@@ -53,7 +52,7 @@ def states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]
             assert settle(log) is None
         for log in logs.values():
             assert log.close() is None
-        yield {name: str(folder / name) for name in logs}
+        return {name: str(folder / name) for name in logs}
 
 
 @pytest.mark.nightly  # it asks the admin socket for the interfaces of now
