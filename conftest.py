@@ -24,7 +24,7 @@ _TIME = pytest.StashKey[contextlib.ExitStack]()
 _WALL = 1_893_456_000.0  # seconds since the epoch: the same date for each run, after that of the files
 _REAL_CLOCK = clock.source()
 _NIGHTLY = (  # unless marked `real`
-    "tests/integration/", "tests/system/", "tests/package/", "tests/proofs/", "lab/tests/proofs/",
+    "tests/integration/", "tests/system/", "tests/package/", "lab/tests/proofs/",
     "fleet/tests/system/",
 )  # fmt: skip
 

@@ -62,7 +62,7 @@ def sizes() -> Mapping[str, int]:
         "core": appliance - features,
         "features": features,
         "language": _lines_in("rosmop") + _lines_in("roswire") - language_tests,
-        "tests": _lines_in("tests") + language_tests,
+        "tests": _lines_in("tests") + _lines_in("lab") + language_tests,
         "kernel": sum(lines_of_code(ROOT / "appliance" / module) for module in kernel_modules()),
     }
 

@@ -31,7 +31,7 @@ from distribution.sizes import kernel_modules
 
 ROOT = Path(__file__).parents[1]
 _KERNEL = [path.removesuffix(".py") for path in kernel_modules() if path.endswith(".py")]
-FOLDERS = ("tests/unit", "tests/world")
+FOLDERS = ("tests/unit", "tests/world", "lab/tests")
 _OPPOSITES: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,

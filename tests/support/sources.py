@@ -6,5 +6,5 @@ LANGUAGE_TESTS = ROOT / "rosmop" / "tests"
 
 
 def files_of_tests() -> Iterator[Path]:
-    for folder in (ROOT / "tests", LANGUAGE_TESTS):
+    for folder in (ROOT / "tests", LANGUAGE_TESTS, ROOT / "lab"):
         yield from sorted(folder.rglob("*.py"))

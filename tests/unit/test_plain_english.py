@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
 FOLDERS = (
     "appliance/", "rosmop/", "rosmop/tests/", "roswire/", "examples/", "benchmarks/", "distribution/", "fleet/",
-    "tests/",
+    "tests/", "lab/",
 )  # fmt: skip
 GENERATED = ("metrics.md", "audit-events.md")
 STRING_OR_COMMENT = re.compile(

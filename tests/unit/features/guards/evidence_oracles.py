@@ -4,6 +4,13 @@ import math
 
 import numpy as np
 
+from lab.closed_loop.messages import (
+    Legs,
+    battery,
+    boolean,
+    odometry,
+    scan,
+)
 from rosmop.tests.acting import message
 from tests.unit.features.guards.guarding import seeded
 from tests.unit.features.guards.tracing import (
@@ -12,13 +19,6 @@ from tests.unit.features.guards.tracing import (
     finite,
     motion,
     pause,
-)
-from tests.world.closed_loop.messages import (
-    Legs,
-    battery,
-    boolean,
-    odometry,
-    scan,
 )
 
 

@@ -4,6 +4,13 @@ import math
 
 import numpy as np
 
+from lab.closed_loop.messages import (
+    ACKERMANN,
+    STILL,
+    Legs,
+    moves,
+    steering,
+)
 from tests.unit.features.guards.guarding import seeded
 from tests.unit.features.guards.tracing import (
     Trace,
@@ -12,13 +19,6 @@ from tests.unit.features.guards.tracing import (
     near,
     norm,
     scaled,
-)
-from tests.world.closed_loop.messages import (
-    ACKERMANN,
-    STILL,
-    Legs,
-    moves,
-    steering,
 )
 
 HUGE = 1e150

@@ -1,8 +1,8 @@
 """Naive models of the guards that listen to nodes and persons: watchdog, enabling device, stop button, mode."""
 
+from lab.closed_loop.messages import STILL, boolean
 from tests.unit.features.guards.guarding import seeded
 from tests.unit.features.guards.tracing import Trace, motion, near, pause, scaled, slow
-from tests.world.closed_loop.messages import STILL, boolean
 
 
 def _judge_stops(trace: Trace, ends: list[int], was: int, *, moved: bool) -> None:

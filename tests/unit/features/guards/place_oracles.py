@@ -5,6 +5,13 @@ import random
 
 import numpy as np
 
+from lab.closed_loop import arms
+from lab.closed_loop.messages import (
+    ODOMETRY,
+    Legs,
+    position,
+    scan,
+)
 from rosmop.tests.acting import STORE, message
 from tests.unit.features.guards.guarding import seeded
 from tests.unit.features.guards.tracing import (
@@ -13,13 +20,6 @@ from tests.unit.features.guards.tracing import (
     norm,
     pause,
     straight,
-)
-from tests.world.closed_loop import arms
-from tests.world.closed_loop.messages import (
-    ODOMETRY,
-    Legs,
-    position,
-    scan,
 )
 
 

@@ -8,9 +8,9 @@ to be one that may; one that must pass has to arrive unchanged. Times are ms.
 import math
 import random
 
+from lab.closed_loop.guard_run import RunningGuard
+from lab.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves
 from tests.unit.features.guards.guarding import seeded
-from tests.world.closed_loop.guard_run import RunningGuard
-from tests.world.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves
 
 
 class Trace:

@@ -1,0 +1,1 @@
+"""Proofs and simulated worlds of the products; no product imports them."""

@@ -1,0 +1,150 @@
+import re
+
+import pytest
+
+from appliance.features.guards.presets import PRESETS
+from lab.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
+from lab.closed_loop.world import ACTS, COMMAND
+from lab.closed_loop.worlds import (
+    EACH_NODE,
+    NOT_MODELLED,
+    PAIRS,
+    WORLDS,
+    planned_act,
+    replay,
+    run_many,
+    run_one,
+)
+from tests.support.examples import ALL, seeds_of_night
+from tests.support.rows import require_rows
+
+AT_GATE = {"separation": 10, "fence": 10, "zone": 6}
+"""Worlds at the gate of presets whose worlds cost 0.1 to 0.2 s; the others cost 5 to 40 ms, and have 15."""
+AT_NIGHT = {"separation": 500, "fence": 500, "zone": 500, PAIRS: 300}
+
+
+def judge(preset: str, seeds: range, alone: str = "") -> None:
+    summary = run_many(preset, seeds, alone=alone)
+    broken = [f"{text}\n    {replay(preset, seed, alone)}" for seed, text in summary.broken]
+    assert not broken, f"{len(broken)} of {len(seeds)} worlds of {preset} break a law:\n" + "\n".join(
+        broken[:5]
+    )
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("preset", WORLDS)
+def test_no_world_breaks_a_law(preset: str) -> None:
+    judge(preset, range(AT_GATE.get(preset, 15)))
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("preset", [*WORLDS, PAIRS])
+def test_no_world_of_a_night_breaks_a_law(preset: str) -> None:
+    judge(preset, seeds_of_night(AT_NIGHT.get(preset, 1000)))
+
+
+def test_a_base_that_executes_a_command_late_is_not_judged_by_the_time_without_its_guard() -> None:
+    """It got a motion while its guard was disabled, and still stands when the guard is enabled."""
+    judge("separation", range(700_081, 700_082))
+
+
+@pytest.mark.complete
+def test_every_preset_has_a_world_or_a_reason() -> None:
+    where = "WORLDS of lab/closed_loop/worlds.py, or to NOT_MODELLED there with the reason"
+    require_rows(PRESETS, WORLDS.keys() | NOT_MODELLED.keys(), where)
+    assert not WORLDS.keys() & NOT_MODELLED.keys()
+
+
+@pytest.mark.parametrize("preset", WORLDS)
+def test_each_act_happens_in_the_worlds_of_each_preset_or_has_a_reason(
+    preset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A world is only planned here, not run, so its guard is not compiled."""
+    kind = WORLDS[preset]
+    monkeypatch.setattr(kind, "guarded", lambda *_values: None)
+    planned = {planned_act(preset, seed) for seed in range(400)}
+    observes = PRESETS[preset].given_topics.keys() - {COMMAND}
+    assert planned - {""} == set(ACTS) - kind.not_yet.keys() - (set() if observes else {"cut"})
+    assert all(kind.not_yet.values())
+
+
+ALONE = [
+    (preset, topic)
+    for preset, world in WORLDS.items()
+    if world.one_source
+    for topic in (*world.one_source, COMMAND)
+]
+"""The topics on which a second node publishes, while the source of one of them fails in most worlds."""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(("preset", "topic"), ALONE)
+def test_a_second_publisher_alone_moves_nothing(preset: str, topic: str) -> None:
+    judge(preset, range(50_000, 50_200 if ALL else 50_003), topic)
+
+
+def test_each_observed_topic_has_one_source_and_a_second_publisher_or_each_node_counts() -> None:
+    observed = {
+        (name, topic)
+        for name, preset in PRESETS.items()
+        for topic in preset.given_topics.keys() - {COMMAND, "cancel"}
+    }
+    with_one = {one for one in ALONE if one[1] != COMMAND}
+    assert with_one | EACH_NODE.keys() == observed and not with_one & EACH_NODE.keys()
+
+
+def _takes_any_node(text: str) -> str:
+    """Let a guard take each node for the source of a topic, and see no other node beside it."""
+    taken, heard = re.subn(r'when \((\w+) == "" \|\| caller\(\w+\) == \1\)', "", text)
+    foreign = r"(event foreign\w*\(\) \w+(?: \S+\s+'\{\}')?\s+)when \("
+    unseen, others = re.subn(foreign, r"\1when (false && ", taken)
+    assert heard and others
+    return unseen
+
+
+@pytest.mark.parametrize(("preset", "topic"), [one for one in ALONE if one[1] != COMMAND])
+def test_a_guard_that_takes_any_node_for_its_source_is_found(preset: str, topic: str) -> None:
+    found = (run_one(preset, seed, _takes_any_node, alone=topic).violations for seed in range(100))
+    assert any(one.law == "L4" for violations in found for one in violations)
+
+
+LAWS_OF = {
+    "deadman": {"L3", "L4", "L6"}, "speed": {"L1", "L2"}, "separation": {"L1", "L2", "L3"}, "fence": {"L2", "L3"},
+    "sensor": {"L2"}, "estop": {"L2", "L3", "L4"}, "arm": {"L2"}, "rate": {"L3"}, "agree": {"L2"},
+    "sane": {"L1", "L2"}, "enable": {"L2", "L6"}, "mode": {"L2", "L6"},
+    "overspeed": {"L3", "L6"}, "standstill": {"L2", "L6"}, "zone": {"L2", "L3", "L6"},
+    "joints": {"L1", "L2", "L3"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("preset", WORLDS)
+def test_a_guard_that_does_nothing_breaks_each_law_of_its_preset(preset: str) -> None:
+    summary, first = run_many(preset, range(20), no_guard), 20
+    while not LAWS_OF[preset] <= summary.violations.keys() and first < 200:
+        summary.join(run_many(preset, range(first, first + 20), no_guard))
+        first += 20
+    assert LAWS_OF[preset] <= summary.violations.keys(), str(summary)
+
+
+@pytest.mark.parametrize("preset", sorted(WORLDS.keys() - {"rate"}))
+def test_a_guard_that_stops_everything_is_found(preset: str) -> None:
+    """A rate drops commands, and never stops, so it has no honest motion to stop."""
+    found = (run_one(preset, seed, stops_everything).violations for seed in range(100))
+    assert any(one.law == "live" for violations in found for one in violations)
+
+
+@pytest.mark.parametrize("preset", WORLDS)
+def test_a_seed_gives_the_same_world_again(preset: str) -> None:
+    traces: list[list[str]] = [[], []]
+    for trace in traces:
+        for seed in range(4):
+            run_one(preset, seed, trace=trace.append)
+    assert traces[0] == traces[1] and len(traces[0]) > 10
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_planted_fault_is_found(name: str) -> None:
+    assert FAULTS[name].first(10 * WITHIN if ALL else WITHIN) is not None
