@@ -6,16 +6,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
 FOLDERS = (
-    "appliance",
-    "rosmop",
-    "roswire",
-    "benchmarks",
-    "distribution",
-    "examples",
-    "scripts",
-    "tests",
-    "lab",
-)
+    "appliance", "rosmop", "roswire", "benchmarks", "distribution", "examples", "scripts", "tests", "lab",
+)  # fmt: skip
 LANGUAGES = {".py", ".js", ".mjs", ".sh", ".cpp", ".hpp", ".css", ""}
 SUPPRESSION = re.compile(
     r"(?:#|//|/\*) *(?:(?:ruff: )?noqa(?:: ?[A-Z]+[0-9]+(?:, ?[A-Z]+[0-9]+)*)?|type: ignore(?:\[[^]]*\])?"
