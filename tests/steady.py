@@ -51,7 +51,7 @@ def main() -> int:
 
 
 def _fails(test: str, log: Path) -> bool:
-    command = [sys.executable, "-m", "pytest", test, "--quiet"]
+    command = [sys.executable, "-m", "pytest", "-c", "pyproject.toml", test, "--quiet"]
     with log.open("wb") as file:
         return subprocess.run(command, cwd=ROOT, stdout=file, stderr=file, check=False).returncode != 0
 
