@@ -3,8 +3,9 @@
 Tested for each logic over random formulas and traces. No named event can be left out (`fewest`).
 """
 
+import contextlib
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from random import Random
 
 import pytest
@@ -203,17 +204,18 @@ def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
     assert compared > 50
 
 
+def properties(logic: str, random: Random) -> Iterator[CompiledProperty]:
+    name, events = logic.split(maxsplit=1)[0], CALLS if logic == "ptcaret" else EVENTS
+    for _ in range(40):
+        with contextlib.suppress(FormulaError):
+            yield compiled(name, MAKERS[logic](random), events)
+
+
 @pytest.mark.parametrize("logic", MAKERS)
 def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
     random = seeded(41)
     count = cut = 0
-    for _ in range(40):
-        try:
-            made = compiled(
-                logic.split(maxsplit=1)[0], MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS
-            )
-        except FormulaError:
-            continue
+    for made in properties(logic, random):
         for explanation, target, category, before in explained(made, random, 30):
             assert explanation is not None
             assert explanation.since is None
@@ -234,13 +236,7 @@ def test_a_shortened_explanation_says_so(logic: str, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(explain, "KEPT", 2)
     random = seeded(42)
     whole = cut = 0
-    for _ in range(40):
-        try:
-            made = compiled(
-                logic.split(maxsplit=1)[0], MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS
-            )
-        except FormulaError:
-            continue
+    for made in properties(logic, random):
         for explanation, target, category, before in explained(made, random, 30):
             assert explanation is not None
             assert (before is None) is (explanation.since is None)

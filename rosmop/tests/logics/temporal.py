@@ -1,13 +1,21 @@
 """Random temporal formulas as trees, and their text with as few parentheses as the precedence allows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Any
 
 Tree = tuple[Any, ...]
 """(operator, operand, …); an event is ("event", name); bounds are the last operand of a timed operator."""
 
-BOOLEAN = ("and", "or", "xor", "implies", "iff")
+CONNECTIVES: Mapping[str, Callable[..., bool]] = {
+    "not": lambda one: not one,
+    "and": lambda left, right: left and right,
+    "or": lambda left, right: left or right,
+    "xor": lambda left, right: left != right,
+    "implies": lambda left, right: not left or right,
+    "iff": lambda left, right: left == right,
+}
+BOOLEAN = tuple(one for one in CONNECTIVES if one != "not")
 SPELLED = {
     "not": ("!", "not "),
     "and": ("and",),
@@ -30,7 +38,7 @@ def draw(
                 ("false",),
             ]
         )
-    operator = random.choice([*operators, *operators, "not", *BOOLEAN])
+    operator = random.choice([*operators, *operators, *CONNECTIVES])
     return (
         operator,
         *(draw(random, depth - 1, operators, arity, events) for _ in range(arity.get(operator, 2))),

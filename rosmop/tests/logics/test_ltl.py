@@ -1,12 +1,11 @@
 """``ltl``: verdicts are compared with the meaning of the formula on ultimately periodic traces."""
 
-from collections.abc import Callable
 from itertools import product
 
 import pytest
 
 from rosmop.tests.logics.driving import compiled, refusal, seeded, told
-from rosmop.tests.logics.temporal import Printer, Tree, draw
+from rosmop.tests.logics.temporal import CONNECTIVES, Printer, Tree, draw
 
 AB = ("a", "b")
 UNARY = {"not": 1, "next": 1, "always": 1, "eventually": 1}
@@ -65,15 +64,7 @@ def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per k
                 else:
                     truth[i] = values[1][i] and (values[0][i] or truth[after[i]])
         return truth
-    table: dict[str, Callable[..., bool]] = {
-        "not": lambda x: not x,
-        "and": lambda x, y: x and y,
-        "or": lambda x, y: x or y,
-        "xor": lambda x, y: x != y,
-        "implies": lambda x, y: not x or y,
-        "iff": lambda x, y: x == y,
-    }
-    return [table[operator](*(value[i] for value in values)) for i in range(size)]
+    return [CONNECTIVES[operator](*(value[i] for value in values)) for i in range(size)]
 
 
 def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:

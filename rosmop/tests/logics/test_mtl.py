@@ -8,7 +8,7 @@ import reelay
 from rosmop.logics.interface import ClockedProperty, FiniteProperty, Run
 from rosmop.logics.past_monitors import PastProperty, PastRun, SinceWindow
 from rosmop.tests.logics.driving import ABC, compiled, refusal, seeded
-from rosmop.tests.logics.temporal import Printer, Tree, draw
+from rosmop.tests.logics.temporal import CONNECTIVES, Printer, Tree, draw
 
 ARITY = {"not": 1, "previously": 1, "once": 1, "historically": 1}
 TEMPORAL = ("previously", "once", "historically", "since")
@@ -36,7 +36,7 @@ def bounded(tree: Tree, random: Random, largest: int) -> Tree:
     return (tree[0], *operands, (low, high))
 
 
-def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
+def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911  # one per operator
     operator, *rest = tree
     low, high = (0, None)
     if operator in TEMPORAL and rest and isinstance(rest[-1][0], int):
@@ -55,18 +55,8 @@ def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  
             return bool(trace[i][1] == rest[0])
         case "true" | "false":
             return bool(operator == "true")
-        case "not":
-            return not at(0, i)
-        case "and":
-            return at(0, i) and at(1, i)
-        case "or":
-            return at(0, i) or at(1, i)
-        case "xor":
-            return at(0, i) != at(1, i)
-        case "implies":
-            return not at(0, i) or at(1, i)
-        case "iff":
-            return at(0, i) == at(1, i)
+        case _ if operator in CONNECTIVES:
+            return CONNECTIVES[operator](*(at(one, i) for one in range(len(rest))))
         case "previously":
             return i > 0 and near(i - 1) and at(0, i - 1)
         case "once":

@@ -8,7 +8,7 @@ import pytest
 from rosmop.logics.interface import RunFaultError
 from rosmop.logics.ptcaret import MAX_DEPTH
 from rosmop.tests.logics.driving import compiled, seeded, told
-from rosmop.tests.logics.temporal import Tree, draw
+from rosmop.tests.logics.temporal import CONNECTIVES, Tree, draw
 from rosmop.text.parser import parse
 
 EVENTS = ("begin", "end", "call", "a")
@@ -56,16 +56,7 @@ def holds(tree: Tree, trace: Sequence[str], place: int) -> bool:
             return now and (earlier < 0 or holds(tree, trace, earlier))
         left = name == "once" or holds(operands[0], trace, place)
         return now or (left and earlier >= 0 and holds(tree, trace, earlier))
-    values = [holds(operand, trace, place) for operand in operands]
-    meaning = {
-        "not": lambda: not values[0],
-        "and": lambda: all(values),
-        "or": lambda: any(values),
-        "xor": lambda: values[0] != values[1],
-        "implies": lambda: not values[0] or values[1],
-        "iff": lambda: values[0] == values[1],
-    }
-    return bool(meaning[operator]())
+    return CONNECTIVES[operator](*(holds(operand, trace, place) for operand in operands))
 
 
 def verdicts(tree: Tree, trace: Sequence[str]) -> list[tuple[str, ...]]:

@@ -5,7 +5,7 @@ from rosmop.logics.interface import FiniteProperty
 from rosmop.logics.past_monitors import PastProperty
 from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, compiled, seeded, told, traces
-from rosmop.tests.logics.temporal import Printer, Tree, draw
+from rosmop.tests.logics.temporal import CONNECTIVES, Printer, Tree, draw
 
 ARITY = {"not": 1, "previously": 1, "weakly previously": 1, "once": 1, "historically": 1}
 TEMPORAL = ("previously", "weakly previously", "once", "historically", "since", "dual since")
@@ -23,7 +23,7 @@ PRINTER = Printer(
 )
 
 
-def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
+def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911  # one per operator
     operator, *operands = tree
 
     def at(operand: int, position: int) -> bool:
@@ -35,18 +35,8 @@ def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911,
             return bool(trace[i] == operands[0])
         case "true" | "false":
             return bool(operator == "true")
-        case "not":
-            return not at(0, i)
-        case "and":
-            return at(0, i) and at(1, i)
-        case "or":
-            return at(0, i) or at(1, i)
-        case "xor":
-            return at(0, i) != at(1, i)
-        case "implies":
-            return not at(0, i) or at(1, i)
-        case "iff":
-            return at(0, i) == at(1, i)
+        case _ if operator in CONNECTIVES:
+            return CONNECTIVES[operator](*(at(one, i) for one in range(len(operands))))
         case "previously":
             return i > 0 and at(0, i - 1)
         case "weakly previously":
