@@ -135,10 +135,3 @@ def test_another_specification_reads_a_given_constant() -> None:
     assert [
         "may change" in one.text for one in refused(CAP + reader.replace("event", "int m = n; event"))
     ] == [True]
-
-
-def test_old_files_may_use_the_new_words_as_names() -> None:
-    monitors = load("given() { int given; int topic; event topic(int in) /t std_msgs/Int32 '{data:in}'"
-                    " { given = in; topic = given; } }")  # fmt: skip
-    monitors.process("/t", message("std_msgs/Int32", data=2), 1)
-    assert monitors.value("given", "topic") == 2

@@ -11,7 +11,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
-from rosmop.tests.acting import definitions, load, message, refused
+from rosmop.tests.acting import definitions, load, refused
 from rosmop.tests.logics.driving import ABC, seeded
 from rosmop.tests.logics.test_pattern import Meaning
 from rosmop.tests.test_published import CAP, FAST, MUX, speeds
@@ -260,9 +260,3 @@ def test_specifications_without_a_place_in_the_order_stay_where_they_are() -> No
 )
 def test_a_circle_is_refused(order: str) -> None:
     assert "would come before itself" in refused(CAP + MUX + order)[0].text
-
-
-def test_old_files_may_use_order_as_a_name() -> None:
-    monitors = load("order() { int order; event e(int x) /n std_msgs/Int32 '{data:x}' { order = x; } }")
-    monitors.process("/n", message("std_msgs/Int32", data=3), 1)
-    assert monitors.value("order", "order") == 3

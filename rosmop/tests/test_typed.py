@@ -224,11 +224,18 @@ def test_each_row_of_a_role_has_its_values(role: str) -> None:
         assert code.events[0].type == name
 
 
-def test_old_files_may_use_the_new_words_as_names() -> None:
-    monitors = load("""preset() { int role, cancel, corners, hosts, time; bool safe() { return true; }
-        event joints(int as) /t std_msgs/Int32 '{data:as}' { role = as; time = role; } }""")  # fmt: skip
+@pytest.mark.parametrize("word", (
+    "as", "cancel", "corners", "given", "hosts", "in", "joints", "order", "preset", "role", "safe", "time", "topic",
+))  # fmt: skip
+def test_old_files_may_use_the_new_words_as_names(word: str) -> None:
+    of_parameter = f"event e(int {word}) /t std_msgs/Int32 '{{data:{word}}}' {{ }}"
+    of_function = (
+        f"f() {{ bool {word}() {{ return true; }} event e() /u std_msgs/Empty '{{}}' {{ {word}(); }} }}"
+    )
+    event = f"event {word}(int x) /t std_msgs/Int32 '{{data:x}}' {{ {word} = x; }}"
+    monitors = load(f"{word}() {{ int {word}; {event} {of_parameter} }} {of_function}")
     monitors.process("/t", message("std_msgs/Int32", data=2), 1)
-    assert monitors.value("preset", "time") == 2
+    assert monitors.value(word, word) == 2
 
 
 def test_lists_are_read_and_written_in_one_form() -> None:
