@@ -126,7 +126,6 @@ BY_HAND = {
     "appliance/features/doors/door_processes.py::_host_numbers": "if len(self._host_numbers) >= _MOST_HOSTS",
     "appliance/features/doors/foxglove.py::_channels": "if len(self._channels) >= self._limits.channels",
     "appliance/features/doors/foxglove.py::_parameters": "if len(self._parameters) >= self._limits.parameters",
-    "appliance/features/doors/fragments.py::_frames": "if self._bytes > self._most_bytes",
     "appliance/features/doors/heard_topic.py::told": "len(self.told) >= _MOST_TOLD",
     "appliance/features/doors/known_types.py::_failed": "while len(self._failed) > _MOST_FAILURES",
     "appliance/features/doors/known_types.py::_kept": "while self.bytes > self._most",
@@ -215,7 +214,6 @@ KEYED = {
     "appliance/features/doors/door_processes.py::_host_numbers": HOST,
     "appliance/features/doors/foxglove.py::_channels": CLIENT,
     "appliance/features/doors/foxglove.py::_parameters": CLIENT,
-    "appliance/features/doors/fragments.py::_frames": CLIENT,
     "appliance/features/doors/heard_topic.py::told": COUNTED,
     "appliance/features/doors/known_types.py::_failed": WHOLE,  # the name, the md5sum and the whole definition
     "appliance/features/doors/known_types.py::_kept": WHOLE,  # as `_failed`, or the message itself

@@ -45,7 +45,6 @@ from appliance.features.doors.foxglove_frames import (
     service_fields,
 )
 from appliance.features.doors.known_types import DoorMessage
-from appliance.features.doors.png_frames import DoorFrame
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import DefinitionError, PeerError, quoted
@@ -423,13 +422,13 @@ class Foxglove:
     def warned(self, reason: str) -> None:
         self._refuse(reason)
 
-    def next_frame(self, now: float) -> DoorFrame | None:
+    def next_frame(self, now: float) -> ClientFrame | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         number, message = taken
         if isinstance(number, int):
-            frame: DoorFrame = message.frame(number, _message_frame)
+            frame: ClientFrame = message.frame(number, _message_frame)
             return frame
         changed: ClientFrame = message  # of a parameter
         return changed

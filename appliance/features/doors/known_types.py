@@ -15,8 +15,7 @@ from functools import partial
 from typing import NamedTuple, TypeVar
 from weakref import WeakValueDictionary
 
-from appliance.features.doors.client_frames import frame_size
-from appliance.features.doors.png_frames import DoorFrame, PngFrame
+from appliance.features.doors.client_frames import ClientFrame, frame_size
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
@@ -107,7 +106,7 @@ class DoorMessage:
     def type(self) -> KnownType:
         return self.type_of(self.header)
 
-    def frame(self, form: Form, make: Callable[["DoorMessage", Form], DoorFrame]) -> DoorFrame:
+    def frame(self, form: Form, make: Callable[["DoorMessage", Form], ClientFrame]) -> ClientFrame:
         """Return the frame that `make` makes in this form, which clients with the same form share."""
         return make(self, form) if self.shared is None else self.shared.frame(self, form, make)
 
@@ -118,11 +117,11 @@ class SharedFrames:
     def __init__(self, most: int = 16 << 20) -> None:
         self.bytes = 0
         self._most = most
-        self._kept: OrderedDict[tuple[DoorMessage, Hashable], DoorFrame] = OrderedDict()  # oldest first
+        self._kept: OrderedDict[tuple[DoorMessage, Hashable], ClientFrame] = OrderedDict()  # oldest first
 
     def frame(
-        self, message: DoorMessage, form: Form, make: Callable[[DoorMessage, Form], DoorFrame]
-    ) -> DoorFrame:
+        self, message: DoorMessage, form: Form, make: Callable[[DoorMessage, Form], ClientFrame]
+    ) -> ClientFrame:
         known = self._kept.get((message, form))
         if known is not None:
             return known
@@ -137,9 +136,8 @@ class SharedFrames:
         return made
 
 
-def _kept_bytes(message: DoorMessage, frame: DoorFrame) -> int:
-    size = frame.size if isinstance(frame, PngFrame) else frame_size(frame)
-    return len(message.body) + size + _FRAME_OVERHEAD
+def _kept_bytes(message: DoorMessage, frame: ClientFrame) -> int:
+    return len(message.body) + frame_size(frame) + _FRAME_OVERHEAD
 
 
 class _Cache:

@@ -4,7 +4,8 @@
    the reason is new, or a failed `service_response`. Nothing else is sent without a request.
 2. Frames repeat the client's own spelling of a name; requests have the canonical name.
 3. Everything that a client can make grow has a limit.
-4. No fragments are sent: no client library reads them.
+4. No fragments and no images of texts (`png`) are sent or read. A subscription that asks for them gets plain JSON,
+   and a `status` of level warning.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +15,7 @@ from typing import Any
 from msgspec import Raw
 
 from appliance.base.counted import counted
-from appliance.features.doors.client_frames import frame_size
+from appliance.features.doors.client_frames import ClientFrame, frame_size
 from appliance.features.doors.client_requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -28,15 +29,12 @@ from appliance.features.doors.client_requests import (
     UnsubscribeTopic,
     WithdrawService,
 )
-from appliance.features.doors.fragments import FragmentStore
 from appliance.features.doors.known_types import DoorMessage
-from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.rosbridge_frames import (
     AdvertiseOp,
     AdvertiseServiceOp,
     CallServiceOp,
     Compression,
-    FragmentOp,
     OperationError,
     PublishOp,
     ServiceResponseOp,
@@ -62,7 +60,7 @@ from roswire.xmlrpc import Value
 _MOST_TOLD = 100
 _WITHOUT_DIGITS = str.maketrans("", "", "0123456789")  # such as the seconds that are left
 _LEVELS = ("none", "error", "warning", "info")
-_STRENGTH: tuple[Compression, ...] = ("none", "png", "cbor", "cbor-raw")
+_STRENGTH: tuple[Compression, ...] = ("none", "cbor", "cbor-raw")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +72,6 @@ class RosbridgeLimits:
     services: int = 100
     will_bytes: int = 4096
     calls: int = 100  # without an answer, in each direction
-    fragment_bytes: int = 8 << 20  # of all frames that are not complete
     call_seconds: float = 60.0  # unless the client asks for another time
     longest_call_seconds: float = 3600.0
 
@@ -110,7 +107,7 @@ class Rosbridge:
         self.queue = queue
         self._node = node
         self._limits = limits
-        self._level = _LEVELS.index("error")
+        self._level = _LEVELS.index("warning")
         self._subscriptions: dict[str, _Subscription] = {}  # by the client's spelling
         self._spellings: dict[str, set[str]] = {}  # of each topic with a subscription
         self._advertised: dict[str, _Advertisement] = {}
@@ -119,7 +116,6 @@ class Rosbridge:
         self._asked: dict[str, str] = {}  # calls to the client: their service, by id
         self._told: set[str] = set()
         self._number = 0
-        self._fragments = FragmentStore(limits.fragment_bytes, queue.memory)
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
             AdvertiseOp: self._advertise,
             UnadvertiseOp: self._unadvertise,
@@ -130,7 +126,6 @@ class Rosbridge:
             AdvertiseServiceOp: self._offer,
             UnadvertiseServiceOp: self._withdraw,
             ServiceResponseOp: self._answer,
-            FragmentOp: self._fragment,
             SetLevelOp: self._set_level,
             StatusOp: lambda _operation: [],
         }
@@ -206,8 +201,16 @@ class Rosbridge:
             )
         self._spellings.setdefault(topic, set()).add(operation.topic)
         seconds, length = (operation.throttle_rate or 0) / 1000, operation.queue_length or 0
-        subscription.clients[operation.id] = seconds, length, operation.compression
+        compression = "none" if operation.compression == "png" else operation.compression
+        subscription.clients[operation.id] = seconds, length, compression
         self._configure(operation.topic, subscription)
+        if operation.compression == "png":
+            text = "a door sends no images of texts: compression png is plain JSON; the smaller form is cbor"
+            self._tell(topic, "warning", text, operation.id)
+        if operation.fragment_size is not None:
+            self._tell(
+                topic, "warning", "a door sends no fragments: fragment_size has no effect", operation.id
+            )
         return [SubscribeTopic(topic, kind, operation.id)]
 
     def _configure(self, spelling: str, subscription: _Subscription) -> None:
@@ -276,15 +279,6 @@ class Rosbridge:
             raise OperationError(f"no call of {quoted(operation.service)} has this id")
         return [AnswerCall(service, call, operation.result, operation.values, operation.id)]
 
-    def _fragment(self, operation: FragmentOp) -> list[DoorRequest]:
-        text = self._fragments.add(operation)
-        if text is None:
-            return []
-        inner = decode_operation(text)
-        if isinstance(inner, FragmentOp):
-            raise OperationError("a fragment inside a fragment")
-        return self._carry_out[type(inner)](inner)
-
     def _set_level(self, operation: SetLevelOp) -> list[DoorRequest]:
         self._level = _LEVELS.index(operation.level)
         return []
@@ -311,13 +305,18 @@ class Rosbridge:
                     self._forget_subscription(spelling, None)
             case OfferService():
                 self._services.pop(request.service, None)
-        self.status("error", reason, request.reply_to)
-        # roslib shows a program only statuses without an id. Once for each topic and reason, it gets this one too.
         if isinstance(request, AdvertiseTopic | PublishMessage | SubscribeTopic):
-            told = f"{request.topic} {reason.translate(_WITHOUT_DIGITS)}"
-            if request.reply_to is not None and told not in self._told and len(self._told) < _MOST_TOLD:
-                self._told.add(told)
-                self.status("error", reason)
+            self._tell(request.topic, "error", reason, request.reply_to)
+        else:
+            self.status("error", reason, request.reply_to)
+
+    def _tell(self, topic: str, level: str, reason: str, reply_to: ClientId) -> None:
+        self.status(level, reason, reply_to)
+        # roslib shows a program only statuses without an id. Once for each topic and reason, it gets this one too.
+        told = f"{topic} {reason.translate(_WITHOUT_DIGITS)}"
+        if reply_to is not None and told not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add(told)
+            self.status(level, reason)
 
     def _fail_call(self, call: _Call, reason: str) -> None:
         # ros-mcp takes values without `successful` for a success.
@@ -370,17 +369,17 @@ class Rosbridge:
         for spelling in self._spellings.get(message.topic, ()):
             self.queue.put(spelling, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> DoorFrame | None:
+    def next_frame(self, now: float) -> ClientFrame | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         spelling, message = taken
         try:
             compression = self._subscriptions[spelling].compression
-            frame: DoorFrame = message.frame((spelling, compression), publish_frame)
+            frame: ClientFrame = message.frame((spelling, compression), publish_frame)
             # A raw message had room while it waited; what is made of one can be many times as large.
             if compression != "cbor-raw":
-                more = max(_size(frame) - len(message.body), 0)
+                more = max(frame_size(frame) - len(message.body), 0)
                 self.queue.memory.take(more)
                 self.queue.memory.send(more)
             return frame
@@ -389,10 +388,6 @@ class Rosbridge:
 
     def next_time(self) -> float | None:
         return self.queue.next_time()
-
-
-def _size(frame: DoorFrame) -> int:
-    return frame.size if isinstance(frame, PngFrame) else frame_size(frame)
 
 
 def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:

@@ -11,7 +11,6 @@ from appliance.features.doors.cbor_frames import json_of_cbor
 from appliance.features.doors.client_frames import ClientFrame, binary_frame, text_frame
 from appliance.features.doors.client_requests import ClientId
 from appliance.features.doors.known_types import DoorMessage
-from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 
@@ -24,7 +23,7 @@ Id = (
     | float
     | None
 )
-Compression = Literal["none", "png", "cbor", "cbor-raw"]
+Compression = Literal["none", "cbor", "cbor-raw"]
 _Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 _NOTHING = Raw(b"{}")
 
@@ -66,7 +65,8 @@ class SubscribeOp(_Operation, tag="subscribe"):
     throttle_rate: Annotated[int, Meta(ge=0, le=86_400_000)] | None = 0
     """The least number of milliseconds between two messages."""
     queue_length: _Count | None = 0
-    compression: Compression = "none"
+    compression: Compression | Literal["png"] = "none"
+    fragment_size: int | None = None
 
 
 class UnsubscribeOp(_Operation, tag="unsubscribe"):
@@ -105,14 +105,6 @@ class ServiceResponseOp(_Operation, tag="service_response"):
     result: bool = True
 
 
-class FragmentOp(_Operation, tag="fragment"):
-    """A part of a frame."""
-
-    data: str
-    num: _Count
-    total: Annotated[int, Meta(ge=1, le=10_000)]
-
-
 class SetLevelOp(_Operation, tag="set_level"):
     """Set the level from which statuses are sent."""
 
@@ -133,13 +125,12 @@ Operation = (
     | AdvertiseServiceOp
     | UnadvertiseServiceOp
     | ServiceResponseOp
-    | FragmentOp
     | SetLevelOp
     | StatusOp
 )
 OPERATIONS = (
     "advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service",
-    "unadvertise_service", "service_response", "fragment", "set_level", "status",
+    "unadvertise_service", "service_response", "set_level", "status",
 )  # fmt: skip
 
 
@@ -151,7 +142,7 @@ class Envelope(Struct):
     receiver: Any = None
 
 
-def publish_frame(message: DoorMessage, form: tuple[str, Compression]) -> DoorFrame:
+def publish_frame(message: DoorMessage, form: tuple[str, Compression]) -> ClientFrame:
     """Return the frame of a message in one form: the clients' spelling of its topic, and their compression.
 
     Raise `MessageValueError` if the message does not fit its definition.
@@ -163,10 +154,7 @@ def publish_frame(message: DoorMessage, form: tuple[str, Compression]) -> DoorFr
         return binary_frame(_publish_head(topic) + head, message.body)
     if compression == "cbor":
         return binary_frame(_publish_head(topic) + b"\x63msg", message.type.codec.cbor(message.body))
-    text = msgspec.json.encode(
-        {"op": "publish", "topic": topic, "msg": message.type.codec.json(message.body)}
-    )
-    return PngFrame(text) if compression == "png" else text_frame(text)
+    return json_frame({"op": "publish", "topic": topic, "msg": message.type.codec.json(message.body)})
 
 
 _RAW_SECS, _RAW_NSECS, _RAW_BYTES = b"\x63msg\xa3\x64secs\x1a", b"\x65nsecs\x1a", b"\x65bytes\x5a"
@@ -218,6 +206,8 @@ def _complaint(text: bytes, error: Exception) -> str:
     if envelope.op is None:
         version = " (rosbridge 1.0 is not supported)" if envelope.receiver is not None else ""
         return f"an operation without `op`{version}; the operations are {', '.join(OPERATIONS)}"
+    if envelope.op == "fragment":
+        return "a door joins no fragments: send the whole operation in one frame"
     if envelope.op not in OPERATIONS:
         return f"unknown operation {quoted(str(envelope.op))}; the operations are {', '.join(OPERATIONS)}"
     return f"{envelope.op}: {error}"

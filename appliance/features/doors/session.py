@@ -48,7 +48,6 @@ from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
-from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.refusal_counts import MOST_REFUSALS, REFUSAL_SECONDS, RefusalCounts
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
@@ -115,7 +114,7 @@ class ClientProtocol(Protocol):
 
     def message(self, message: DoorMessage, now: float) -> None: ...
 
-    def next_frame(self, now: float) -> DoorFrame | None:
+    def next_frame(self, now: float) -> ClientFrame | None:
         """Return the next frame to send now, or None."""
 
     def next_time(self) -> float | None:
@@ -324,9 +323,9 @@ class DoorSession:
         self.memory.add(size - self._unfinished)
         self._unfinished = size
         if size or self._socket.current_size is not None:
-            self.memory.unfinished.grew("frame", size)
+            self.memory.unfinished.grew(size)
         else:
-            self.memory.unfinished.finished("frame")
+            self.memory.unfinished.finished()
         if size > _READ_BYTES and (reason := self.memory.refusal(0)):
             self._disconnect(CloseCode.MESSAGE_TOO_BIG, reason)
 
@@ -353,7 +352,7 @@ class DoorSession:
             size = len(data)
             self.memory.add(-self._unfinished)
             self._unfinished = 0
-            self.memory.unfinished.finished("frame")
+            self.memory.unfinished.finished()
             # A small frame, such as a stop, is always carried out.
             try:
                 with self.memory.holding(_COPIES * size) if size > _READ_BYTES else contextlib.nullcontext():
@@ -411,7 +410,7 @@ class DoorSession:
             while self._socket.state is State.OPEN:
                 self._wake.clear()
                 now = loop.time()
-                taken = await self._take_frames(now)
+                taken = self._take_frames(now)
                 next_ping = last_ping + (options.will_ping_seconds if self._wills else options.ping_seconds)
                 if now >= next_ping:
                     last_ping = now
@@ -439,17 +438,14 @@ class DoorSession:
         self._alarm, self._alarm_time = None, -math.inf
         self._wake.set()
 
-    async def _take_frames(self, now: float) -> int:
+    def _take_frames(self, now: float) -> int:
         """Take about `_BATCH_BYTES` of the frames that may be sent now; return their number of bytes.
 
         Without deflate, frames are sent as they are, and large bodies are not copied. `_flush` sends them before
         anything else can be added, so nothing follows a closing frame.
         """
         size, next_frame, deflates = 0, self._protocol.next_frame, bool(self._socket.extensions)
-        while size < _BATCH_BYTES and (made := next_frame(now)) is not None:
-            frame = await self._made(made) if isinstance(made, PngFrame) else made
-            if self._socket.state is not State.OPEN:  # it was closed in the meantime
-                break
+        while size < _BATCH_BYTES and (frame := next_frame(now)) is not None:
             size += frame_size(frame)
             self.sent += 1
             if deflates:
@@ -460,12 +456,6 @@ class DoorSession:
             else:
                 self._pieces += frame
         return size
-
-    async def _made(self, png: PngFrame) -> ClientFrame:
-        while png.frame is None:
-            png.step()
-            await asyncio.sleep(0)
-        return png.frame
 
     async def _flush(self) -> None:
         if not self._write():

@@ -44,7 +44,6 @@ SHOWN = {
     "rosbridge.RosbridgeLimits.services": "100 of a client",
     "rosbridge.RosbridgeLimits.will_bytes": "4096 bytes",
     "rosbridge.RosbridgeLimits.calls": "100 of a client",
-    "rosbridge.RosbridgeLimits.fragment_bytes": "| 8 MB |",
     "rosbridge.RosbridgeLimits.call_seconds": "60 s, or the `timeout`",
     "rosbridge.RosbridgeLimits.longest_call_seconds": "up to 3600 s",
     "rosbridge_frames._MOST_CHARACTERS": "1024 characters",
@@ -62,7 +61,7 @@ SHOWN = {
     "unfinished._LEAST_SENT": "16 KB more in ten seconds",
     "unfinished._LEAST_SHARED": "256 KB if the client holds",
     "values.ValueLimits.message_bytes": "a message of a client | 16 MB",
-    "values.ValueLimits.shown_bytes": "as JSON, CBOR or PNG 32 MB",
+    "values.ValueLimits.shown_bytes": "as JSON or CBOR 32 MB",
     "values.ValueLimits.values": "450,000 values in JSON",
 }
 

@@ -1,28 +1,21 @@
-import tracemalloc
-
 import pytest
 
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
-from appliance.features.doors.fragments import FragmentStore
 from appliance.features.doors.quotas import DOOR_BYTES
-from appliance.features.doors.rosbridge_frames import FragmentOp, OperationError
 from appliance.features.doors.viewer_queue import ViewerQueue, ViewerStalledError
 
 _MIB = 1 << 20
 
 
-def fill(memory: ClientMemory) -> tuple[ViewerQueue[str], FragmentStore]:
-    queue, fragments = ViewerQueue[str](memory=memory), FragmentStore(8 * _MIB, memory)
+def fill(memory: ClientMemory) -> ViewerQueue[str]:
+    queue = ViewerQueue[str](memory=memory)
     queue.configure("/image", depth=1000, interval=0.0)
-    with pytest.raises(OperationError):
-        for number in range(9):
-            fragments.add(FragmentOp(id=str(number), data="x" * _MIB, num=0, total=2))
     with pytest.raises(ViewerStalledError):
         for _ in range(17):
             queue.reply(b"x" * _MIB)
     for _ in range(17):
         queue.put("/image", b"", _MIB, 0.0)
-    return queue, fragments
+    return queue
 
 
 def test_a_message_without_room_costs_the_client_no_other() -> None:
@@ -32,20 +25,6 @@ def test_a_message_without_room_costs_the_client_no_other() -> None:
     queue.put("/image", b"too large", 60 * _MIB, 0.0)
     assert queue.dropped == 1
     assert queue.take(0.0) == ("/image", b"kept")
-
-
-def test_one_letter_makes_no_text_take_more_than_is_charged() -> None:
-    """Python takes four bytes for each character of a text that has an emoji."""
-    memory = DoorMemory().client()
-    fragments = FragmentStore(8 * _MIB, memory)
-    tracemalloc.start()
-    for number in range(3):
-        text = f"{'x' * _MIB}{number}\N{GRINNING FACE}"
-        fragments.add(FragmentOp(id=str(number), data=text, num=0, total=2))
-        del text
-    taken, _peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert 3 * _MIB < taken < memory.held
 
 
 def test_greedy_clients_leave_memory_for_the_next_one() -> None:
@@ -60,7 +39,7 @@ def test_greedy_clients_leave_memory_for_the_next_one() -> None:
     quiet.put("/image", b"", _MIB, 0.0)
     quiet.reply(b"pong")
     assert quiet.dropped == 0
-    queue, _fragments = greedy[0]
+    queue = greedy[0]
     while queue.take(0.0) is not None:
         pass
     for memory in clients:

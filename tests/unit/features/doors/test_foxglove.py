@@ -13,7 +13,6 @@ from appliance.features.doors.client_requests import (
     UnsubscribeTopic,
 )
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
-from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.quotas import DOOR_BYTES
 from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
 from appliance.features.doors.viewer_queue import ViewerQueue
@@ -314,7 +313,7 @@ def received(foxglove: Foxglove, frame: str | bytes) -> list[DoorRequest]:
 
 def text_frame(foxglove: Foxglove) -> str | None:
     frame = foxglove.next_frame(0.0)
-    assert frame is None or (not isinstance(frame, PngFrame) and is_text(frame))
+    assert frame is None or is_text(frame)
     return None if frame is None else content(frame).decode()
 
 

@@ -1,7 +1,5 @@
-import base64
 import json
 import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -24,7 +22,6 @@ from appliance.features.doors.client_requests import (
 )
 from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.known_types import DoorMessage, KnownTypes
-from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue, ViewerStalledError
@@ -56,9 +53,6 @@ class Client:
     def gets(self) -> list[Any]:
         frames = []
         while (frame := self.rosbridge.next_frame(self.now)) is not None:
-            while isinstance(frame, PngFrame):
-                frame.step()
-                frame = frame.frame or frame
             frames.append(json.loads(content(frame)) if is_text(frame) else cbor2.loads(content(frame)))
         return frames
 
@@ -213,29 +207,18 @@ def test_messages_have_the_spelling_and_the_compression_of_the_client(client: Cl
     assert client.gets() == []
 
 
-@pytest.mark.parametrize(
-    "text", [*("x" * length for length in range(1, 12)), "x" * 5000, "grüße, 机器人 😀" * 3000]
-)
-def test_png_holds_the_frame_in_its_pixels(client: Client, text: str) -> None:
-    client.sends({"op": "subscribe", "topic": "/chatter", "compression": "png"})
-    client.hears(text)
-    (frame,) = client.gets()
-    png = base64.b64decode(frame["data"])
-    chunks, position = dict[bytes, bytes](), 8
-    while position < len(png):
-        size, kind = struct.unpack_from(">I4s", png, position)
-        body = png[position + 8 : position + 8 + size]
-        assert struct.unpack_from(">I", png, position + 8 + size) == (zlib.crc32(kind + body),)
-        chunks[kind] = chunks.get(kind, b"") + body
-        position += 12 + size
-    width, height, *form = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
-    assert form == [8, 2, 0, 0, 0] and [*chunks][-1] == b"IEND"
-    rows = zlib.decompress(chunks[b"IDAT"])
-    assert len(rows) == height * (3 * width + 1)
-    pixels = b"".join(rows[start + 1 : start + 3 * width + 1] for start in range(0, len(rows), 3 * width + 1))
-    expected = {"op": "publish", "topic": "/chatter", "msg": {"data": text}}
-    read = pixels.decode("latin-1")  # as roslib reads them in a browser: each byte is a character
-    assert json.loads(read) == expected  # the line feeds at the end are white space
+def test_png_and_fragments_are_answered_with_json_and_a_warning(client: Client) -> None:
+    asked = {"op": "subscribe", "topic": "/chatter", "id": 1, "compression": "png", "fragment_size": 1000}
+    assert client.sends(asked) == [SubscribeTopic("/chatter", None, 1)]
+    client.hears("hello")
+    *warnings, message = client.gets()
+    assert message == {"op": "publish", "topic": "/chatter", "msg": {"data": "hello"}}
+    assert {(one["op"], one["level"]) for one in warnings} == {("status", "warning")}
+    assert [one.get("id") for one in warnings] == [1, None, 1, None]  # roslib shows those without an id
+    assert "png is plain JSON" in warnings[0]["msg"] and "fragment_size has no effect" in warnings[2]["msg"]
+    client.sends({"op": "subscribe", "topic": "/chatter", "id": 2, "compression": "cbor"})
+    client.hears("hello")
+    assert client.gets() == [message]
 
 
 def test_two_spellings_of_a_topic_both_get_its_messages(client: Client) -> None:
@@ -339,17 +322,6 @@ def test_a_service_of_the_client_gets_calls_and_its_answers_are_matched_by_id(cl
     assert "does not offer" in client.refusal({"op": "unadvertise_service", "service": "/brake"})["msg"]
 
 
-def test_fragments_of_the_client_are_joined_in_any_order(client: Client) -> None:
-    text = json.dumps({"op": "subscribe", "topic": "/chatter"})
-    parts = [text[:10], text[10:20], text[20:]]
-    for number in (2, 0):
-        part = {"op": "fragment", "id": "f", "num": number, "total": 3, "data": parts[number]}
-        assert client.sends(part) == []
-    assert client.sends({"op": "fragment", "id": "f", "num": 1, "total": 3, "data": parts[1]}) == [
-        SubscribeTopic("/chatter")
-    ]
-
-
 def test_cbor_and_binary_json_of_a_client_are_understood(client: Client) -> None:
     for frame in (cbor2.dumps({"op": "subscribe", "topic": "/a"}), b' {"op":"subscribe","topic":"/a"}'):
         assert client.sends(frame) == [SubscribeTopic("/a")]
@@ -394,14 +366,7 @@ def test_levels_choose_the_statuses(client: Client) -> None:
         (b'{"op":"subscribe","topic":"/\xff"}', "can't decode byte 0xff", None),
         (b"\xa1\x62op\x9f\xff", "indefinite length", None),
         (b"\xff\xff", "indefinite length", None),
-        ('{"op":"fragment","id":1,"num":3,"total":3,"data":""}', "fragment 3 of 3 does not fit", 1),
-        ('{"op":"fragment","id":1,"num":0,"total":99999,"data":""}', "<= 10000", 1),
-        (
-            '{"op":"fragment","id":1,"num":0,"total":1,"data":"{\\"op\\":\\"fragment\\",\\"num\\":0,\\"total\\":1,'
-            '\\"data\\":\\"\\"}"}',
-            "a fragment inside a fragment",
-            1,
-        ),
+        ('{"op":"fragment","id":1,"num":3,"total":3,"data":""}', "send the whole operation in one frame", 1),
         ('{"op":"service_response","service":"/a","id":"x","result":true}', "no call of '/a'", "x"),
         ('{"op":"set_level","level":"loud"}', "Invalid enum value 'loud'", None),
     ],
@@ -415,13 +380,12 @@ def test_a_frame_that_breaks_the_protocol_is_refused_in_words(
 
 
 def test_everything_that_a_client_can_make_grow_has_a_limit() -> None:
-    client = Client(topics=3, ids=3, services=3, fragment_bytes=10_000)
+    client = Client(topics=3, ids=3, services=3)
     made: dict[str, Callable[[int], dict[str, Any]]] = {
         "subscribe": lambda number: {"topic": f"/t{number}"},
         "publish": lambda number: {"topic": f"/t{number}"},
         "advertise": lambda number: {"topic": "/t1", "type": "a/B", "id": number},
         "advertise_service": lambda number: {"service": f"/s{number}", "type": "a/B"},
-        "fragment": lambda number: {"id": "x" * 900 + str(number), "num": 0, "total": 9, "data": ""},
     }
     for operation, fields in made.items():
         refused = 0

@@ -10,7 +10,6 @@ from websockets.datastructures import Headers
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.origins import rejection
-from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.quotas import DOOR_BYTES
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
@@ -536,32 +535,6 @@ async def test_a_viewer_that_stops_reading_delays_no_other_and_takes_bounded_mem
         await asyncio.sleep(100)
         assert world.sessions[0].end == "the client was silent for too long"
         assert reading.is_open
-
-
-async def test_an_image_of_a_large_text_delays_no_other_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with door_world() as world:
-        robot = await world.robot("10.0.0.3", "/robot")
-        large, small = await talks(robot, "/map"), await talks(robot, "/state")
-        viewers, other = [await world.client() for _number in range(3)], await world.client()
-        for client in viewers:
-            client.send({"op": "subscribe", "topic": "/map", "compression": "png"})
-        other.send({"op": "subscribe", "topic": "/state"})
-        await asyncio.sleep(1)
-        arrived, step = list[int](), PngFrame.step
-
-        def watched(png: PngFrame) -> None:
-            if not arrived:
-                small.publish(string("ready"))
-                viewers[2].writer.close()
-            arrived.append(other.frames.qsize())
-            step(png)
-
-        monkeypatch.setattr(PngFrame, "step", watched)
-        large.publish(string("x" * 3_000_000))
-        frames = [await client.next() for client in viewers[:2]]
-        assert frames[0] == frames[1] and frames[0]["op"] == "png"
-        assert arrived[0] == 0 and arrived[-1] == 1
-        assert 60 < len(arrived) < 90  # both clients share the steps
 
 
 async def test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds() -> None:
