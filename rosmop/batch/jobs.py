@@ -7,13 +7,12 @@ recording's length.
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import msgspec
 
-from rosmop.batch.object_store import SCHEME, fetched
 from rosmop.batch.recording_list import RecordingName, local_recording
 from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replayed
 from rosmop.check.sources import compiled_from
@@ -173,23 +172,18 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 
 @contextmanager
 def local_file(recording: RecordingName) -> Iterator[Path]:
-    """Yield the path of a recording, which is fetched if it is remote.
+    """Yield the path of a recording.
 
-    Raises `RecordingError`, even after the block if a local file has changed since the command listed it.
+    Raises `RecordingError`, even after the block if the file has changed since the command listed it.
     """
-    with ExitStack() as opened:
-        if recording.uri.startswith(SCHEME):
-            path = opened.enter_context(fetched(recording.uri, recording.version))
-        else:
-            path = Path(os.fsdecode(recording.path))
-        try:
-            yield path
-        except RecordingError as error:
-            raise RecordingError(str(error).replace(str(path), recording.uri)) from error
-        if recording.path:
-            now = local_recording(path)
-            if (now.size, now.version) != (recording.size, recording.version):
-                raise RecordingError(f"{recording.uri} changed after the command began")
+    path = Path(os.fsdecode(recording.path))
+    try:
+        yield path
+    except RecordingError as error:
+        raise RecordingError(str(error).replace(str(path), recording.uri)) from error
+    now = local_recording(path)
+    if (now.size, now.version) != (recording.size, recording.version):
+        raise RecordingError(f"{recording.uri} changed after the command began")
 
 
 def _name(recording: RecordingName) -> str:

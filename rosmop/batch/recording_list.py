@@ -1,4 +1,4 @@
-"""List the recordings that a user names: files, folders, patterns and S3 prefixes."""
+"""List the recordings that a user names: files, folders and patterns."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -6,14 +6,13 @@ from pathlib import Path
 
 import msgspec
 
-from rosmop.batch import object_store
 from rosmop.recordings.recording import RecordingError
 
 ENDINGS = (".bag", ".mcap")
 
 
 class RecordingName(msgspec.Struct, frozen=True):
-    """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents.
+    """A path, with the size in bytes and the time of change, which identify the contents.
 
     `uri` escapes bytes outside UTF-8. `path` is absolute, because workers have other current folders.
     """
@@ -27,22 +26,20 @@ class RecordingName(msgspec.Struct, frozen=True):
 def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingName]:
     """Return each recording once: the files, then those of each set in the order of their names.
 
-    A set is a folder (with its folders), a pattern or an S3 prefix. Raises `RecordingError` for an empty set.
+    A set is a folder (with its folders) or a pattern. Raises `RecordingError` for an empty set.
     """
     found: dict[str, RecordingName] = {}
     for file in files:
         found.setdefault(os.path.realpath(file), local_recording(file))
     for one in sets:
-        if one.startswith(object_store.SCHEME):
-            objects = [RecordingName(*row) for row in object_store.listed(one) if row[0].endswith(ENDINGS)]
-            found.update((row.uri, row) for row in objects)
-            empty = not objects
-        else:
-            paths = sorted(_paths(one))
-            for path in paths:
-                found.setdefault(os.path.realpath(path), local_recording(Path(path)))
-            empty = not paths
-        if empty:
+        if one.startswith("s3://"):
+            raise RecordingError(
+                f"{one}: recordings are files; mount the bucket, or copy it with `aws s3 sync`"
+            )
+        paths = sorted(_paths(one))
+        for path in paths:
+            found.setdefault(os.path.realpath(path), local_recording(Path(path)))
+        if not paths:
             raise RecordingError(f"there are no recordings ({', '.join(ENDINGS)}) in {one}")
     return list(found.values())
 

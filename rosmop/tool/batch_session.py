@@ -112,7 +112,7 @@ class BatchSession:
 @contextmanager
 def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterator[BatchSession]:
     if not options.bags and not options.sets:
-        raise program.usage_error("give recordings: --bag FILE, or --bags with a folder, a pattern or s3://…")
+        raise program.usage_error("give recordings: --bag FILE, or --bags with a folder or a pattern")
     if options.report is not None and not os.access(options.report.parent, os.W_OK):
         raise program.usage_error(f"cannot write {options.report}: its folder is missing or not writable")
     with ExitStack() as opened:

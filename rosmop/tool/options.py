@@ -19,7 +19,7 @@ BagSets = Annotated[
     typer.Option(
         "--bags",
         metavar="DIR",
-        help="All recordings in a folder, matching a pattern ('2026-*/*.bag'), or in s3://BUCKET/PREFIX (repeatable)",
+        help="All recordings in a folder, or matching a pattern ('2026-*/*.bag') (repeatable)",
     ),
 ]
 Workers = Annotated[
