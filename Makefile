@@ -100,7 +100,6 @@ fleet: setup ## the collector: its images dist/rosrv-fleet-images_VERSION_ARCH.t
 release: ## everything anew, with provenance and checksums that KEY=FILE signs; DESPITE="reason" if a lane of the night is not green
 	mkdir -p build && $(BIN)/python -m tests.nightly --release --despite "$(DESPITE)" > build/lanes.txt
 	$(BIN)/python -m distribution.released_presets --check
-	$(BIN)/python -m distribution.sizes --release
 	rm -rf dist
 	$(MAKE) wheel package site fleet ARCH="amd64 arm64"
 	cp build/lanes.txt dist/

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from appliance.audit.log.events import EVENTS, SEVERITIES
 from appliance.audit.log.record import Severity
 from appliance.audit.log.repetition import ABOUT, PARAMETERS
-from distribution import counts
+from distribution import fact_cache
 from distribution.checkout import ROOT
 from distribution.fact_cache import facts_of_files
 
@@ -104,13 +104,13 @@ class _Recorded(NamedTuple):
 def _modules() -> tuple[_Recorded, ...]:
     paths = sorted((ROOT / "appliance").rglob("*.py"))
     usual = map(str, sorted(SEVERITIES.items()))
-    code = (__file__, counts.__file__)
+    code = (__file__, fact_cache.__file__)
     return tuple(facts_of_files(_Recorded, _recorded, paths, code=code, context=usual).values())
 
 
 def _recorded(path: Path) -> _Recorded:
     text = path.read_text(encoding="utf-8")
-    within, place = counts.nodes(ast.parse(text)), path.relative_to(ROOT / "appliance")
+    within, place = fact_cache.nodes(ast.parse(text)), path.relative_to(ROOT / "appliance")
     calls = (node for node in within if isinstance(node, ast.Call))
     uses = tuple(use for node in calls for use in _use(node, f"{place}:{node.lineno}"))
     return _Recorded(uses, frozenset(_written(within)))
@@ -130,7 +130,7 @@ def written() -> frozenset[str]:
 
 def written_by(text: str) -> Iterator[str]:
     """Yield the events that a module records."""
-    return _written(counts.nodes(ast.parse(text)))
+    return _written(fact_cache.nodes(ast.parse(text)))
 
 
 def _written(nodes: Sequence[ast.AST]) -> Iterator[str]:

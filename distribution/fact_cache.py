@@ -1,19 +1,63 @@
-"""Keep the facts of source files between runs, in `build/facts`, so that a check parses only the files that changed."""
+"""Walk the syntax of source files, and keep their facts in `build/facts`, so that a check parses only changed files."""
 
+import ast
 import contextlib
+import gc
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
 from distribution.checkout import ROOT
-from distribution.counts import no_collector
 
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
 _Facts = TypeVar("_Facts")
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@contextlib.contextmanager
+def no_collector() -> Iterator[None]:
+    """Stop the garbage collector, which scans millions of syntax nodes again and again. They have no cycles."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def nodes(tree: ast.AST) -> list[ast.AST]:
+    """Return the node and all nodes below it, level by level, in half the time of `ast.walk`."""
+    found = [tree]
+    for node in found:
+        for value in node.__dict__.values():
+            if isinstance(value, list):
+                found += [each for each in value if isinstance(each, ast.AST)]
+            elif isinstance(value, ast.AST):
+                found.append(value)
+    return found
+
+
+def statements(tree: ast.AST) -> list[ast.AST]:
+    """Return the node and all statements below it, without the expressions, which are most of a file's nodes."""
+    found = [tree]
+    for node in found:
+        for block in _BLOCKS:
+            found += getattr(node, block, ()) if not isinstance(node, ast.expr) else ()
+    return found
+
+
+def functions(tree: ast.AST) -> Iterator[Function]:
+    return (node for node in statements(tree) if isinstance(node, Function))
 
 
 def facts_of_files(

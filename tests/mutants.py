@@ -27,7 +27,7 @@ from typing import Any
 
 import pytest
 
-from distribution.sizes import kernel_modules
+from tests.support.sources import kernel_modules
 
 ROOT = Path(__file__).parents[1]
 _KERNEL = [path.removesuffix(".py") for path in kernel_modules() if path.endswith(".py")]

@@ -1,9 +1,8 @@
 import grimp
 import pytest
 
-from distribution.sizes import KERNEL_FILE, OUTSIDE, kernel_modules, kernel_parts
 from tests.support.rows import require_rows
-from tests.support.sources import ROOT
+from tests.support.sources import KERNEL_FILE, OUTSIDE, ROOT, kernel_modules, kernel_parts
 
 
 def test_each_listed_module_exists() -> None:

@@ -335,3 +335,10 @@ def test_the_architecture_lists_each_folder_once() -> None:
     )
     assert len(rows) > 20
     assert len(rows) == len(set(rows))
+
+
+def test_the_guides_stay_short_and_the_index_begins_with_twelve_pages() -> None:
+    """Further text is a row of the reference, or replaces words of a guide."""
+    words = sum(len(page.read_text().split()) for page in (ROOT / "docs").glob("*.md"))
+    first = (ROOT / "docs/README.md").read_text().split("\n## ")[1]
+    assert (words <= 40_000, first.count("\n| [")) == (True, 12)

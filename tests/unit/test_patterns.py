@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from distribution.counts import nodes
+from distribution.fact_cache import nodes
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError
 from roswire.xmlrpc import XmlRpcLimits

@@ -14,9 +14,8 @@ import typer
 from rosrv_fleet.cli import app as fleet_app
 
 from appliance.cli import main
-from distribution import counts
-from distribution.counts import nodes
-from distribution.fact_cache import facts_of_files
+from distribution import fact_cache
+from distribution.fact_cache import facts_of_files, nodes
 from rosmop.tool.command import app as rosmop_app
 from tests.support.sources import LANGUAGE_TESTS, ROOT
 
@@ -59,7 +58,7 @@ def proposals() -> dict[str, str]:
     files = [file for folder in ("appliance", "fleet", "rosmop") for file in (ROOT / folder).rglob("*.py")]
     files += ROOT.glob("appliance/**/console/**/*.js")
     product = [file for file in files if LANGUAGE_TESTS not in file.parents]
-    code = (__file__, counts.__file__)
+    code = (__file__, fact_cache.__file__)
     for name, proposed in facts_of_files(tuple[str, ...], proposed_by, product, code=code).items():
         for call in proposed:
             found.setdefault(call, Path(name).name)

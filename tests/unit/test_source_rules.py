@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import pytest
 
-from distribution import counts
-from distribution.counts import name_of, nodes
-from distribution.fact_cache import facts_of_files
+from distribution import fact_cache
+from distribution.fact_cache import facts_of_files, name_of, nodes
 from tests.support.sources import ROOT
 from tests.unit import test_plain_english
 from tests.unit.test_plain_english import FOLDERS, bad_habits, said_in
@@ -549,7 +548,7 @@ RULES = {
 def test_the_source_keeps_its_rules() -> None:
     seen: dict[str, list[Seen]] = {name: [] for name in RULES}
     paths = sorted({path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")})
-    code = (__file__, test_plain_english.__file__, counts.__file__)
+    code = (__file__, test_plain_english.__file__, fact_cache.__file__)
     for path, facts in facts_of_files(dict[str, list[tuple[int, str]]], seen_in, paths, code=code).items():
         for name, rows in facts.items():
             seen[name] += (Seen(path, line, what) for line, what in rows)

@@ -8,7 +8,7 @@ import pytest
 from appliance.channel.messages import Contents, ContentsFound, ContentsWanted, PartsMade, PartsWanted
 from appliance.specifications import compiled_store
 from appliance.specifications.compiled_store import LIBRARIES, SOURCES, CompiledStore, toolchain
-from distribution.counts import statements
+from distribution.fact_cache import statements
 
 QUESTION = ContentsWanted(0, {"a.rv": "text", "b.rv": "more"}, {}, at_start=True)
 ANSWER = ContentsFound(7, Contents({"a": "a.rv"}, topics={"/t": frozenset({"a"})}, compiled=b"code"))

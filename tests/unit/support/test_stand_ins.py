@@ -2,7 +2,7 @@ import ast
 import re
 from collections.abc import Iterator
 
-from distribution.counts import nodes
+from distribution.fact_cache import nodes
 from tests.support.sources import ROOT, files_of_tests
 
 # Names with an underscore that are part of a published interface.

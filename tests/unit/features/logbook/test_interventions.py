@@ -34,7 +34,7 @@ from appliance.formats.machine_report import (
     read_records,
 )
 from appliance.formats.report_words import page, report_lines
-from distribution.counts import nodes, statements
+from distribution.fact_cache import nodes, statements
 
 HOUR = 3_600_000_000_000
 ALWAYS = Period(0, 1000 * HOUR)

@@ -10,7 +10,7 @@ from appliance.configuration.settings import Settings
 from appliance.features.selftest import file_checks, machine_checks
 from appliance.network.namespaces import read_only_settings
 from appliance.supervisor.restore_mark import set_mark
-from distribution.counts import functions, statements
+from distribution.fact_cache import functions, statements
 
 ROOT = Path(__file__).parents[4] / "appliance"
 TWINS = {
