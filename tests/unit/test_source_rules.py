@@ -163,58 +163,6 @@ def unfilled(seen: Sequence[Seen]) -> Iterator[str]:
 
 # --- clocks ---
 
-WALL_CLOCK = {
-    "a moment that people are shown, or that stands in a file": [
-        "api/front/history.py", "audit/log/ids.py", "audit/log/log.py", "telemetry/audit_trail.py", "backup/create.py",
-        "cli/audit/verified.py",
-        "features/fleet/poller.py", "features/fleet/bundle_gate.py", "features/adopt/machine_side.py",
-        "features/standby/second_join.py", "cli/status_watch.py", "features/fleet/connection.py",
-        "control/assembly/host_blocks.py", "features/standby/passive.py", "cli/connection/audit_file.py",
-        "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",
-        "features/recorder/orders.py",
-        "features/evidence/bundle.py",
-        "features/doors/client_counts.py", "features/guards/guard_orders.py",
-        "features/doors/door_node.py", "features/doors/door_table.py", "features/doors/door_tickets.py",
-        "features/syslog/log_forwarder.py",
-        "features/fleet/segment_pusher.py",
-        "features/tunnels/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
-        "features/recorder/recorder.py", "features/recorder/ring.py", "features/recorder/recorder_ring.py",
-        "features/recorder/rings.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
-        "specifications/specifications_in_force.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
-        "supervisor/supervisor.py", "base/log_output.py",
-    ],
-    "the date of an end of `EndTable`, for people and for the api": [
-        "api/front/access.py", "control/operators/handled_alarms.py", "control/operators/token_orders.py",
-        "features/blocks/orders.py", "features/blocks/verbs.py",
-        "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
-        "features/standby/passive_rest.py",
-    ],
-    "the time of a signature, for a receiver on another machine": ["features/approvals/hook_process.py"],
-    "an end that is a date: of a certificate or a revocation": [
-        "features/sso/sign_on.py",
-        "features/metrics/routes.py", "features/fleet/view.py", "api/process.py",
-        "features/selftest/file_checks.py",
-        "features/fleet/verified_bundles.py", "features/standby/appliance_table.py",
-        "features/tunnels/certification.py", "hosts/revoked_certificates.py",
-        "hosts/tunnel_state.py", "features/tunnels/host_view.py", "ipsec/certificate_authority.py",
-        "signing/own_certificate.py",
-    ],
-    "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/operators/new_state.py", "control/operators/switched_off.py", "features/tunnels/self_service.py",
-    ],
-    "whether the wall clock can be believed, and where it is read": [
-        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py", "store/ends.py",
-    ],
-    "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/front/moments.py", "audit/search/filter_options.py",
-        "features/logbook/report_verb.py", "cli/durations.py",
-        "features/monitor_tools/reset_verb.py", "features/policy_tools/policy_input.py",
-        "features/tunnels/protect_verb.py",
-        "base/timestamps.py",
-        "features/topics/verbs.py", "features/recorder/replay_input.py",
-    ],
-}  # fmt: skip
-"""Files that may read the wall clock, by purpose. Add a file only if it has one of these purposes."""
 DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
     "appliance/features/standby/witness/enforcement.py": "runs on a machine without the appliance",
@@ -225,22 +173,6 @@ DIRECT = {
 _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
     f"{clock}{unit}" for clock in ("monotonic", "perf_counter", "clock_gettime") for unit in ("", "_ns")
 }
-
-
-def wall_clocks(source: Source) -> Iterator[tuple[int, str]]:
-    """Find reads of the wall clock, which may be set while a robot runs."""
-    for node in source.nodes:
-        match node:
-            case ast.ImportFrom(module="appliance.base.clock", names=names):
-                wall = any(one.name in ("wall", "wall_ns", "utc_now") for one in names)
-            case ast.Attribute(value=ast.Name(id="clock"), attr="wall" | "wall_ns" | "utc_now"):
-                wall = True
-            case ast.Attribute(value=ast.Name(id="time"), attr="time" | "time_ns"):
-                wall = True
-            case _:
-                wall = False
-        if wall:
-            yield node.lineno, source.path  # type: ignore[attr-defined]  # an import or an expression
 
 
 def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
@@ -360,14 +292,6 @@ RULES = {
         ["def close(self):\n    os.close(self._lock)\n    self._lock = -1"],
     ),
     "slots": Rule(PRODUCT, slots, unfilled),
-    "wall clock": Rule(
-        PRODUCT, wall_clocks,
-        exactly(
-            [f"appliance/{file}" for files in WALL_CLOCK.values() for file in files],
-            "use a monotonic clock, or list the file in WALL_CLOCK under its purpose",
-        ),
-        ["clock.wall()", "time.time()", "from appliance.base.clock import utc_now"],
-    ),
     "clocks": Rule(
         ("appliance/", "fleet/rosrv_fleet/"), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
         ["time.monotonic_ns()", "datetime.datetime.now()", "from time import time", "date.today()"],
