@@ -6,7 +6,6 @@ files, and sources that the rule must reject and accept.
 
 import ast
 import re
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -105,60 +104,6 @@ def closed_descriptors(source: Source) -> Iterator[tuple[int, str]]:
                     func=ast.Attribute(value=ast.Name(id="os"), attr="close"), args=[ast.Attribute() as kept]
                 ) if ast.unparse(kept) not in reset:
                     yield node.lineno, ast.unparse(kept)
-
-
-# --- functions that an object gets after it was made ---
-
-
-def slots(source: Source) -> Iterator[tuple[int, str]]:
-    """Find attributes that begin as an empty function, and attributes of other objects that are set."""
-    for node in source.nodes:
-        match node:
-            case ast.AnnAssign(target=target, annotation=kind, value=ast.expr() as value):
-                if _does_nothing(value) and "Callable" in ast.unparse(kind):
-                    yield from ((node.lineno, f"empty {name}") for name in _own(target))
-            case ast.Assign(targets=[ast.Attribute() as target], value=ast.Lambda() as value):
-                if _does_nothing(value):
-                    yield from ((node.lineno, f"empty {name}") for name in _own(target))
-        match node:
-            case ast.Assign(targets=targets):
-                ends = [
-                    each for one in targets for each in (one.elts if isinstance(one, ast.Tuple) else [one])
-                ]
-            case ast.AnnAssign(target=target):
-                ends = [target]
-            case _:
-                continue
-        for end in ends:
-            if isinstance(end, ast.Attribute) and not _own(end):
-                yield node.lineno, f"set {end.attr}"
-
-
-def _own(target: ast.expr) -> list[str]:
-    match target:
-        case ast.Attribute(value=ast.Name(id="self" | "cls"), attr=name) | ast.Name(id=name):
-            return [name]
-    return []
-
-
-def _does_nothing(value: ast.expr) -> bool:
-    match value:
-        case ast.Constant(value=None) | ast.Name(id="dict" | "list" | "set" | "str" | "int" | "bool"):
-            return True
-        case ast.Lambda(body=ast.Constant() | ast.Name()):
-            return True
-    return False
-
-
-def unfilled(seen: Sequence[Seen]) -> Iterator[str]:
-    fillers = defaultdict(set)
-    for path, _line, what in seen:
-        if what.startswith("set "):
-            fillers[what.removeprefix("set ")].add(path)
-    for path, line, what in seen:
-        kind, name = what.split()
-        if kind == "empty" and (others := fillers[name] - {path}):
-            yield f"{path}:{line}: {name} is filled in {sorted(others)}: make it an argument of the constructor"
 
 
 # --- clocks ---
@@ -291,7 +236,6 @@ RULES = {
         ["def close(self):\n    os.close(self._lock)"],
         ["def close(self):\n    os.close(self._lock)\n    self._lock = -1"],
     ),
-    "slots": Rule(PRODUCT, slots, unfilled),
     "clocks": Rule(
         ("appliance/", "fleet/rosrv_fleet/"), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
         ["time.monotonic_ns()", "datetime.datetime.now()", "from time import time", "date.today()"],
@@ -335,19 +279,6 @@ def test_a_rule_finds_what_it_forbids(rule: Rule) -> None:
         assert findings(rule, text), text
     for text in rule.right:
         assert not findings(rule, text), text
-
-
-@pytest.mark.parametrize(
-    "value", ["lambda: None", "lambda topic: 0", "None", "dict", "lambda *_: ''", "lambda: False"]
-)
-@pytest.mark.parametrize("begin", ["self.changed: Callable[[], int] | None", "changed: 'Callable[[], None]'"])
-def test_a_slot_that_another_file_fills_is_found(begin: str, value: str) -> None:
-    fillers = ("parts.hosts.changed = f", "x.changed, x.lost = f, g", "x.changed: Callable[[], None] = f")
-    for filler in fillers:
-        assert findings(RULES["slots"], f"{begin} = {value}", filler), filler
-    assert not findings(RULES["slots"], f"{begin} = {value}", "self.changed = f")
-    for other in ("self.changed = changed", "self.changed: int = 0", "self.changed: Task | None = None"):
-        assert not findings(RULES["slots"], other, fillers[0]), other
 
 
 def parsed(path: str, text: str) -> Source:
