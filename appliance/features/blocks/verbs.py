@@ -1,6 +1,5 @@
 """The commands `rosrv host block|unblock|blocks`."""
 
-import functools
 import shlex
 from typing import Annotated
 
@@ -8,7 +7,6 @@ import typer
 
 from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import moment, say_json, say_row
@@ -23,7 +21,6 @@ from appliance.features.blocks.requests import (
 from rosmop.tool.terminal import say
 
 _MINUTES_FROM = 600
-_usage_error = functools.partial(output.usage_error, verb="rosrv host")
 _Address = Annotated[
     str,
     typer.Argument(

@@ -28,8 +28,6 @@ from appliance.supervisor.users import NUMERIC_IDS
 
 _SECONDS = 10.0
 _CHARON = Path("/usr/sbin/charon-systemd")
-ROS_PACKAGES = {path.name: package for path, package in ROS_PROGRAMS.items()}
-"""The packages of the programs without which the appliance does not start."""
 
 
 def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:

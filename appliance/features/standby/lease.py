@@ -196,9 +196,6 @@ class ApplianceLease:
             return False
         return self.answers_alone or now < self._valid_until + _RENEWABLE
 
-    def may_answer(self, now: float, *, acknowledged: bool) -> bool:
-        return self.is_active(now) and (acknowledged or self.answers_alone)
-
     def next_event(self, now: float) -> float:
         changes = (self._valid_until, self._promised_until)
         return min([self._next_round, *(time for time in changes if time > now)])

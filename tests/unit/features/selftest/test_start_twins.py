@@ -83,7 +83,7 @@ def test_a_setting_of_the_kernel_that_cannot_be_written_fails(
     assert all(name in found.text for name in missing)
 
 
-@pytest.mark.parametrize("name", sorted(machine_checks.ROS_PACKAGES))
+@pytest.mark.parametrize("name", sorted(path.name for path in machine_checks.ROS_PROGRAMS))
 def test_a_program_without_which_nothing_starts_is_a_failure(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -258,7 +258,7 @@ class SimulatedAppliance(Host):
         while self.pending:
             length, _ = self.pending[0]
             stored = self.stored_epoch == self.lease.held and self.stored >= length
-            if not self.lease.may_answer(self.now, acknowledged=stored):
+            if not (self.lease.is_active(self.now) and (stored or self.lease.answers_alone)):
                 return
             self.history.acknowledged(self, self.log[length - 1])
             del self.pending[0]

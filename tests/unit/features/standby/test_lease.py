@@ -229,10 +229,9 @@ def test_it_answers_alone_only_after_the_removal() -> None:
     )
     assert removal.operation == "remove"
     lease.answered(renewal)
-    assert not lease.lease.may_answer(lease.now, acknowledged=False)
-    assert lease.lease.may_answer(lease.now, acknowledged=True)
+    assert lease.lease.is_active(lease.now) and not lease.lease.answers_alone
     lease.answered(removal, in_sync=ALONE)
-    assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.lease.is_active(lease.now) and lease.lease.answers_alone
 
 
 def test_a_change_that_waits_too_long_does_not_wait_for_the_next_round() -> None:
@@ -243,7 +242,7 @@ def test_a_change_that_waits_too_long_does_not_wait_for_the_next_round() -> None
     assert lease.later(0.05).operations() == []
     lease.answered(lease.later(0.25).request("renew"), in_sync=ALONE)
     assert lease.later(0.1).operations(waiting_since=0.0) == []
-    assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.lease.is_active(lease.now) and lease.lease.answers_alone
 
 
 def test_a_change_that_waits_is_noticed_between_two_rounds() -> None:
@@ -268,14 +267,14 @@ def test_it_waits_for_the_standby_before_it_is_added() -> None:
     lease = active_lease().later(0.3)
     old = lease.request("renew")
     lease.answered(old, in_sync=ALONE)
-    assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.lease.is_active(lease.now) and lease.lease.answers_alone
     assert lease.later(0.3).operations(caught_up=False) == ["renew"]
-    assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.lease.is_active(lease.now) and lease.lease.answers_alone
     assert lease.later(0.3).operations(caught_up=True) == ["renew", "add"]
     lease.answered(old, in_sync=ALONE)
-    assert not lease.lease.may_answer(lease.now, acknowledged=False)
+    assert not (lease.lease.is_active(lease.now) and lease.lease.answers_alone)
     lease.answered(lease.later(0.3).request("renew"), in_sync=ALONE)
-    assert lease.lease.may_answer(lease.now, acknowledged=False), "the addition was lost"
+    assert lease.lease.is_active(lease.now) and lease.lease.answers_alone, "the addition was lost"
 
 
 def in_a_switchover() -> tuple[Lease, TakeOver]:
