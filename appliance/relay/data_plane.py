@@ -100,7 +100,9 @@ class DataPlane:
         self._carry_out(message, descriptors)
         return False
 
-    def _carry_out(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
+    def _carry_out(  # noqa: PLR0912  one branch for each kind of message
+        self, message: messages.Message, descriptors: tuple[int, ...]
+    ) -> None:
         if isinstance(message, messages.StateBegan):
             self._table.begin(message.epoch)
         elif isinstance(message, messages.StateEnded):
@@ -123,9 +125,11 @@ class DataPlane:
             self._calls.answered(message)
         elif isinstance(message, messages.OrdersAsked):
             self._reporter.send(messages.OrdersCarriedOut())
+        elif isinstance(message, messages.FactWithdrawn):
+            self._table.withdraw(message.fact)
+            self._withdrawn(message.fact)
         else:
-            self._table.withdraw(message)
-            self._withdrawn(message)
+            raise TypeError(f"control does not send {type(message).__name__} to a relay")
 
     def close(self) -> None:
         self.interceptor.close()
@@ -157,8 +161,8 @@ class DataPlane:
             self._recheck_waiting(message)
 
     def _restated(self, epoch: int) -> None:
-        for message in self._table.end(epoch):
-            self._withdrawn(message)
+        for fact in self._table.end(epoch):
+            self._withdrawn(fact)
         self._reporter.repeat_connections()
         self._ranks.repeat()
         for topic in self.topics.values():
@@ -166,24 +170,23 @@ class DataPlane:
             topic.latch.repeat()
         self.interceptor.observations.repeat()
 
-    def _withdrawn(self, message: messages.Message) -> None:
-        if isinstance(message, messages.NodeWithdrawn):
-            self.ports.close(message.key)
-            for key, topic in [entry for entry in self.topics if entry[0] == message.key]:
-                self._remove_topic(key, topic, "the publisher's node is gone")
-            for incoming in [
-                incoming for incoming in self.incoming_connections if incoming.key == message.key
-            ]:
-                self._incoming_failed(incoming, "")
-            self._remove_services("the service's node is gone", message.key)
-        elif isinstance(message, messages.PublicationWithdrawn):
-            self._remove_topic(message.key, message.topic, "the topic is no longer published")
-        elif isinstance(message, messages.GrantRevoked):
-            self._cut_by(("topic", message.key, message.topic, message.host, message.caller_id))
-        elif isinstance(message, messages.ServiceWithdrawn):
-            self._remove_services("the service is no longer offered", message.key, message.service)
-        elif isinstance(message, messages.ClientRevoked):
-            self._cut_by(("service", message.key, message.service, message.host, message.caller_id))
+    def _withdrawn(self, fact: messages.Fact) -> None:
+        match fact:
+            case "node", gone:
+                self.ports.close(gone)
+                for key, topic in [entry for entry in self.topics if entry[0] == gone]:
+                    self._remove_topic(key, topic, "the publisher's node is gone")
+                for incoming in [one for one in self.incoming_connections if one.key == gone]:
+                    self._incoming_failed(incoming, "")
+                self._remove_services("the service's node is gone", gone)
+            case "publication", key, topic:
+                self._remove_topic(key, topic, "the topic is no longer published")
+            case "grant", key, topic, host, caller_id:
+                self._cut_by(("topic", key, topic, host, caller_id))
+            case "service", key, service:
+                self._remove_services("the service is no longer offered", key, service)
+            case "client", key, service, host, caller_id:
+                self._cut_by(("service", key, service, host, caller_id))
 
     def _cut_by(self, grant: PeerGrant) -> None:
         for peer in list(self._by_grant.get(grant, ())):

@@ -13,7 +13,6 @@ from appliance.relay.loop import ANYBODY, UNKNOWN
 
 PeerGrant = tuple[str, str, str, str, str]
 """A peer's grant: `topic` or `service`, the incarnation's key, the name of the topic or service, host, caller id."""
-_Fact = tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -32,12 +31,12 @@ class GrantTable:
     """The facts that control has stated."""
 
     def __init__(self) -> None:
-        self._facts: dict[_Fact, messages.Message] = {}
-        self._by_key: dict[str, dict[_Fact, None]] = {}
+        self._facts: dict[messages.Fact, messages.Message] = {}
+        self._by_key: dict[str, dict[messages.Fact, None]] = {}
         self._hosts: Counter[str] = Counter()
         self._named: set[str] = set()  # hosts that the policy names, according to their last statement
-        self._clients: dict[_Fact, dict[str, None]] = {}  # names of clients by service and host
-        self._restated: set[_Fact] | None = None
+        self._clients: dict[messages.Fact, dict[str, None]] = {}  # names of clients by service and host
+        self._restated: set[messages.Fact] | None = None
         self._epoch = 0
 
     @property
@@ -48,15 +47,14 @@ class GrantTable:
         self._restated = set()
         self._epoch = epoch
 
-    def end(self, epoch: int) -> list[messages.Message]:
+    def end(self, epoch: int) -> list[messages.Fact]:
         if self._restated is None or epoch != self._epoch:
             return []
         gone = [fact for fact in self._facts if fact not in self._restated]
         self._restated = None
-        withdrawals = [messages.FACTS[kind].withdrawn(*about) for kind, *about in gone]
-        for message in withdrawals:
-            self.withdraw(message)
-        return withdrawals
+        for fact in gone:
+            self.withdraw(fact)
+        return gone
 
     def state(self, message: messages.RelayFact) -> None:
         fact = messages.identity(message)
@@ -70,12 +68,9 @@ class GrantTable:
         if self._restated is not None:
             self._restated.add(fact)
 
-    def withdraw(self, message: messages.Message) -> None:
-        if isinstance(message, messages.NodeWithdrawn):
-            for fact in list(self._by_key.get(message.key, ())):
-                self._forget(fact)
-        else:
-            self._forget(messages.identity(message))
+    def withdraw(self, fact: messages.Fact) -> None:
+        for one in list(self._by_key.get(fact[1], ())) if fact[0] == "node" else (fact,):
+            self._forget(one)
 
     def is_registered(self, host: str) -> bool:
         return self.quota_class(host) is QuotaClass.REGISTERED
@@ -131,12 +126,12 @@ class GrantTable:
         else:
             self._named.discard(host)
 
-    def _forget(self, fact: _Fact) -> None:
+    def _forget(self, fact: messages.Fact) -> None:
         self._take_out(fact)
         if self._restated is not None:
             self._restated.discard(fact)
 
-    def _take_out(self, fact: _Fact) -> None:
+    def _take_out(self, fact: messages.Fact) -> None:
         message = self._facts.pop(fact, None)
         if message is not None:
             of_key = self._by_key[fact[1]]
@@ -155,5 +150,5 @@ class GrantTable:
                 del self._clients[fact[:4]]
 
 
-def _host(fact: _Fact, message: messages.Message) -> str:
+def _host(fact: messages.Fact, message: messages.Message) -> str:
     return message.host if isinstance(message, messages.NodePlaced) else fact[3] if len(fact) > 3 else ""

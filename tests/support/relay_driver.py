@@ -29,20 +29,18 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
     ClientGranted,
+    FactWithdrawn,
     GrantInstalled,
     Lifeline,
     LinkOpened,
     Message,
     NodePlaced,
-    NodeWithdrawn,
     Ping,
     Pong,
     PublicationPlaced,
-    PublicationWithdrawn,
     Ready,
     RelayLink,
     ServicePlaced,
-    ServiceWithdrawn,
     StateBegan,
     StateEnded,
     Stop,
@@ -288,7 +286,7 @@ class RelayDriver:
             face = self.faces.get(name)
             if face is None or face.real_uri != uri:
                 if face is not None:
-                    self.link.send(NodeWithdrawn(face.key))
+                    self.link.send(FactWithdrawn(("node", face.key)))
                     self._gone.append(face)
                 face = Face(self, name, uri)
                 self.faces[name] = face
@@ -310,7 +308,7 @@ class RelayDriver:
                 self.link.send(PublicationPlaced(face.key, arguments[1], arguments[2]))
             elif method == "unregisterPublisher":
                 face.publications.pop(arguments[1], None)
-                self.link.send(PublicationWithdrawn(face.key, arguments[1]))
+                self.link.send(FactWithdrawn(("publication", face.key, arguments[1])))
         elif method == "registerService":
             face = self._face(arguments[0], arguments[3])
             port = _port(arguments[2])
@@ -325,7 +323,7 @@ class RelayDriver:
         elif method == "unregisterService":
             face = self.faces[arguments[0]]
             face.services.pop(arguments[1], None)
-            self.link.send(ServiceWithdrawn(face.key, arguments[1]))
+            self.link.send(FactWithdrawn(("service", face.key, arguments[1])))
             arguments[2] = f"rosrpc://{LOOPBACK}:{face.port}"
         elif method == "subscribeParam":
             arguments[1] = self._face(arguments[0], arguments[1]).uri

@@ -82,14 +82,8 @@ class Relay:
                     self._granted[message.key, message.topic, message.host, message.caller_id] = None
             case messages.PublicationPlaced() | messages.ServicePlaced():
                 table.state(message)
-            case (
-                messages.NodeWithdrawn()
-                | messages.PublicationWithdrawn()
-                | messages.ServiceWithdrawn()
-                | messages.GrantRevoked()
-                | messages.ClientRevoked()
-            ):
-                table.withdraw(message)
+            case messages.FactWithdrawn(fact):
+                table.withdraw(fact)
         for connection in [one for one in self.connections if self.refusal(one)]:
             if isinstance(message, messages.StateEnded):
                 self._world.interrupted(connection)

@@ -3,7 +3,7 @@
 `key` is the key of an incarnation. `named`: the policy names the host, not only all hosts (`*`).
 """
 
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
@@ -42,12 +42,6 @@ class NodePlaced(Message):
     name: str
     host: str
     monitors: bool = False
-
-
-class NodeWithdrawn(Message):
-    """The relay closes its port and cuts its connections."""
-
-    key: str
 
 
 class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
@@ -96,13 +90,6 @@ class PublicationPlaced(Message):
     rank: RankPlace | None = None
 
 
-class PublicationWithdrawn(Message):
-    """A publication ended; the relay cuts its connections."""
-
-    key: str
-    topic: str
-
-
 class ServicePlaced(Message):
     """A TCPROS service at `host:port`."""
 
@@ -110,13 +97,6 @@ class ServicePlaced(Message):
     service: str
     host: str
     port: int
-
-
-class ServiceWithdrawn(Message):
-    """A service ended; the relay cuts its connections."""
-
-    key: str
-    service: str
 
 
 class GrantInstalled(Message):
@@ -130,15 +110,6 @@ class GrantInstalled(Message):
     named: bool = True
 
 
-class GrantRevoked(Message):
-    """The relay cuts a connection that uses the grant."""
-
-    key: str
-    topic: str
-    host: str
-    caller_id: str
-
-
 class ClientGranted(Message):
     """A host and caller id may call the service; `asks`: control approves each request (`RequestHeld`)."""
 
@@ -150,49 +121,31 @@ class ClientGranted(Message):
     asks: bool = False
 
 
-class ClientRevoked(Message):
-    """A client may no longer call a service; the relay cuts its connections to it."""
-
-    key: str
-    service: str
-    host: str
-    caller_id: str
-
-
 RelayFact = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
 """A fact that control states and withdraws. The relay keeps the facts in a table (`relay/grant_table.py`)."""
 
 
-class FactKind(NamedTuple):
-    """A kind of fact: its message, the message that withdraws it, and the fields that identify it."""
+Fact = tuple[str, ...]
+"""What identifies a fact: its kind, the key of its incarnation, and the other fields that `_IDENTITIES` names."""
 
-    stated: type[RelayFact]
-    withdrawn: type[Message]
-    fields: tuple[str, ...]
-
-
-FACTS = {
-    "node": FactKind(NodePlaced, NodeWithdrawn, ("key",)),
-    "publication": FactKind(PublicationPlaced, PublicationWithdrawn, ("key", "topic")),
-    "service": FactKind(ServicePlaced, ServiceWithdrawn, ("key", "service")),
-    "grant": FactKind(GrantInstalled, GrantRevoked, ("key", "topic", "host", "caller_id")),
-    "client": FactKind(ClientGranted, ClientRevoked, ("key", "service", "host", "caller_id")),
-}
-_FACT_KINDS: dict[type, str] = {
-    message: word for word, kind in FACTS.items() for message in (kind.stated, kind.withdrawn)
+_IDENTITIES: dict[type[RelayFact], tuple[str, ...]] = {
+    NodePlaced: ("node", "key"),
+    PublicationPlaced: ("publication", "key", "topic"),
+    ServicePlaced: ("service", "key", "service"),
+    GrantInstalled: ("grant", "key", "topic", "host", "caller_id"),
+    ClientGranted: ("client", "key", "service", "host", "caller_id"),
 }
 
 
-def identity(message: Message) -> tuple[str, ...]:
-    word = _FACT_KINDS.get(type(message))
-    if word is None:
-        raise TypeError(f"{type(message).__name__} is not a withdrawal")
-    return (word, *(getattr(message, name) for name in FACTS[word].fields))
+def identity(fact: RelayFact) -> Fact:
+    kind, *fields = _IDENTITIES[type(fact)]
+    return (kind, *(getattr(fact, name) for name in fields))
 
 
-def withdrawal(fact: RelayFact) -> Message:
-    word, *about = identity(fact)
-    return FACTS[word].withdrawn(*about)
+class FactWithdrawn(Message):
+    """A fact ended, and with a node all its facts; the relay cuts the connections that needed them."""
+
+    fact: Fact
 
 
 class UpstreamWanted(Message):
@@ -667,8 +620,8 @@ class MessageSeen(Message):
 
 
 RelayLink = (
-    StateBegan | StateEnded | NodePlaced | NodeWithdrawn | PublicationPlaced | PublicationWithdrawn
-    | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
+    StateBegan | StateEnded | NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
+    | FactWithdrawn
     | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | LatchRefused | ConnectionOpened
     | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
     | StateWanted | StateLeft

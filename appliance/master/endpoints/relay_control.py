@@ -290,7 +290,7 @@ class RelayControl:
             for row in self.grants.of(node.key):
                 self._state(post, row)
         elif node.key in post.stated:
-            post.send(messages.NodeWithdrawn(node.key))
+            post.send(messages.FactWithdrawn(("node", node.key)))
             del post.stated[node.key]
 
     def _state_fact(
@@ -308,7 +308,7 @@ class RelayControl:
             if node.of_monitors and isinstance(fact, RegistrationKey) and fact.resource in self._latched:
                 post.send(self._latched[fact.resource], soon=True)
         elif before is not None:
-            post.send(messages.withdrawal(before), soon=soon)
+            post.send(messages.FactWithdrawn(messages.identity(before)), soon=soon)
             del post.stated[node.key][fact]
 
     def _place_node(self, post: RelayOutbox, node: Incarnation) -> None:

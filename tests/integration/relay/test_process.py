@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.channel.messages import NodePlaced, NodeWithdrawn, StateEnded
+from appliance.channel.messages import FactWithdrawn, NodePlaced, StateEnded
 from appliance.relay.process import fitted
 from appliance.relay.relay_limits import RelayLimits
 from tests.support.processes import LIMIT
@@ -75,7 +75,7 @@ def test_a_port_is_open_until_its_node_is_withdrawn(relay: RelayProcess) -> None
     link = relay.open_link()
     relay.ping(2)
     assert not refuses(port)
-    link.send(NodeWithdrawn("k"))
+    link.send(FactWithdrawn(("node", "k")))
     relay.ping(3)
     assert refuses(port)
     link.close()

@@ -3,7 +3,7 @@ from functools import partial
 
 import pytest
 
-from appliance.channel.messages import ClientRevoked, ConnectionClosed, ConnectionOpened, ConnectionRefused
+from appliance.channel.messages import ConnectionClosed, ConnectionOpened, ConnectionRefused, FactWithdrawn
 from roswire.tcpros import HeaderParser, encode_header
 from tests.support.nodes import Client, RosSession
 from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
@@ -96,7 +96,7 @@ def test_a_failed_call_returns_the_services_error(driver: RelayDriver, ros: RosS
 def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSession) -> None:
     ros.service_server("rospy", "/mode", name="server")
     face = driver.faces["/server"]
-    driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK, "/client"))
+    driver.link.send(FactWithdrawn(("client", face.key, "/mode", LOOPBACK, "/client")))
     for service, reason in (("/mode", "no grant"), ("/other", "not a provider")):
         fields = {"callerid": "/client", "service": service, "md5sum": "*"}
         assert reason in ask_header(face, fields)["error"]
@@ -108,7 +108,7 @@ def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, r
     client = ros.service_client("rospy", "/mode", "--persistent", name="client")
     client.send("true")
     client.wait_for(event="answered")
-    driver.link.send(ClientRevoked(driver.faces["/server"].key, "/mode", LOOPBACK, "/client"))
+    driver.link.send(FactWithdrawn(("client", driver.faces["/server"].key, "/mode", LOOPBACK, "/client")))
     driver.link.wait_for(
         lambda message: isinstance(message, ConnectionClosed) and "revoked" in message.reason
     )

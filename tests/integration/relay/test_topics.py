@@ -12,8 +12,8 @@ from appliance.channel.messages import (
     ConnectionClosed,
     ConnectionOpened,
     ConnectionRefused,
+    FactWithdrawn,
     GrantInstalled,
-    GrantRevoked,
     TrafficReported,
     UpstreamLost,
 )
@@ -222,7 +222,7 @@ def test_a_revocation_closes_its_connection(driver: RelayDriver, ros: RosSession
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     ros.listener("roscpp", "/chatter", name="listener").wait_for(event="received")
-    driver.link.send(GrantRevoked(face.key, "/chatter", LOOPBACK, "/listener"))
+    driver.link.send(FactWithdrawn(("grant", face.key, "/chatter", LOOPBACK, "/listener")))
     closed = driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
     assert closed.reason == "its grant is revoked"
 

@@ -159,7 +159,8 @@ class Dialogue:
     # --- control and the relay ---
 
     def _state(self, kind: str, *words: str) -> None:
-        message: Message = getattr(messages, kind)(*map(_value, words))
+        withdrawn = kind == "FactWithdrawn"
+        message: Message = getattr(messages, kind)(*([words] if withdrawn else map(_value, words)))
         self.world.state(message, *([self.world.port] if kind == "NodePlaced" else []))
 
     def _hears(self, kind: str, *words: str) -> None:

@@ -17,18 +17,16 @@ from appliance.channel.messages import (
     ConnectionClosed,
     ConnectionOpened,
     ConnectionRefused,
+    FactWithdrawn,
     FlowLimit,
     GrantInstalled,
-    GrantRevoked,
     LimitedRow,
     Message,
     MessagesLimited,
     NodePlaced,
-    NodeWithdrawn,
     OrdersAsked,
     OrdersCarriedOut,
     PublicationPlaced,
-    PublicationWithdrawn,
     ServicePlaced,
     StateBegan,
     StateEnded,
@@ -102,7 +100,7 @@ def test_control_gets_confirmations_of_its_orders(world: World) -> None:
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one"))
     world.gets(subscriber, encode_frame(b"one"))
-    world.control.send(GrantRevoked("k", "/chatter", LOOPBACK, "/listener"))
+    world.control.send(FactWithdrawn(("grant", "k", "/chatter", LOOPBACK, "/listener")))
     world.control.send(OrdersAsked())
     world.hears(OrdersCarriedOut)
     publisher.send(encode_frame(b"two"))
@@ -122,7 +120,7 @@ def test_a_grant_costs_the_same_among_thousands() -> None:
             for name in names:
                 peers.append(world.connect(encode_header(ASK | {"callerid": name})))
                 world.until(lambda: len(topic.members) == len(peers))
-            revoked = GrantRevoked("k", "/chatter", LOOPBACK, names[0])
+            revoked = FactWithdrawn(("grant", "k", "/chatter", LOOPBACK, names[0]))
 
             def again_and_back() -> None:
                 world.engine.take(grants[0], ())
@@ -320,7 +318,7 @@ def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> Non
                 sock.send(data)
                 world.loop.turn(0.005)
         chance.choice((peer.reset, peer.sock.close, lambda: None))()
-    world.state(NodeWithdrawn("k"))
+    world.state(FactWithdrawn(("node", "k")))
     world.until(
         lambda: (
             not (
@@ -343,11 +341,11 @@ def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> Non
 @pytest.mark.parametrize(
     "message",
     [
-        GrantRevoked("k", "/chatter", LOOPBACK, "/listener"),
-        PublicationWithdrawn("k", "/chatter"),
-        NodeWithdrawn("k"),
+        FactWithdrawn(("grant", "k", "/chatter", LOOPBACK, "/listener")),
+        FactWithdrawn(("publication", "k", "/chatter")),
+        FactWithdrawn(("node", "k")),
     ],
-    ids=lambda message: type(message).__name__,
+    ids=lambda message: message.fact[0],
 )
 def test_a_connection_ends_with_its_grant_publication_or_node(world: World, message: Message) -> None:
     _publisher, subscriber = world.subscribed()
@@ -386,7 +384,7 @@ def test_no_message_of_a_silent_publisher_passes(world: World) -> None:
 
 
 def test_a_withdrawn_nodes_port_is_closed(world: World) -> None:
-    world.state(NodeWithdrawn("k"))
+    world.state(FactWithdrawn(("node", "k")))
     where = world.port.getsockname()
     world.port.close()
     world.loop.turn(0.01)
@@ -761,7 +759,7 @@ def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
         world.gets_header(subscriber)
     topic = world.engine.topics["k", "/chatter"]
     monkeypatch.setattr(world.loop, "over", lambda: True)
-    world.state(PublicationWithdrawn("k", "/chatter"))
+    world.state(FactWithdrawn(("publication", "k", "/chatter")))
     assert len(topic.members) == 5
     for subscriber in (first, *others):
         world.ends(subscriber)

@@ -7,10 +7,10 @@ import pytest
 
 from appliance.channel.messages import (
     ConnectionClosed,
+    FactWithdrawn,
     GrantInstalled,
     LatchRefused,
     NodePlaced,
-    NodeWithdrawn,
     PublicationPlaced,
     UpstreamFound,
     UpstreamLost,
@@ -86,7 +86,7 @@ def test_latched_messages_of_a_guest_stop_no_other_host(world: World) -> None:
     world.gets(subscriber, message)
     assert world.engine.memory.latched.of(LOOPBACK).used == len(message)
     for number in range(29):
-        world.state(NodeWithdrawn(f"guest{number}"))
+        world.state(FactWithdrawn(("node", f"guest{number}")))
     assert world.engine.memory.latched.of("10.9.9.9").used == 0
     carries_images(world, *robot)
 

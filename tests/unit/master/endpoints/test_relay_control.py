@@ -160,10 +160,10 @@ async def test_each_relay_receives_its_topics(world: World) -> None:
         messages.StateEnded(2),
     ]  # fmt: skip
     world.withdraw(Kind.PUBLICATION, "/left")
-    assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
+    assert (first.heard(), again.heard()) == ([messages.FactWithdrawn(("publication", "key", "/left"))], [])
     world.registry.overshadow(node, 0.0)
     world.flush()
-    assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
+    assert first.heard() == again.heard() == [messages.FactWithdrawn(("node", "key"))]
 
 
 async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
@@ -197,8 +197,8 @@ async def test_a_topic_moves_with_its_grants(world: World) -> None:
     world.put(left=0, right=0)
     relay.place_moved(moves)
     assert second.heard() == [
-        messages.PublicationWithdrawn("key", "/right"),
-        messages.GrantRevoked("key", "/right", "10.0.0.5", "/ear"),
+        messages.FactWithdrawn(("publication", "key", "/right")),
+        messages.FactWithdrawn(("grant", "key", "/right", "10.0.0.5", "/ear")),
     ]
     assert first.heard() == [
         messages.PublicationPlaced("key", "/right", "std_msgs/String"),
@@ -214,12 +214,12 @@ async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world:
     first.heard()
     away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
     relay.withdraw_moving(away)
-    assert messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c") in first.heard()
+    assert messages.FactWithdrawn(("client", "key", "/serve", "10.0.0.5", "/c")) in first.heard()
     world.allocation.adopt(AllocationPlan({}, {(SERVICE, "/serve"): 1}))
     relay.place_moved(away)
     world.grants.take(world.grants.all()[0])
     world.flush()
-    assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c")
+    assert second.heard()[-1] == messages.FactWithdrawn(("client", "key", "/serve", "10.0.0.5", "/c"))
     relay.withdraw_moving(back)
     world.put()
     relay.place_moved(back)

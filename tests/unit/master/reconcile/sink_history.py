@@ -32,9 +32,6 @@ from tests.support.control_parts import (
 from tests.support.engines import InlineDatabase
 from tests.support.parameters import put
 
-WITHDRAWALS = (
-    messages.PublicationWithdrawn | messages.ServiceWithdrawn | messages.GrantRevoked | messages.ClientRevoked
-)
 NAMES = "/a", "/a", "/b", "/c"
 TOPICS = "/t", "/t", "/secret"
 ADDRESSES = "10.0.0.1", "10.0.0.2"
@@ -242,10 +239,10 @@ class History(ControlParts):
                 assert facts.get(messages.identity(message)) != message, f"stated twice: {message}"
                 facts[messages.identity(message)] = message
                 assert ("node", message.key) in facts, f"without its node: {message}"
-            elif isinstance(message, messages.NodeWithdrawn):
-                facts = {fact: one for fact, one in facts.items() if fact[1] != message.key}
-            elif isinstance(message, WITHDRAWALS):
-                del facts[messages.identity(message)]
+            elif isinstance(message, messages.FactWithdrawn) and message.fact[0] == "node":
+                facts = {fact: one for fact, one in facts.items() if fact[1] != message.fact[1]}
+            elif isinstance(message, messages.FactWithdrawn):
+                del facts[message.fact]
         return facts
 
     def told(self) -> dict[tuple[str, str], dict[str, Value]]:

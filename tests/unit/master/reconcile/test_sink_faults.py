@@ -139,13 +139,13 @@ FAULTS = {
         RelayControl, "_state_fact", "del post.stated[node.key][fact]", "pass"
     ),
     "a fact is not withdrawn": Fault(
-        RelayControl, "_state_fact", "post.send(messages.withdrawal(before), soon=soon)", "pass"
+        RelayControl, "_state_fact", "post.send(messages.FactWithdrawn(messages.identity(before)), soon=soon)", "pass"
     ),
     "a fact is stated without its node": Fault(
         RelayControl, "_state_fact", "self._place_node(post, node)", "post.stated[node.key] = {}"
     ),
     "a node that ended is not withdrawn": Fault(
-        RelayControl, "_state_node", "post.send(messages.NodeWithdrawn(node.key))", "pass"
+        RelayControl, "_state_node", "post.send(messages.FactWithdrawn((\"node\", node.key)))", "pass"
     ),
     "a node that ended has its facts": Fault(
         RelayControl, "_state_node", "del post.stated[node.key]", "pass"

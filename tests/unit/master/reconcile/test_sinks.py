@@ -97,15 +97,13 @@ async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None
     order = asyncio.ensure_future(world.relay.carried_out())
     await asyncio.sleep(3)
     assert not order.done()
-    assert not {type(seen) for seen in world.seen} & {messages.NodeWithdrawn, messages.GrantRevoked}
+    assert messages.FactWithdrawn not in map(type, world.seen)
     world.seen.clear()
     world.full = False
     await asyncio.sleep(0.2)
-    assert [
-        seen for seen in world.seen if isinstance(seen, messages.NodeWithdrawn | messages.GrantRevoked)
-    ] == [
-        messages.NodeWithdrawn(ended.key),
-        messages.GrantRevoked(node.key, "/t", str(HOST), "/old"),
+    assert [seen for seen in world.seen if isinstance(seen, messages.FactWithdrawn)] == [
+        messages.FactWithdrawn(("node", ended.key)),
+        messages.FactWithdrawn(("grant", node.key, "/t", str(HOST), "/old")),
     ]
     assert [
         (seen.key, seen.caller_id) for seen in world.seen if isinstance(seen, messages.GrantInstalled)
@@ -170,5 +168,5 @@ async def test_a_defect_of_a_sink_takes_no_change_from_the_others(monkeypatch: p
         world.graph.forgotten(node)
         with pytest.raises(ArithmeticError):
             world.sinks.flush()
-    assert messages.NodeWithdrawn(node.key) in world.seen
+    assert messages.FactWithdrawn(("node", node.key)) in world.seen
     assert ("close", node) in world.seen

@@ -2,7 +2,6 @@ import pytest
 
 from appliance.channel.messages import (
     ClientGranted,
-    ClientRevoked,
     GrantInstalled,
     NodePlaced,
     PublicationPlaced,
@@ -80,5 +79,5 @@ def test_a_client_calls_under_the_name_of_its_lookup() -> None:
     assert bound_name(table, "k", "10.0.0.2", probe) == "/client"
     assert missing(table, "k", "10.0.0.2", probe) == ""
     assert "no grant" in missing(table, "k", "10.0.0.3", probe)
-    table.withdraw(ClientRevoked("k", "/mode", "10.0.0.2", "/client"))
+    table.withdraw(("client", "k", "/mode", "10.0.0.2", "/client"))
     assert "no grant" in missing(table, "k", "10.0.0.2", probe)

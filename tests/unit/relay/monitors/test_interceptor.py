@@ -9,6 +9,7 @@ import pytest
 
 from appliance.channel.messages import (
     ConnectionClosed,
+    FactWithdrawn,
     FlowLimit,
     GrantInstalled,
     MessagesLimited,
@@ -21,7 +22,6 @@ from appliance.channel.messages import (
     OwnPublished,
     PublicationPlaced,
     PublicationRefused,
-    PublicationWithdrawn,
     SpecificationsRefused,
     SpecificationsTaken,
     StateGiven,
@@ -243,7 +243,7 @@ def test_waiting_messages_end_with_the_publication(world: Monitored) -> None:
     world.engine.interceptor.over = lambda: True
     world.push(publisher, string("x" * 100) * 3000)
     world.until(lambda: world.held)
-    world.state(PublicationWithdrawn("k", "/chatter"))
+    world.state(FactWithdrawn(("publication", "k", "/chatter")))
     world.ends(subscriber)
     assert world.held == 0
 

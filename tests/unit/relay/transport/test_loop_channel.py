@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from appliance.channel.channel import Channel
-from appliance.channel.messages import NodePlaced, NodeWithdrawn, RelayLink, UpstreamWanted
+from appliance.channel.messages import FactWithdrawn, NodePlaced, RelayLink, UpstreamWanted
 from appliance.relay.loop import QUANTUM, EventLoop
 from appliance.relay.transport.loop_channel import LoopLink
 
@@ -43,7 +43,7 @@ class Ends:
 
 
 def send(sock: socket.socket, count: int) -> None:
-    bodies = [msgspec.msgpack.encode(NodeWithdrawn(str(number))) for number in range(count)]
+    bodies = [msgspec.msgpack.encode(FactWithdrawn(("node", str(number)))) for number in range(count)]
     data = b"".join(struct.pack(">I", len(body)) + body for body in bodies)
     assert sock.send(data) == len(data)
 
@@ -62,7 +62,7 @@ def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(
     assert 0 < len(ends.received) <= 210
     while len(ends.received) < 1000:
         ends.loop.turn(1)
-    assert [message.key for message in ends.received] == [str(number) for number in range(1000)]
+    assert [message.fact[1] for message in ends.received] == [str(number) for number in range(1000)]
 
 
 def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
@@ -91,7 +91,7 @@ def test_closing_closes_descriptors_that_were_not_taken(ends: Ends) -> None:
 
 def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
     ends.waits = True
-    body = msgspec.msgpack.encode(NodeWithdrawn("k"))
+    body = msgspec.msgpack.encode(FactWithdrawn(("node", "k")))
     frame, sent = struct.pack(">I", len(body)) + body, 0
     ends.raw.setblocking(False)
     with pytest.raises(BlockingIOError):
