@@ -113,7 +113,7 @@ class GuardList(msgspec.Struct, frozen=True):
     presets: Annotated[list[PresetRow], doc("all presets")]
     guards: Annotated[list[GuardRow], doc("the loaded guards, in the order in which they see messages")]
     warnings: Annotated[
-        list[str], doc("guards of a topic whose order changes what they promise, and the remedy")
+        list[str], doc("monitors that were guards before 0.4, and bases on other machines, as sentences")
     ] = []
 
 

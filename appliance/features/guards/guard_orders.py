@@ -25,7 +25,6 @@ from appliance.features.guards.guard_answers import (
     Suggestions,
 )
 from appliance.features.guards.guard_facts import facts_of, preset_row, values_of
-from appliance.features.guards.guard_order import Placed, faults, statements
 from appliance.features.guards.placement import ConnectedNodes, Placement
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
@@ -34,6 +33,8 @@ from appliance.features.guards.presets import (
     Preset,
     below_the_standard,
     described,
+    former_guard,
+    is_former,
     keeps_state,
     loaded_values,
     preset_named,
@@ -139,8 +140,8 @@ class GuardOrders:
         self._digests = {row.name: row.digest for row in rows}
 
     def state(self) -> GuardsState | None:
-        guards, place = self._guards(), self.placement
-        if not guards:
+        guards, place, former = self._guards(), self.placement, self._former()
+        if not guards and not former:
             return None
         switches = self._monitors.switches
         return GuardsState(
@@ -152,6 +153,7 @@ class GuardOrders:
             {name: self._monitors.lasting(name) for name in guards
              if name not in switches.said and not switches.enabled(name)},
             [*self._older(guards)],
+            former,
         )  # fmt: skip
 
     def _older(self, guards: Mapping[str, Preset]) -> Iterator[OlderGuard]:
@@ -177,7 +179,7 @@ class GuardOrders:
         presets = [preset_row(one) for one in PRESETS.values()] if request.presets else []
         return GuardList(
             self._monitors.revision, self._monitors.tag, presets, rows,
-            [*faults(self._placed()), *self.placement.elsewhere],
+            [*self._former().values(), *self.placement.elsewhere],
         )  # fmt: skip
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
@@ -228,7 +230,7 @@ class GuardOrders:
         )  # fmt: skip
         loaded = await monitors.load(order, who)
         self._record_loaded()
-        return _with_warnings(loaded, [*faults(self._placed())])
+        return loaded
 
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
         monitors, name = self._monitors, request.name or request.preset
@@ -296,8 +298,7 @@ class GuardOrders:
                 )
         except GuardError as error:
             raise SenselessError(str(error)) from error
-        placed = Placed(name, preset.name, request.topics["command"], file)
-        return file, text + statements(placed, self._placed())
+        return file, text
 
     def _upgraded(self, name: str, topics: Mapping[str, str]) -> Upgrade:
         preset, text = self._guard(name)
@@ -326,26 +327,23 @@ class GuardOrders:
         }
         return {name: preset for name, preset in found.items() if preset is not None}
 
-    def _placed(self) -> list[Placed]:
-        file_of = self._monitors.checked.monitors
-        return [
-            Placed(
-                name,
-                preset.name,
-                topics_in(preset.text).get("command", ""),
-                file_of[name],
-                preset.text.startswith("preset "),
-            )
-            for name, preset in self._guards().items()
-        ]
+    def _former(self) -> dict[str, str]:
+        """Return what to do about each monitor that was a guard before 0.4, by its name."""
+        files = self._monitors.sources.files
+        return {
+            name: former_guard(name, file)
+            for name, file in self._monitors.checked.monitors.items()
+            if is_former(files.get(file, ""))
+        }
 
     def _guarded_commands(self) -> frozenset[str]:
-        return frozenset(guard.command for guard in self._placed() if guard.preset != "withhold")
+        guards = self._guards().values()
+        return frozenset(topics_in(one.text).get("command", "") for one in guards if one.name != "withhold")
 
     def _guard(self, name: str) -> tuple[Preset, str]:
         guards = self._guards()
         if name not in guards:
-            raise UnknownThingError(unknown_guard(name, guards))
+            raise UnknownThingError(self._former().get(name) or unknown_guard(name, guards))
         return guards[name], self._monitors.sources.files[self._monitors.checked.monitors[name]]
 
     def _acts_of(self, name: str) -> int:

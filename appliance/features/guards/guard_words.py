@@ -43,8 +43,7 @@ def afresh_in_words(row: GuardRow) -> str:
     if row.afresh == now:
         return ""
     command = {"on": f"enable {name}", "shadow": f"enable {name} --shadow", "off": f"disable {name}"}[now]
-    verb = f"guard upgrade {name}" if row.origin == "older" else f"monitor {command}"
-    write = f"rosrv {verb}, on the appliance's machine, writes it there"
+    write = f"rosrv monitor {command}, on the appliance's machine, writes it there"
     if row.afresh == "absent":
         return f"it is only in the state directory, not in the folder of specifications: {write}"
     then = {"on": "in force", "shadow": "in shadow mode", "off": "disabled"}[row.afresh]

@@ -15,8 +15,6 @@ from pathlib import Path
 from appliance.base.shipped import SHIPPED
 from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import meant
-from appliance.features.guards import old_form
-from appliance.features.guards.old_form import Head
 from rosmop.form.switch_words import Word
 from rosmop.types import given_lists
 from rosmop.types.roles import ANY_TYPE, types_of_roles
@@ -29,6 +27,18 @@ _TYPE = re.compile(r"[A-Za-z]\w*+/[A-Za-z]\w*+", re.ASCII)
 _WHOLE = re.compile(r"[-+]?\d++", re.ASCII)
 _DECIMAL = re.compile(r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?", re.ASCII)
 _COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq}
+
+
+@dataclass(frozen=True)
+class Head:
+    """The `preset` statement of a guard. Topics with their types, and values, are its `settings`."""
+
+    preset: str
+    version: int
+    name: str
+    settings: Mapping[str, str]
+    switch: str = ""
+    """`on`, `shadow`, `off` or empty."""
 
 
 class GuardError(UserError):
@@ -118,10 +128,7 @@ class Preset:
         """The role, or nothing, and the parameter or topic of each line of `given`."""
         block, brace, _rest = self.body.partition("\n} {\n")
         lines = block.partition(" given {\n")[2].split("\n") if brace else []
-        found = [given for given in map(_read_given, lines) if given is not None]
-        if self.text.startswith("// ") and (kind := old_form.list_of(self.name)):
-            found.append(("", Parameter(kind[1], kind[0], old_form.list_in(self.text, self.name) or "")))
-        return tuple(found)
+        return tuple(given for given in map(_read_given, lines) if given is not None)
 
     @functools.cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -189,6 +196,18 @@ class Guard:
     """How it begins on an appliance that does not know it; without it, as the setting `enable` says."""
 
 
+def is_former(text: str) -> bool:
+    """Return whether `rosrv guard` of a release before 0.4 made it: it is a monitor now, not a guard."""
+    return text.startswith("// preset ")
+
+
+def former_guard(name: str, file: str) -> str:
+    return (
+        f"{name} is a guard of a release before 0.4: it stays in force as a monitor, and rosrv guard does not change it;"
+        f" make a guard in its place: rosrv guard new, with another --name; then rosrv monitor remove {file}"
+    )
+
+
 def unknown_guard(name: str, guards: Collection[str]) -> str:
     known = f"the guards are: {', '.join(guards)}" if guards else "none is loaded: see rosrv guard suggest"
     return f"no guard is named {name[:80]}{meant(name, guards)}; {known}"
@@ -254,9 +273,7 @@ def head_of(text: str) -> Head | None:
     """Return what the `preset` statement of a text says, or nothing if the text does not begin with one."""
     statement, _rest = _divided(text)
     words = statement.partition("{")[0].rstrip("; ").split()
-    if words[:1] != ["preset"]:
-        return old_form.head_of(text)
-    if len(words) < 3 or not words[2].isdecimal():
+    if words[:1] != ["preset"] or len(words) < 3 or not words[2].isdecimal():
         return None
     if words[3:4] != ["as"]:
         return Head(words[1], int(words[2]), words[1], {})
@@ -367,8 +384,6 @@ def with_values(text: str, values: Mapping[str, str]) -> str:
             "it was not made from a preset; change its source, and load it with rosrv monitor load"
         )
     checked = {name: preset.parameter(name).checked(value) for name, value in values.items()}
-    if not text.startswith("preset "):
-        return old_form.with_values(text, checked)
     return _written(replace(head, settings={**head.settings, **checked}), body_of(text))
 
 
@@ -376,9 +391,7 @@ def keeps_state(text: str, names: Collection[str]) -> bool:
     """Whether a guard keeps its state when these parameters are set."""
     preset = preset_of(text)
     kinds = {preset.parameter(name).kind for name in names} if preset else set()
-    return kinds.isdisjoint({"joints", "time"}) and (
-        text.startswith("preset ") or kinds.isdisjoint(given_lists.EXAMPLES)
-    )
+    return kinds.isdisjoint({"joints", "time"})
 
 
 def file_of(name: str, folder: Path) -> Path:

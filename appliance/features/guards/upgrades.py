@@ -79,9 +79,7 @@ def upgraded(
         types = {each: kind for each, kind in types_in(text).items() if each not in topics}
         only = {each: kinds[0] for each, kinds in preset.topics.items() if len(kinds) == 1}
         types = only | {each: kind for each, kind in types.items() if each in preset.topics}
-        given = preset.given_topics  # `cancel` of an action follows from its goal now
-        kept = {each: topic for each, topic in topics_in(text).items() if each in given}
-        guard = planned(preset, name, {**kept, **topics}, graph, values, types)
+        guard = planned(preset, name, {**topics_in(text), **topics}, graph, values, types)
         guard = replace(guard, switch=switch)
     except GuardError as error:
         raise GuardError(f"{name}: {error}; or remove it, and make it again") from error

@@ -34,6 +34,8 @@ from appliance.features.guards.presets import (
     Preset,
     described,
     file_of,
+    former_guard,
+    is_former,
     preset_of,
     unknown_guard,
     with_values,
@@ -453,7 +455,9 @@ def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str
     texts = loaded.files or {}
     guards = {row.name: row for row in loaded.monitors if preset_of(texts.get(row.file, ""))}
     if name not in guards:
-        raise GuardError(unknown_guard(name, guards))
+        file = next((row.file for row in loaded.monitors if row.name == name), "")
+        former = is_former(texts.get(file, ""))
+        raise GuardError(former_guard(name, file) if former else unknown_guard(name, guards))
     return loaded, guards[name], texts[guards[name].file]
 
 

@@ -59,6 +59,9 @@ class GuardsState(msgspec.Struct, frozen=True):
         ),
     ] = {}
     older: Annotated[list[OlderGuard], doc("guards in force with an older version of their preset")] = []
+    former: Annotated[
+        dict[str, str], doc("monitors that were guards before 0.4, by name, with what to do about each")
+    ] = {}
 
 
 def _since(guard: ActingGuard) -> str:
@@ -87,6 +90,8 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
         )
         text = f"the guard {old.name} has {old.preset} {old.version}; the present version is {old.present}: {remedy}"
         yield Trouble("warning", f"guard-older:{old.name}", text, "monitors")
+    for name, text in state.former.items():
+        yield Trouble("warning", f"guard-older:{name}", text, "monitors")
     for one in state.bypassed:
         text = (
             f"{one.node} takes {one.topic} from {', '.join(one.publishers)}, past its guards: end that process, and"

@@ -24,8 +24,7 @@ OLDER = [
     (row, preset)
     for row in ROWS
     for path in sorted(RELEASED.glob(f"{row.preset}-*.rv"))
-    if path.read_text().startswith("preset ")  # later than 0.3
-    and (preset := released(row.preset, int(path.stem.rpartition("-")[2]))).version
+    if (preset := released(row.preset, int(path.stem.rpartition("-")[2]))).version
     < PRESETS[row.preset].version
 ]
 

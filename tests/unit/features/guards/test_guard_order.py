@@ -5,7 +5,7 @@ from itertools import product
 
 import pytest
 
-from appliance.features.guards.guard_order import PRECEDENCES, Placed, faults, statements
+from appliance.features.guards.guard_order import PRECEDENCES
 from appliance.features.guards.message_types import GOAL
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from rosmop.check.sources import compiled_from
@@ -179,52 +179,3 @@ def test_each_row_of_the_table_has_its_test_and_the_phases_keep_it() -> None:
         places = {one.name: place for place, one in enumerate(compiled.specifications)}
         for first, then in (pair for row in PRECEDENCES for pair in product(row.first, row.then)):
             assert places[first] < places[then]
-
-
-def placed(name: str, preset: str, command: str = "/cmd_vel", *, phased: bool = True) -> Placed:
-    return Placed(name, preset, command, f"{name}.rv", phased)
-
-
-def in_its_phase(guard: Placed) -> str:
-    """Return a specification with the name of a guard, and with the phase of its preset if it has one."""
-    phase = re.search(r" in \w+(?= given)", PRESETS[guard.preset].text) if guard.phased else None
-    return f"{guard.name}(){phase[0] if phase else ''} {{ event e() /t std_msgs/Empty '{{}}' {{ }} }}\n"
-
-
-@pytest.mark.parametrize("guards", [*product(("a", "m"), ("b", "n"), ("c", "z"))])
-def test_a_new_guard_is_ordered_among_old_ones_whatever_their_names_and_other_topics(
-    guards: tuple[str, str, str],
-) -> None:
-    """The phase of the guard of an arm also moves the others."""
-    fence, speed, joints = guards
-    old = placed(speed, "speed", phased=False)
-    new = placed(fence, "fence")
-    arm = placed(joints, "joints", "/arm/command")
-    files = {
-        old.file: in_its_phase(old),
-        new.file: in_its_phase(new) + statements(new, [old]),
-        arm.file: in_its_phase(arm) + statements(arm, [old, new]),
-    }
-    compiled = compiled_from(dict(sorted(files.items())), DEFINITIONS, lints=False)
-    names = [one.name for one in compiled.specifications]
-    assert names.index(fence) < names.index(speed)
-
-
-def test_an_old_guard_is_ordered_among_those_of_its_topic() -> None:
-    stop, fence = placed("estop", "estop", phased=False), placed("yard", "fence", phased=False)
-    cap = placed("cap", "speed")
-    assert statements(placed("speed", "speed"), [placed("z", "fence", "/arm/cmd_vel", phased=False)]) == ""
-    assert statements(cap, [stop, fence]) == "\norder estop < cap;\n\norder yard < cap;\n"
-    assert statements(cap, [placed("yard", "fence")]) == ""
-    assert (
-        statements(placed("yard", "fence"), [placed("cap", "speed", phased=False)]) == "\norder yard < cap;\n"
-    )
-    third = placed("last", "deadman")  # before a rate, which is before a fence
-    assert statements(third, [fence]) == "\norder last < yard;\n"
-    [fault] = faults([stop, placed("speed", "speed", phased=False), fence])
-    assert (
-        fault.startswith("speed acts before yard: after a stop")
-        and "order yard < speed; into speed.rv" in fault
-    )
-    assert not [*faults([stop, fence, placed("speed", "speed", phased=False)])]
-    assert not [*faults([cap, placed("yard", "fence")])]

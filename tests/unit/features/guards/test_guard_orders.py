@@ -22,11 +22,10 @@ from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_facts import values_of
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.message_types import GOAL
-from appliance.features.guards.old_form import with_name
-from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.presets import PRESETS, Guard, former_guard, text_of
 from appliance.features.guards.released import released
 from appliance.features.guards.upgrades import upgraded
-from appliance.features.guards.view import ActingGuard, GuardsState
+from appliance.features.guards.view import GUARDS_VIEW, ActingGuard, GuardsState
 from appliance.specifications.specification_files import MonitorsChangedError, SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.telemetry.audit_trail import AuditTrail
@@ -37,6 +36,24 @@ from tests.unit.features.guards.guard_desk import FENCE, TYPES, monitors_of
 from tests.unit.features.guards.test_placement import Connections
 
 pytestmark = pytest.mark.anyio
+FORMER = r"""// preset sane 1: command=/cmd_vel geometry_msgs/Twist
+// Stops the base if a command has a number that is infinite or NaN.
+
+begin sane() given {
+    topic command = /cmd_vel;
+} {
+    safe geometry_msgs/Twist { } on command every 100ms;
+
+    event drive(double x, double y, double z, double rx, double ry, double rz) command geometry_msgs/Twist
+            '{linear.x:x, linear.y:y, linear.z:z, angular.x:rx, angular.y:ry, angular.z:rz}' {
+        if (!isfinite(x) || !isfinite(y) || !isfinite(z) || !isfinite(rx) || !isfinite(ry) || !isfinite(rz)) {
+            ROS_WARN_THROTTLE(1.0, "stopped: a velocity is not a finite number");
+            STOP;
+        }
+    }
+}
+"""
+"""A guard of 0.3.0."""
 CHANGED = text_of(FENCE).replace("<= silent", "<= 1e9", 1)
 
 
@@ -280,29 +297,25 @@ async def test_an_order_without_sense_changes_nothing(
     assert monitors.tag == before
 
 
-async def test_a_new_guard_acts_behind_an_old_one_and_a_wrong_order_is_reported(
-    monitors: SpecificationManager, orders: GuardOrders
-) -> None:
-    types = {"command": TYPES["command"]}
-    request = guard_requests.GuardNew("speed", {"command": "/cmd_vel"}, types=types, name="cap")
-    await orders.new(request, "eve")
-    assert "\norder " not in monitors.sources.files["cap.rv"]  # both have phases
-    await monitors.remove(admin.MonitorRemove(["cap.rv"]), "eve")
-    await load(monitors, fence=released("fence", 2).text)
-    await orders.new(request, "eve")
-    assert monitors.sources.files["cap.rv"].endswith("\norder fence < cap;\n")
-    assert (await orders.guards(guard_requests.GuardsWanted())).warnings == []
-    await load(monitors, cap=with_name(released("speed", 1).text, "cap"))
-    [warning] = (await orders.guards(guard_requests.GuardsWanted())).warnings
-    assert "cap acts before fence" in warning
-
-
-async def test_an_upgrade_beside_old_guards_reports_a_wrong_order(
-    monitors: SpecificationManager, orders: GuardOrders
-) -> None:
-    await load(monitors, cap=with_name(released("speed", 1).text, "cap"), fence=released("fence", 2).text)
-    [warning] = (await orders.upgrade(guard_requests.GuardUpgrade("fence"), "eve")).warnings
-    assert "cap acts before fence" in warning
+async def test_a_guard_of_before_0_4_stays_in_force_as_a_monitor_that_is_named(tmp_path: Path) -> None:
+    """Its first line was its only sign of a guard. `rosrv guard` names it, and does not change it."""
+    async with monitors_of(tmp_path, {"sane.rv": FORMER}) as monitors:
+        orders, why = orders_of(monitors), former_guard("sane", "sane.rv")
+        assert monitors.switches.enabled("sane")
+        listed, state = await orders.guards(guard_requests.GuardsWanted()), orders.state()
+        assert (listed.guards, listed.warnings) == ([], [why])
+        assert state is not None and (state.loaded, state.former) == (0, {"sane": why})
+        [trouble] = GUARDS_VIEW.states[0].alarms(state)
+        assert (trouble.severity, trouble.kind, trouble.text) == ("warning", "guard-older:sane", why)
+        with pytest.raises(
+            UnknownThingError, match="rosrv guard new, with another --name; then rosrv monitor"
+        ):
+            await orders.upgrade(guard_requests.GuardUpgrade("sane"), "eve")
+        types = {"command": "geometry_msgs/Twist"}
+        await orders.new(guard_requests.GuardNew("sane", {"command": "/c"}, types=types, name="still"), "eve")
+        await monitors.remove(admin.MonitorRemove(["sane.rv"]), "eve")
+        listed = await orders.guards(guard_requests.GuardsWanted())
+        assert ([one.name for one in listed.guards], listed.warnings) == (["still"], [])
 
 
 async def test_a_type_of_an_unknown_topic_is_refused(
@@ -371,21 +384,20 @@ async def test_a_guard_shows_its_version_and_a_changed_one_is_not_upgraded(
     assert monitors.tag == before
 
 
-async def test_an_old_guard_is_upgraded_as_it_was_planned(
-    monitors: SpecificationManager, orders: GuardOrders
-) -> None:
-    await load(monitors, fence=released("fence", 2).text)
-    await set_shadow(monitors)
-    assert (await row(orders)).origin == "older"
-    plan = await orders.plan(guard_requests.GuardTry(name="fence", upgrade=True), "eve")
-    in_force = values_of(monitors.givens.states(monitors.checked, "fence"))
-    new = upgraded(released("fence", 2).text, in_force, [], {}, "shadow")
-    assert (plan.file, plan.text, plan.changed, plan.shadow) == ("fence.rv", new.text, new.changed, True)
-    assert plan.warnings == new.warnings
-    await orders.upgrade(guard_requests.GuardUpgrade("fence", confirm_within=60.0), "eve")
-    assert monitors.sources.files["fence.rv"] == new.text
-    assert monitors.switches.in_shadow("fence")
-    assert monitors.confirm_by == pytest.approx(clock.wall() + 60.0)
+async def test_an_old_guard_is_upgraded_as_it_was_planned(tmp_path: Path) -> None:
+    old, name = released("separation", 2).text, "separation"
+    async with monitors_of(tmp_path, {"separation.rv": old}) as monitors:
+        orders = orders_of(monitors)
+        await monitors.shadow(admin.MonitorShadow([name], True), "eve")
+        assert (await row(orders)).origin == "older"
+        plan = await orders.plan(guard_requests.GuardTry(name=name, upgrade=True), "eve")
+        new = upgraded(old, values_of(monitors.givens.states(monitors.checked, name)), [], {}, "shadow")
+        assert (plan.file, plan.text, plan.changed) == ("separation.rv", new.text, new.changed)
+        assert (plan.shadow, plan.warnings) == (True, new.warnings)
+        await orders.upgrade(guard_requests.GuardUpgrade(name, confirm_within=60.0), "eve")
+        assert monitors.sources.files["separation.rv"] == new.text
+        assert monitors.switches.in_shadow(name)
+        assert monitors.confirm_by == pytest.approx(clock.wall() + 60.0)
 
 
 async def test_a_new_guard_and_the_list_say_that_the_base_is_on_another_machine(

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from appliance.features.guards.guard_order import PRECEDENCES
-from appliance.features.guards.old_form import Head
 from appliance.features.guards.presets import (
     FOLDER,
     PRESETS,
     Guard,
     GuardError,
+    Head,
     Preset,
     below_the_standard,
     described,

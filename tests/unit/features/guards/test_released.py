@@ -3,47 +3,33 @@
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from hashlib import sha256
 from itertools import product
 from pathlib import Path
 
 import pytest
 
-from appliance.features.guards import old_form, released, upgrades
+from appliance.features.guards import released, upgrades
 from appliance.features.guards.presets import (
     PRESETS,
     Guard,
     GuardError,
     Parameter,
     Preset,
-    name_in,
-    preset_of,
     text_of,
     topics_in,
     types_in,
     values_in,
-    with_values,
 )
 from appliance.features.guards.released import FOLDER, origin_of
 from appliance.features.guards.robot_graph import TopicFacts
 from appliance.features.guards.upgrades import upgraded
 from distribution import released_presets
-from rosmop.check.reachable_types import identity
-from rosmop.text.parser import parse
-from rosmop.text.tree import TopicDeclaration
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import sample
 
-LAST_OLD = {
-    "agree": 1, "answer": 1, "arm": 1, "deadman": 2, "estop": 1, "fence": 2, "joints": 1, "rate": 1, "sane": 1,
-    "sensor": 2, "separation": 1, "speed": 1, "withhold": 1,
-}  # fmt: skip
-"""The versions whose guards have their types and values all over their texts."""
-IDENTITIES = "14b8ca5929d4b92c99ab646d0257efd0c3ed54976246012112ecd3dbb3033b1d"
 VALUES = {"corners": "0,0 4,0 0,3.5", "joints": "a:-1..1 b:0..2.5", "time": "7s", "hosts": "10.0.0.7/32 10.8.0.0/16",
           "bool": "true"}  # fmt: skip
 RELEASED = [tuple(path.stem.rsplit("-", 1)) for path in sorted(FOLDER.glob("*.rv"))]  # names and versions
-OLD = [(name, version) for name, version in RELEASED if int(version) <= LAST_OLD.get(name, 0)]
 
 
 def another(parameter: Parameter) -> str:
@@ -100,49 +86,6 @@ def test_a_value_beyond_its_range_or_without_a_place_is_a_change(preset: Preset)
         assert origin_of(text.replace("\n}\n", f"\n    {other}\n}}\n", 1)) == "changed"
 
 
-def old_guard(name: str, version: str) -> str:
-    """Return a guard of an old release with another name, topics and values."""
-    base = released.released(name, int(version))
-    text = old_form.with_name(base.text, "mine")
-    text = old_form.with_values(text, {each.name: another(each) for each in base.parameters})
-    for topic, default in base.given_topics.items():
-        new = f"/robot/{'command/cancel' if topic == 'cancel' else topic}"
-        text = old_form.with_topic(text, topic, new).replace(f"{topic}={default}", f"{topic}={new}", 1)
-        if f"{topic}={new}" not in text.partition("\n")[0] and topic != "cancel":
-            text = text.replace("\n", f", {topic}={new}\n", 1)
-    return text
-
-
-@pytest.mark.parametrize(("name", "version"), OLD)
-def test_a_guard_of_an_old_release_is_recognised_and_made_again(name: str, version: str) -> None:
-    text = old_guard(name, version)
-    base = released.released(name, int(version))
-    topics = {
-        topic: f"/robot/{'command/cancel' if topic == 'cancel' else topic}" for topic in base.given_topics
-    }
-    guard = preset_of(text)
-    assert guard is not None and (guard.version, name_in(text), topics_in(text)) == (
-        int(version),
-        "mine",
-        topics,
-    )
-    assert values_in(text) == {each.name: another(each) for each in base.parameters}
-    for own in (text, text + "\norder mine < other;\n", base.text):
-        assert origin_of(own) == "older"
-    for other in (text.replace("STOP;", "", 1), text.replace("return", "", 1), text + "\n// more\n"):
-        assert other == text or origin_of(other) == "changed"
-    for topic in topics.keys() - {"cancel"}:
-        assert origin_of(text.replace(f"{topic}=/robot", f"{topic}=/other", 1)) == "changed"
-    present = {one.name for one in PRESETS[name].parameters}
-    kept = {one.name for one in base.parameters} & present
-    by_default = {one: value for one, value in values_in(base.text).items() if one not in present}
-    graph = [*old_types(text), ("/joint_states", "sensor_msgs/JointState")]
-    facts = [TopicFacts(topic, kind, (), ()) for topic, kind in graph]
-    new = upgraded(old_form.with_values(text, by_default), {}, facts)
-    assert origin_of(new.text) == "current" and topics_in(new.text).items() >= topics.items()
-    assert {one: values_in(new.text)[one] for one in kept} == {one: values_in(text)[one] for one in kept}
-
-
 @pytest.mark.parametrize(("name", "version"), [("separation", 2), ("zone", 1), ("joints", 2)])
 def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, version: int) -> None:
     base = released.released(name, version)
@@ -154,8 +97,11 @@ def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, ve
         assert values_in(new.text).items() >= values_in(text).items()
 
 
-def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet() -> None:
-    base = released.released("joints", 1)
+def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = re.sub(r"\n    topic state [^\n]*", "", released.released("joints", 2).text)
+    base = replace(PRESETS["joints"], source=text)
+    for module in (released, upgrades):
+        monkeypatch.setattr(module, "released", lambda _name, _version: base)
     with pytest.raises(GuardError, match="joints needs a topic for state: give --topic state=TOPIC"):
         upgraded(base.text, {}, [])
     new = upgraded(base.text, {}, [], {"state": "/arm/joint_states"})
@@ -165,44 +111,10 @@ def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet() -> None:
         upgraded(base.text, {}, [other], {"state": "/arm/joint_states"})
 
 
-def test_an_old_guard_of_goals_is_made_again() -> None:
-    """Its text, which 0.3.0 made, has the topic that cancels goals. Now that topic follows from the goal."""
-    text = Path(__file__).with_name("estop_of_goals_0.3.0.rv").read_text(encoding="utf-8")
-    assert origin_of(text) == "older" and topics_in(text)["cancel"] == "/r/arm/cancel"
-    new = upgraded(text, {}, [])
-    assert origin_of(new.text) == "current"
-    assert topics_in(text).items() - topics_in(new.text).items() == {("cancel", "/r/arm/cancel")}
-    assert types_in(new.text) == {"command": "move_base_msgs/MoveBaseActionGoal"}
-    given = parse(new.text, "guard.rv").specifications[0].givens
-    assert "/r/arm/cancel" in {one.topic for one in given if isinstance(one, TopicDeclaration)}
-
-
 def old_types(text: str) -> Iterator[tuple[str, str]]:
     for name, topic in topics_in(text).items():
         if kind := types_in(text).get(name):
             yield topic, kind
-
-
-@pytest.mark.parametrize(("name", "version"), OLD)
-def test_a_list_of_an_old_guard_is_set_in_its_text(name: str, version: str) -> None:
-    base = released.released(name, int(version))
-    for each in base.parameters:
-        text = with_values(base.text, {each.name: another(each)})
-        assert text.count("\n") == base.text.count("\n") and values_in(text)[each.name] == another(each)
-        parse(text, "guard.rv")
-        assert with_values(text, {each.name: each.default}) == base.text
-
-
-def test_guards_in_use_keep_their_state_with_this_language() -> None:
-    """The identity of a state is that of 0.3.0 for texts that use nothing new."""
-    texts = [released.released(name, int(version)).text for name, version in OLD]
-    identities = [identity(one) for text in texts for one in parse(text, "guard.rv").specifications]
-    assert sha256(b"".join(identities)).hexdigest() == IDENTITIES
-
-
-def test_the_table_of_released_texts_has_each_old_version_and_no_other() -> None:
-    assert {(name, str(version)) for name in PRESETS for version in released.versions_of(name)} == {*OLD}
-    assert {(name, str(version)) for name, version in LAST_OLD.items()} == {*OLD}
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)

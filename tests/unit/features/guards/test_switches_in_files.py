@@ -177,8 +177,6 @@ ROW = example(GuardRow, name="a", file="a.rv", confirm_by=None, off_until=None, 
 def test_the_list_names_guards_that_a_new_state_directory_changes(state: str, afresh: str, said: str) -> None:
     told = afresh_in_words(msgspec.structs.replace(ROW, state=state, afresh=afresh))
     assert said in told and bool(told) == bool(said)
-    older = afresh_in_words(msgspec.structs.replace(ROW, state=state, afresh=afresh, origin="older"))
-    assert ("rosrv guard upgrade a," in older) == bool(said)  # a text of before 0.4 has no place for the word
 
 
 def written(
