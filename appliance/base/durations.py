@@ -4,7 +4,6 @@ import re
 
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
-_NUMBER = re.compile(r"[0-9]{1,9}(?:\.[0-9]{1,9})?")
 
 
 def seconds_of(text: str) -> float | None:
@@ -20,8 +19,3 @@ def bounded_seconds(text: str, shortest: str, longest: str) -> float:
     if not (seconds_of(shortest) or 0.0) <= seconds <= (seconds_of(longest) or 0.0):
         raise ValueError(f"{text} is out of bounds: write {shortest} to {longest}")
     return seconds
-
-
-def is_bare(text: str) -> bool:
-    """Return whether a text is a number without a unit."""
-    return _NUMBER.fullmatch(text) is not None

@@ -55,8 +55,6 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[object
         query = parse_qs(text, keep_blank_values=True)
         for operation in OPERATIONS:
             named = _named(operation.path, parts)
-            if named is None and operation.former:
-                named = _named(operation.former, parts)
             if operation.method == asked.method and named is not None:
                 order = _order(operation, named, query, asked, dry_run=dry_run)
                 if order is not None:

@@ -69,8 +69,6 @@ class Operation:
     method: str = ""
     path: str = ""
     query: tuple[str, ...] = ()
-    # The path of the last release, which is accepted in this one, but is not in the contract.
-    former: str = ""
     # The name in the contract. If several operations have one path, the operation with a name describes the path.
     name: str = ""
     words: str = ""

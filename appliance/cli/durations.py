@@ -1,23 +1,13 @@
 """Parse times on the command line: points in time, and durations such as `30s`, `5m`, `1.5h`, `90d`, `52w`."""
 
-import typer
-
 from appliance.base import clock
-from appliance.base.durations import bounded_seconds, is_bare
+from appliance.base.durations import bounded_seconds
 from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.output import usage_error
 
 
-def bounded_span(
-    option: str, text: str, shortest: str, longest: str, verb: str = "rosrv", *, bare: str = ""
-) -> float:
-    """Return seconds; both bounds are durations. Exit with status 2 for any other text.
-
-    `bare` is the unit of a number without one, for an option that took such numbers in the last release.
-    """
-    if bare and is_bare(text):
-        typer.echo(f"{option} {text} is now {option} {text}{bare}", err=True)
-        text += bare
+def bounded_span(option: str, text: str, shortest: str, longest: str, verb: str = "rosrv") -> float:
+    """Return seconds; both bounds are durations. Exit with status 2 for any other text."""
     try:
         return bounded_seconds(text, shortest, longest)
     except ValueError as error:

@@ -14,7 +14,6 @@ from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
 from appliance.cli.help_panels import in_order, panel_of
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
-from rosmop.tool.renamed_options import renamed
 from rosmop.tool.terminal import flowed
 
 if TYPE_CHECKING:
@@ -127,28 +126,21 @@ class _Deferred(TyperCommand):
     help = property(lambda self: self._verb.help, lambda _self, _given: None)  # click sets it
 
     def __init__(self, verb: Verb, name: str) -> None:
-        super().__init__(name, hidden=verb.hidden or bool(verb.now))
+        super().__init__(name, hidden=verb.hidden)
         self._verb = verb
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: "Context | None" = None, **extra: object
     ) -> "Context":
         command = loaded(self._verb, str(self.name))
-        if self._verb.now and not extra.get("resilient_parsing"):
-            typer.echo(f"rosrv {_path_of(parent)}{info_name} is now rosrv {self._verb.now}", err=True)
         try:
-            return command.make_context(info_name, renamed(command, args), parent, **extra)
+            return command.make_context(info_name, args, parent, **extra)
         except typer.BadParameter as error:
             from pydantic import ValidationError  # noqa: PLC0415  a correct command line does not need it
 
             if isinstance(error.__cause__, ValidationError):  # typer chains it
                 error.message = refusal(error.__cause__.errors()[0])
             raise
-
-
-def _path_of(parent: "Context | None") -> str:
-    """Return the names of the groups around a verb, without the program's."""
-    return "" if parent is None or parent.parent is None else f"{_path_of(parent.parent)}{parent.info_name} "
 
 
 def loaded(verb: Verb, name: str) -> "Command":

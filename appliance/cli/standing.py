@@ -80,7 +80,7 @@ WhenStanding = Annotated[
 
 def _seconds(given: str | float) -> float:
     """Return the seconds of --within; typer also converts the default."""
-    return given if isinstance(given, float) else bounded_span("--within", given, "1s", "1h", bare="s")
+    return given if isinstance(given, float) else bounded_span("--within", given, "1s", "1h")
 
 
 def longest_wait(end: str) -> object:

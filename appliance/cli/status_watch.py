@@ -35,7 +35,7 @@ def seconds_between(every: str | None, verb: str, *, watch: bool) -> float:
         return _SECONDS
     if not watch:
         raise usage_error("--every needs --watch", verb)
-    return bounded_span("--every", every, "1s", "1h", verb, bare="s")
+    return bounded_span("--every", every, "1s", "1h", verb)
 
 
 class StatusView(NamedTuple):

@@ -9,16 +9,12 @@ from appliance.cli.output import usage_error
 from rosmop.tool.terminal import printable, refused
 
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask; needs --state")]
-Confirm = Annotated[str | None, typer.Option("--confirm", metavar="DIR", hidden=True)]
-"""The former form of `Yes`."""
 
 
 def confirm_state(context: typer.Context, state: Path, consequence: str) -> None:
     """Exit with status 1 unless the operator types the state directory, or has agreed with --yes."""
-    given = context.params["confirm"]
-    if given is not None:
-        typer.echo("--confirm DIR is now --yes, with --state DIR", err=True)
-    elif context.params["yes"]:
+    given = None
+    if context.params["yes"]:
         source = context.get_parameter_source("state")
         if source is None or source.name != "COMMANDLINE":
             raise usage_error(f"--yes needs the directory: --state {state}", f"rosrv {context.info_name}")

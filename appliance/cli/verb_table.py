@@ -11,15 +11,13 @@ from pathlib import Path
 class Verb:
     """A row of the table; `place` is `module:function`, and in the help, `first` precedes its docstring.
 
-    A feature's verb is listed `after` another one. A former name of a verb, accepted for one release and
-    not listed, has its present name in `now`.
+    A feature's verb is listed `after` another one.
     """
 
     place: str
     first: str = ""
     hidden: bool = False
     after: str = ""
-    now: str = ""
 
     @property
     def path(self) -> str:

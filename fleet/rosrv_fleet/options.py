@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from appliance.base.durations import bounded_seconds, is_bare
+from appliance.base.durations import bounded_seconds
 
 Config = Annotated[
     Path,
@@ -18,18 +18,14 @@ DEFAULT_CONFIG = Path("/etc/rosrv-fleet/fleet.yaml")
 Json = Annotated[bool, typer.Option("--json", metavar="", help="One JSON object a line (NDJSON)")]
 
 
-def duration(shortest: str, longest: str, *, bare: str) -> Callable[[str | float], float]:
-    """Return a parser of seconds, for an option that took numbers in the unit `bare` in the last release."""
+def duration(shortest: str, longest: str) -> Callable[[str | float], float]:
+    """Return a parser of seconds."""
 
     def parsed(given: str | float) -> float:
         if isinstance(given, float):  # typer also converts the default
             return given
-        text = given
-        if is_bare(text):
-            text += bare
-            typer.echo(f"rosrv-fleet: {given} is now {text}", err=True)
         try:
-            return bounded_seconds(text, shortest, longest)
+            return bounded_seconds(given, shortest, longest)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
 

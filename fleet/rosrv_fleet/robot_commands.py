@@ -26,7 +26,7 @@ OfPair = Annotated[
     str,
     typer.Option("--appliance", metavar="NAME", help="One appliance of a robot with a standby, such as b"),
 ]
-_WITHIN = duration("1s", "30d", bare="h")
+_WITHIN = duration("1s", "30d")
 Certificate = Annotated[
     Path, typer.Option("--certificate", metavar="FILE", help="The robot's client certificate (PEM)")
 ]
@@ -48,7 +48,6 @@ def invite_robots(
     ] = 86_400.0,
     appliance: OfPair = "",
     *,
-    hours: Annotated[str | None, typer.Option("--hours", hidden=True)] = None,  # its name in the last release
     config: Config = DEFAULT_CONFIG,
 ) -> None:
     """Print an invitation for each robot, one a line. A robot uses it once: `rosrv fleet join FILE`.
@@ -58,9 +57,6 @@ def invite_robots(
 
     Example: rosrv-fleet robot invite arm7 --group site-a/arms > arm7.json
     """
-    if hours is not None:
-        typer.echo("rosrv-fleet: --hours is now --within", err=True)
-        within = _WITHIN(hours)
     found = load_config(config)
     if group:
         RobotGroup.parse(group)

@@ -29,7 +29,6 @@ from rosmop.tool.options import (
     WhySlow,
     Workers,
 )
-from rosmop.tool.renamed_options import RenamedCommand
 from rosmop.tool.summaries import SUMMARIES
 from rosmop.tool.terminal import flowed
 
@@ -159,4 +158,4 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for _name, _command in commands_of(CommandContext("rosmop", Path.write_bytes)).items():
-    app.command(_name, cls=RenamedCommand, help=f"{SUMMARIES[_name]}\n\n{_command.__doc__}")(_command)
+    app.command(_name, help=f"{SUMMARIES[_name]}\n\n{_command.__doc__}")(_command)

@@ -54,11 +54,11 @@ def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path:
         policy.write_text(POLICY)
         policy.chmod(0o640)
         (tmp_path / "filler").write_bytes(bytes(4096))
-        done = appliance.rosrv("policy", "grant", record, "--write", str(policy), check=False)
+        done = appliance.rosrv("policy", "grant", record, "--output", str(policy), check=False)
         assert (done.returncode, "No space left" in done.stderr) == (2, True), done.stderr
         assert policy.read_text() == POLICY
         (tmp_path / "filler").unlink()
-        appliance.rosrv("policy", "grant", record, "--write", str(policy))
+        appliance.rosrv("policy", "grant", record, "--output", str(policy))
         assert "/cmd_vel = ocu robot" in policy.read_text()
         assert policy.stat().st_mode & 0o777 == 0o640
 
@@ -78,7 +78,7 @@ def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_
     new, dos = tmp_path / "new.ini", tmp_path / "dos.ini"
     dos.write_bytes(b"[Groups]\r\n")
     for file, ends in ((new, b"\n"), (dos, b"\r\n")):  # the file's line endings stay the same
-        appliance.rosrv("policy", "grant", record, "--write", str(file))
+        appliance.rosrv("policy", "grant", record, "--output", str(file))
         assert set(re.findall(rb"\r?\n", file.read_bytes())) == {ends}
     done = appliance.rosrv("policy", "grant", record, "--load", "--confirm-within", "5m")
     assert "unless you run: rosrv policy confirm" in done.stdout

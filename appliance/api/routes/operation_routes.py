@@ -151,19 +151,17 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
 
     has_model = given is not Response
     options: dict[str, object] = {"response_model": given} if has_model else {"response_class": Response}
-    for path in filter(None, (operation.path, operation.former)):
-        router.add_api_route(
-            _converted(path),
-            endpoint,
-            name=operation.name,
-            description=inspect.cleandoc(operation.words),
-            methods=[operation.method],
-            tags=[operation.tag],
-            status_code=operation.status,
-            responses=_responses(operation, own),
-            include_in_schema=path == operation.path,
-            **options,
-        )
+    router.add_api_route(
+        _converted(operation.path),
+        endpoint,
+        name=operation.name,
+        description=inspect.cleandoc(operation.words),
+        methods=[operation.method],
+        tags=[operation.tag],
+        status_code=operation.status,
+        responses=_responses(operation, own),
+        **options,
+    )
 
 
 def _converted(path: str) -> str:

@@ -33,9 +33,6 @@ def approve(
         str | None,
         typer.Option("--for", help="Approve all calls of this name by this host for this time, 1s to 1h"),
     ] = None,
-    refused: Annotated[
-        bool, typer.Option("--refuse", help="Former name of: rosrv approval refuse NUMBER", hidden=True)
-    ] = False,
     watch: Annotated[
         bool, typer.Option("--watch", help="Show calls as they come, with a bell, until interrupted")
     ] = False,
@@ -48,21 +45,17 @@ def approve(
     Example: rosrv approve 48213 --for 30s
     """
     if watch:
-        if number is not None or last is not None or refused:
+        if number is not None or last is not None:
             raise usage_error("--watch takes no call: approve in another terminal", "rosrv approve")
         show_held_calls(appliance, lambda one: _line(appliance, one))
         return
     if number is None:
-        if last is not None or refused:
+        if last is not None:
             raise usage_error("name the call: rosrv approve NUMBER", "rosrv approve")
         _list(appliance)
         return
-    if refused:
-        typer.echo(f"rosrv approve --refuse is now rosrv approval refuse {number}", err=True)
-    if refused and last is not None:
-        raise usage_error("give --for or --refuse, not both", "rosrv approve")
     seconds = None if last is None else bounded_span("--for", last, "1s", "1h", "rosrv approve")
-    _say(appliance, appliance.answer_or_exit(RefuseCall(number) if refused else ApproveCall(number, seconds)))
+    _say(appliance, appliance.answer_or_exit(ApproveCall(number, seconds)))
 
 
 @speaks

@@ -21,8 +21,6 @@ FEATURE = Feature(
                 "assign": Verb(f"{_PLACE}verbs:assign"),
                 "free": Verb(f"{_PLACE}verbs:free"),
                 "ask": Verb(f"{_PLACE}verbs:ask"),
-                "take": Verb(f"{_PLACE}verbs:assign", now="drive assign"),
-                "give": Verb(f"{_PLACE}verbs:free", now="drive free"),
             },
             after="guard",
         )

@@ -62,7 +62,6 @@ class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
 
 @rest(
     "operator", "POST", "/v1/drive/{group}/assign", name="drive_assign", body=GroupHost, problems=_NO_GROUP,
-    former="/v1/drive/{group}/take",
 )  # fmt: skip
 class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
     """Assign a group to a host that may take it, or that may override its holder."""
@@ -73,7 +72,6 @@ class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
 
 @rest(
     "operator", "POST", "/v1/drive/{group}/free", name="drive_free", body=GroupGift, problems=_NO_GROUP,
-    former="/v1/drive/{group}/give",
 )  # fmt: skip
 class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
     """Take a group from its holder; it is assigned to a host, or to the first waiting host.

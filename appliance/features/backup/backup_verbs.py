@@ -12,7 +12,7 @@ from appliance.backup.create import back_up
 from appliance.base.counted import counted
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.typed_confirmation import Confirm, Yes, confirm_state
+from appliance.cli.typed_confirmation import Yes, confirm_state
 from appliance.features.backup.only_in_state import lacking_in_folder, specifications_in
 from appliance.features.backup.purge import purge as remove
 from appliance.features.backup.purge import require_state_directory
@@ -82,7 +82,6 @@ def purge(
     state: State = DEFAULT_STATE,
     *,
     yes: Yes = False,  # noqa: ARG001  `confirm_state` reads it
-    confirm: Confirm = None,  # noqa: ARG001  as above
     as_json: Json = False,
 ) -> None:
     """Erase a state directory: audit log, policies, keys of the appliance and its hosts. Stop the appliance first.

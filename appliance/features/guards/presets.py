@@ -203,8 +203,8 @@ def is_former(text: str) -> bool:
 
 def former_guard(name: str, file: str) -> str:
     return (
-        f"{name} is a guard of a release before 0.4: it stays in force as a monitor, and rosrv guard does not change it;"
-        f" make a guard in its place: rosrv guard new, with another --name; then rosrv monitor remove {file}"
+        f"{name} is a guard of a release before 0.4: it stays in force as a monitor, which rosrv guard does not"
+        f" change: make a guard in its place: rosrv guard new, with another --name; then rosrv monitor remove {file}"
     )
 
 

@@ -20,7 +20,6 @@ FEATURE = Tool(
                 "list": Verb(f"{_LIVE}:list_monitors"),
                 "enable": Verb(f"{_LIVE}:enable"),
                 "enforce": Verb(f"{_LIVE}:enforce"),
-                "promote": Verb(f"{_LIVE}:enforce", now="monitor enforce"),
                 "disable": Verb(f"{_LIVE}:disable"),
                 "load": Verb(f"{_PLACE}load_verb:load"),
                 "remove": Verb(f"{_LIVE}:remove"),

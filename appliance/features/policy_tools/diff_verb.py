@@ -71,16 +71,11 @@ def compare(
 ) -> None:
     """Compare the texts of two policies or, with --decisions, their decisions. Exit status 1 if they differ.
 
-    Give a file or a revision to compare it with the policy in force. Give neither to show the last change. Two files
-    are always compared by their decisions.
+    Give a file or a revision to compare it with the policy in force. Give neither to show the last change.
 
     Example: rosrv policy diff next.ini
     """
     before, after = _sources(appliance, old, new)
-    if not decisions and requests is None and _are_files(old, new):
-        # the meaning of two files in 0.2.0
-        typer.echo("rosrv: two files will be compared by their text: use --decisions", err=True)
-        decisions = True
     if decisions or requests is not None:
         known = _known(appliance, old, new, robot, enrolled)
         policies = _compiled(before, known), _compiled(after, known)

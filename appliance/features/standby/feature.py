@@ -26,7 +26,6 @@ FEATURE = Feature(
                 "repair": Verb(f"{_PLACE}membership_verbs:repair"),
                 "status": Verb(f"{_PLACE}live_verbs:status"),
                 "switch": Verb(f"{_PLACE}live_verbs:switch"),
-                "promote": Verb(f"{_PLACE}live_verbs:switch", now="standby switch"),
             },
             after="host",
         ),

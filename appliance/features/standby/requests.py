@@ -14,7 +14,7 @@ class StandbyWanted(AdminRequest[StandbyState], frozen=True, tag="standby"):
 
 
 @rest(
-    "admin", "POST", "/v1/standby/switch", name="switch_standby", tag="status", former="/v1/standby/promote",
+    "admin", "POST", "/v1/standby/switch", name="switch_standby", tag="status",
     problems={404: "This appliance is not one of two."},
 )  # fmt: skip
 class StandbyPromote(WaitingRequest[StandbyState], frozen=True, tag="standby promote"):

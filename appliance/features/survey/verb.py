@@ -43,7 +43,7 @@ def survey(
 
     Example: rosrv survey --output survey.html --policy draft.ini
     """
-    seconds = bounded_span("--within", within, "1s", "10m", _VERB, bare="s")
+    seconds = bounded_span("--within", within, "1s", "10m", _VERB)
     tests = None if policy is None else policy.with_name(f"{policy.name}.tests.yaml")
     for file in filter(None, (output, policy, tests)):
         if file.exists():

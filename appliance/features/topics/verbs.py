@@ -72,7 +72,7 @@ def echo(
 
     Example: rosrv topic echo /odom -n 3 --field pose.pose.position
     """
-    seconds = bounded_span("--within", within, "0.1s", "10s", "rosrv topic", bare="s")
+    seconds = bounded_span("--within", within, "0.1s", "10s", "rosrv topic")
     shown = 0
     while shown < count:
         request = TopicLook(topic, min(count - shown, _AT_ONCE), seconds, latched=not shown)

@@ -5,7 +5,7 @@ import typer
 from appliance.backup.contents import BackupError
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.typed_confirmation import Confirm, Yes, confirm_state
+from appliance.cli.typed_confirmation import Yes, confirm_state
 from appliance.features.tunnels.rotate_authority import rotate_authority
 from rosmop.tool.terminal import refused, say
 
@@ -15,7 +15,6 @@ def rotate(
     state: State = DEFAULT_STATE,
     *,
     yes: Yes = False,  # noqa: ARG001  `confirm_state` reads it
-    confirm: Confirm = None,  # noqa: ARG001  as above
     as_json: Json = False,
 ) -> None:
     """Erase the key of the hosts' authority; the next start makes a new one. Stop the appliance first.

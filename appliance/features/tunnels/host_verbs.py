@@ -204,7 +204,7 @@ def revoke(running: Appliance, name: _Name) -> None:
 
 
 def _days(valid: str) -> float:
-    return bounded_span("--for", valid, "1s", "398d", "rosrv host", bare="d") / _DAY
+    return bounded_span("--for", valid, "1s", "398d", "rosrv host") / _DAY
 
 
 def _token_seconds(within: str | None, csr: Path | None, *, token: bool) -> float:

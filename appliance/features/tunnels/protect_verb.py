@@ -119,7 +119,7 @@ def protect(
     The check tries TCP. Run it on a machine other than the appliance's, because the rules let the appliance in. Exit
     status: 0 done, or closed; 1 a port is open; 2 failed, no answer, or closed but not reported.
     """
-    seconds = bounded_span("--within", within, "0.05s", "1m", "rosrv protect", bare="s")
+    seconds = bounded_span("--within", within, "0.05s", "1m", "rosrv protect")
     if sum((apply, check is not None, remove)) > 1:
         _fail("--apply, --check and --remove exclude one another: give one")
     try:

@@ -34,7 +34,7 @@ def start(
         float,
         typer.Option(
             "--healthy",
-            parser=duration("0s", "7d", bare="s"),
+            parser=duration("0s", "7d"),
             metavar="DURATION",
             show_default="10m",
             help="How long a ring must stay healthy: 90s, 15m",
@@ -44,7 +44,7 @@ def start(
         float,
         typer.Option(
             "--ring-within",
-            parser=duration("1s", "30d", bare="s"),
+            parser=duration("1s", "30d"),
             metavar="DURATION",
             show_default="1h",
             help="The longest time in which a ring must reach its share: 90m, 2d",

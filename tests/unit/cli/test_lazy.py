@@ -1,9 +1,7 @@
 import functools
 import os
-import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,8 +10,8 @@ from rosrv_fleet.cli import app as fleet_app
 from typer.testing import CliRunner
 
 from appliance.cli.lazy import loaded
-from appliance.cli.main import all_verbs, app
-from appliance.cli.verb_table import Group, Verb, Verbs
+from appliance.cli.main import app
+from appliance.cli.verb_table import Verb
 from distribution import command_line_page
 from rosmop.tool.command import app as rosmop_app
 from tests.support.command import table
@@ -61,27 +59,6 @@ def test_every_verb_has_help_with_an_example(name: str, verb: Verb) -> None:
     assert "<bool>" not in shown.output, "a flag takes no value"
     assert shown.exit_code == 0
     assert "Usage: " in shown.output
-
-
-def former(verbs: Verbs, group: str = "") -> Iterator[tuple[str, Verb]]:
-    for name, one in verbs.items():
-        if isinstance(one, Group):
-            yield from former(one.verbs, f"{group}{name} ")
-        elif one.now:
-            yield f"{group}{name}", one
-
-
-FORMER = [*former(all_verbs())]
-
-
-@pytest.mark.parametrize(("name", "verb"), [pytest.param(*row, id=row[0]) for row in FORMER])
-def test_a_former_name_of_a_verb_is_accepted_and_not_listed(name: str, verb: Verb) -> None:
-    assert dict(table())[verb.now].path == verb.path
-    group, _space, former_name = name.rpartition(" ")
-    assert not re.search(rf"[│ ] {former_name} ", CliRunner().invoke(app, [*group.split(), "-h"]).output)
-    done = CliRunner().invoke(app, [*name.split(), "-h"])
-    assert f"rosrv {name} is now rosrv {verb.now}" in done.output
-    assert done.exit_code == 0
 
 
 @pytest.mark.parametrize("program", [app, rosmop_app, fleet_app], ids=["rosrv", "rosmop", "rosrv-fleet"])

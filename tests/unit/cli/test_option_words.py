@@ -4,13 +4,11 @@ import re
 from collections import defaultdict
 from typing import Any, NamedTuple
 
-import pytest
 import typer
 from typer.core import TyperArgument, TyperOption
 
 from appliance.cli.main import app
-from rosmop.tool.renamed_options import FORMER_OPTIONS
-from tests.support.command import commands, rosrv
+from tests.support.command import commands
 
 POINTS = {"--since": "TIME", "--until": "TIME", "--at": "TIME", "--between": "TIME TIME"}
 DURATIONS = {"--for", "--within", "--confirm-within", "--every", "--grace", "--before", "--after"}
@@ -97,24 +95,3 @@ def test_an_argument_is_in_capitals() -> None:
 
 def test_help_of_options_is_a_phrase_without_a_full_stop() -> None:
     assert [one for one in OPTIONS if one.help.endswith(".")] == []
-
-
-@pytest.mark.parametrize(("former", "now"), sorted(FORMER_OPTIONS.items()))
-def test_a_former_name_is_replaced_somewhere(former: str, now: str) -> None:
-    known = defaultdict(set)
-    for one in OPTIONS:
-        known[one.verb].update(one.given.opts)
-    assert [verb for verb, names in known.items() if now in names and former not in names]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "note"),
-    [
-        (("status", "--watch", "--every", "0"), "--every 0 is now --every 0s"),
-        (("survey", "--seconds", "0.5"), "--within 0.5 is now --within 0.5s"),
-        (("host", "add", "a", "--days", "0"), "--for 0 is now --for 0d"),
-    ],
-)
-def test_a_number_without_a_unit_is_accepted_with_a_note(arguments: tuple[str, ...], note: str) -> None:
-    done = rosrv(*arguments)
-    assert (done.returncode, note in done.stderr) == (2, True)

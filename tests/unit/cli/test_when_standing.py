@@ -37,7 +37,7 @@ _PERSON = "it is an operator's answer to one person or node that waits"
 _NO_MOTION = "it changes no topic, service or right of a node"
 _READS = "it only looks"
 AT_ONCE = {
-    "release": "it always waits, unless --moving is given",
+    "release": "it always waits, unless --force is given",
     "policy rollback": "it undoes a change that may be the harm",
     "monitor rollback": "it undoes a change that may be the harm",
     "policy confirm": _NO_MOTION,

@@ -84,19 +84,6 @@ def test_an_option_of_both_programs_has_one_kind_of_value() -> None:
             assert found <= both[name] | OTHER_THINGS.get(name, set()), (name, found, both[name])
 
 
-def test_the_former_option_is_accepted_with_a_note() -> None:
-    done = CliRunner().invoke(app, ["robot", "invite", "a", "--hours", "9999"])
-    assert (done.exit_code, "--hours is now --within" in done.output) == (2, True)
-    assert "9999 is now 9999h" in done.output and "out of bounds" in done.output
-
-
-def test_a_number_of_seconds_is_accepted_with_a_note() -> None:
-    done = CliRunner().invoke(
-        app, ["rollout", "start", "a/b/1.tar", "--collector", "https://x", "--healthy", "9999999"]
-    )
-    assert (done.exit_code, "9999999 is now 9999999s" in done.output) == (2, True)
-
-
 def started(monkeypatch: pytest.MonkeyPatch, *options: str) -> dict[str, float]:
     """Return the gates of the request that `rollout start` with these options makes."""
     requests: list[dict[str, Any]] = []

@@ -80,10 +80,6 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/drive/base/free", {}),
     ("POST", "/v1/drive/base/free", {"to": "10.0.0.7"}),
     ("POST", "/v1/drive/base/ask", {"host": "robot"}),
-    # Former paths
-    ("POST", "/v1/drive/base/take", {"host": "robot"}),
-    ("POST", "/v1/drive/base/give", {"to": "10.0.0.7"}),
-    ("POST", "/v1/standby/promote", None),
     ("POST", "/v1/approvals/17/approve", {}),
     ("POST", "/v1/approvals/17/approve", {"seconds": 30}),
     ("POST", "/v1/approvals/17/refuse", None),
@@ -484,7 +480,7 @@ def routes() -> dict[str, set[str]]:
 
 
 def test_routes_written_by_hand_are_for_these_roles() -> None:
-    named = {f"{one.method} {path}": one.name for one in NAMED for path in (one.path, one.former) if path}
+    named = {f"{one.method} {one.path}": one.name for one in NAMED}
     of_table = {
         path: {"operator" if any(one.dry_run and one.name == name for one in NAMED) else LEAST[name]}
         for path, name in named.items()

@@ -99,7 +99,7 @@ def test_yes_needs_the_state_directory_beside_it(state: Path, monkeypatch: pytes
 
 def test_the_command_asks_for_the_path_again(state: Path) -> None:
     run = CliRunner().invoke
-    refused = run(app, ["purge", "--state", str(state), "--confirm", "/var/lib/rosrv"])
+    refused = run(app, ["purge", "--state", str(state)], input="/var/lib/rosrv\n")
     assert (refused.exit_code, "nothing was changed" in refused.output) == (1, True)
     done = run(app, ["purge", "--state", str(state)], input=f"{state}\n")
     assert (done.exit_code, "is erased: 5 files" in done.output) == (0, True)
