@@ -1,7 +1,9 @@
 """`rosrv config check|show`: validate and print the configuration."""
 
+import contextlib
 import json
 import os
+import sqlite3
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +11,13 @@ from typing import Annotated
 import typer
 import yaml
 
-from appliance.configuration.config_sources import ConfigError, json_schema, plain, resolve
+from appliance.configuration.config_sources import ConfigError, Mistake, json_schema, plain, resolve
+from appliance.configuration.settings import Settings
+from appliance.features.table import members
+from appliance.supervisor.state_directory import STORED, made_before_0_4, read_only
+from rosmop.tool.terminal import printable
+
+_SOURCES = "SELECT sources FROM monitor_revision ORDER BY revision DESC LIMIT 1"
 
 _CheckedFile = Annotated[
     Path | None, typer.Argument(readable=False, metavar="FILE", help="The same as --config FILE")
@@ -26,10 +34,12 @@ _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
     """Report every error in the configuration file and the environment variables. Exit status: 0 valid, 1 errors.
 
+    A state directory that this version cannot continue is an error, too. Guards of releases before 0.4 are named.
+
     Example: rosrv config check appliance.yaml
     """
     try:
-        resolve(file or config, os.environ, {})
+        _check_state(resolve(file or config, os.environ, {}))
     except ConfigError as error:
         if not as_json:
             raise
@@ -38,6 +48,33 @@ def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = Fals
         raise typer.Exit(1) from error
     if not as_json:
         _print("The configuration is valid.")
+
+
+def _check_state(settings: Settings) -> None:
+    """Name guards of releases before 0.4. Raises `ConfigError` for a state that this version cannot continue."""
+    files: dict[str, str] = {}
+    try:
+        for path in settings.monitors.glob("*.rv") if settings.monitors is not None else ():
+            files[path.name] = path.read_text(encoding="utf-8", errors="replace")
+        if reason := made_before_0_4(settings.state):
+            raise ConfigError([Mistake("state", reason)])
+        files |= _stored_files(settings.state)
+    except (OSError, sqlite3.Error) as error:
+        typer.echo(
+            f"rosrv: the stored state is not checked: {printable(str(error))}; run this as root", err=True
+        )
+    for former_guards in members("presets", "former_guards"):
+        for line in former_guards(files):
+            typer.echo(f"rosrv: {printable(line)}", err=True)
+
+
+def _stored_files(state: Path) -> dict[str, str]:
+    """Return the specifications in force by their files."""
+    if not (state / STORED).exists():
+        return {}
+    with contextlib.closing(read_only(state)) as database:
+        row = database.execute(_SOURCES).fetchone()
+    return {} if row is None else dict(json.loads(row[0])["files"])
 
 
 def show(

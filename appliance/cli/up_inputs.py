@@ -23,6 +23,7 @@ from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder, read_usable
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.state_directory import made_before_0_4
 from rosmop.tool.terminal import refused
 
 _STATE = Path("control", "state.db")
@@ -39,6 +40,9 @@ def read_inputs(settings: Settings, robot: str | None = None) -> range:
 
     The standby, which knows the address of the `robot`, starts with the active appliance's policy.
     """
+    with contextlib.suppress(OSError):  # if only control can read the state, it judges
+        if reason := made_before_0_4(settings.state):
+            raise StartError(reason)
     state = settings.state / _STATE
     author = _last_author(state)
     if settings.monitors is not None and author in ("", DISK):

@@ -32,6 +32,7 @@ from appliance.specifications.specification_files import SpecificationFolder
 from appliance.specifications.specification_revisions import Check, specifications_at_start
 from appliance.specifications.switches import SWITCHES, Switches
 from appliance.store.changes import Change, Value
+from appliance.store.ends import require_0_4
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import Database, StoreError
 
@@ -94,6 +95,7 @@ class StartRehearsal:
     def _load_state(self) -> tuple[MonitorRevisionRow | None, str]:
         settings = self._settings
         store = StateStore(self.folder, failed=_log.error, kind=ReadOnlyDatabase)
+        require_0_4(store.database.query)
         known = PolicyContext(
             make_host_table(settings, store).addresses(),
             robot_addresses(settings, self._robot),

@@ -45,7 +45,6 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 _HEAD = struct.Struct(">II")  # length with the mark, checksum
 _NUMBERS = struct.Struct(">QQ")  # number of the change, number of the change before it in this file
 _MARK = 1 << 31
-_EARLIER_LENGTH = struct.Struct(">I")  # of a statement that version 0.2.0 left; without the mark
 
 
 class ChangeError(ValueError):
@@ -170,10 +169,9 @@ class Encoded(NamedTuple):
 
 
 class LeftBehind(NamedTuple):
-    """The content of the file after a crash: changes, or statements (SQL) of an earlier release."""
+    """The changes in the file after a crash."""
 
     changes: list[tuple[int, Change]]
-    statements: list[tuple[str, list[Value]]]
     goes_on: bool = False
     """Whether the database has an earlier change of the process that made these."""
 
@@ -205,12 +203,10 @@ class WriteAhead:
         """Return the changes after `stored`. Raises `ValueError` for an intact change that is not known here."""
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
-        if data[:1] < b"\x80":
-            return LeftBehind([], list(_earlier_statements(data)))
         decoder = msgspec.msgpack.Decoder(Change)
         found = list(_after(stored, data))
         changes = [(number, decoder.decode(body)) for number, _previous, body in found]
-        return LeftBehind(changes, [], goes_on=bool(found) and found[0][1] > 0)
+        return LeftBehind(changes, goes_on=bool(found) and found[0][1] > 0)
 
     def append(self, changes: Sequence[Encoded]) -> None:
         """Append changes. Raises `OSError`, for example if the disk is full; then the file has none of them."""
@@ -271,16 +267,3 @@ def _after(stored: int, data: bytes) -> Iterator[tuple[int, int, bytes]]:
         if number > stored:
             stored = number
             yield number, previous, data[begin + _NUMBERS.size : position]
-
-
-def _earlier_statements(data: bytes) -> Iterator[tuple[str, list[Value]]]:
-    """Yield the statements that version 0.2.0 left; omit a torn last one."""
-    decoder = msgspec.msgpack.Decoder(tuple[str, list[Any]])
-    position = 0
-    while position + _EARLIER_LENGTH.size <= len(data):
-        (length,) = _EARLIER_LENGTH.unpack_from(data, position)
-        begin = position + _EARLIER_LENGTH.size
-        position = begin + length
-        if not length or position > len(data):
-            return
-        yield decoder.decode(data[begin:position])

@@ -19,7 +19,7 @@ import asyncio
 import contextlib
 import math
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,12 +29,14 @@ import structlog
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
 from appliance.base.shipped import before_program
-from appliance.store.earlier_ends import earlier_ends
 from appliance.store.state_file import EndRow, StateStore
 from appliance.store.writer_thread import StoreError
 
 _READING = "reading of the clocks"
-_IMPORTED = "ends"  # this setting exists once the ends of versions up to 0.3.0 are in the table
+_MARK = "ends"  # this setting exists in each state that a version from 0.4 on has opened
+_BEFORE_0_4 = """
+    SELECT EXISTS (SELECT 1 FROM policy_revision) AND NOT EXISTS (SELECT 1 FROM setting WHERE name = 'ends')
+"""
 _SECOND = 1_000_000_000
 _NOTE_SECONDS = 30.0
 _PAIRED_NOTE_SECONDS = 1.0  # at each look, unless many come together
@@ -57,6 +59,14 @@ class EndKind:
     """Whether it survives a restart of control."""
     dated: bool = False
     """Whether its date ends it too: a credential."""
+
+
+def require_0_4(query: Callable[[str], Iterable[tuple[object, ...]]]) -> None:
+    """Raise `StoreError` for the state of a version before 0.4, whose ends are not in the table."""
+    if list(query(_BEFORE_0_4)) != [(0,)]:
+        raise StoreError(
+            "the state was made by a version before 0.4: install 0.4.1, start it once, then install this version"
+        )
 
 
 class _Reading(msgspec.Struct, frozen=True):
@@ -257,20 +267,17 @@ class EndTable:
         last = None if text is None else msgspec.json.decode(text, type=_Reading)
         # A standby that left its pair also has the ends of the other appliance, by its clock.
         taken_over = last is not None and last.appliance not in ("", self._appliance)
-        imported: list[EndRow] = []
-        if _IMPORTED not in settings:
-            wall, age = (last.wall, last.age) if last is not None and taken_over else (clock.wall(), now)
-            imported = earlier_ends(self._store, wall, age)
-            self._store.save_setting(_IMPORTED, "1")
-            self._store.forget_time_left()
-        for row in [*self._store.ends(), *imported]:
+        if _MARK not in settings:
+            require_0_4(self._store.database.query)
+            self._store.save_setting(_MARK, "1")
+        for row in self._store.ends():
             end = _End(row.at, row.since, bool(row.late), stored=True, date=row.date)
             if last is not None and taken_over:
                 end = _inherited(end, last, away_seconds, now)
             elif last is not None and now < last.age:
                 end = end._replace(at=end.at + now - last.age, since=end.since + now - last.age)
             self._ends.setdefault(row.kind, {})[row.name] = end
-            if row in imported or row != _row(row.kind, row.name, end):
+            if row != _row(row.kind, row.name, end):
                 self._store.save_end(_row(row.kind, row.name, end))
         self._note()
 
@@ -279,17 +286,12 @@ class EndTable:
         self._store.save_setting(_READING, msgspec.json.encode(reading).decode())
 
 
-def replicated_ends(connection: sqlite3.Connection, kind: EndKind) -> dict[str, tuple[int, float]] | None:
-    """Return the stored end of each name, and the seconds left when the active appliance last read its clock.
-
-    None: the active appliance has an earlier version, whose ends `EndTable` imports at a takeover.
-    """
-    settings = dict(
-        connection.execute("SELECT name, value FROM setting WHERE name IN (?, ?)", (_READING, _IMPORTED))
-    )
-    if _IMPORTED not in settings:
-        return None
-    last = msgspec.json.decode(settings[_READING], type=_Reading)
+def replicated_ends(connection: sqlite3.Connection, kind: EndKind) -> dict[str, tuple[int, float]]:
+    """Return the stored end of each name, and the seconds left when the active appliance last read its clock."""
+    reading = connection.execute("SELECT value FROM setting WHERE name = ?", (_READING,)).fetchone()
+    if reading is None:
+        return {}
+    last = msgspec.json.decode(reading[0], type=_Reading)
     rows = connection.execute("SELECT name, at, date FROM ends WHERE kind = ?", (kind.name,))
     return {
         name: (at, min((at - last.age) / _SECOND, math.inf if date is None else date / _SECOND - last.wall))

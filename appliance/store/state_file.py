@@ -53,7 +53,6 @@ CREATE TABLE IF NOT EXISTS token_keys (
     id TEXT PRIMARY KEY, reading BLOB NOT NULL, verifying BLOB NOT NULL
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS token_left (id TEXT PRIMARY KEY, seconds REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS ends (
     kind TEXT NOT NULL, name TEXT NOT NULL, at INTEGER NOT NULL, since INTEGER NOT NULL, late INTEGER NOT NULL,
     date INTEGER, PRIMARY KEY (kind, name)
@@ -351,10 +350,6 @@ class StateStore:
 
     def ends(self) -> list[EndRow]:
         return [EndRow(*row) for row in self.database.query("SELECT * FROM ends")]
-
-    def forget_time_left(self) -> None:
-        """Empty the table of versions up to 0.3.0."""
-        self.database.delete("token_left", ("id", ">", ""))
 
     # --- settings ---
 

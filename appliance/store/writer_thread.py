@@ -393,10 +393,10 @@ class Database:
         history = kept[0] if kept and left.goes_on else self.history
         for _number, change in left.changes:
             self.tables.check(change)
-        if left.changes or left.statements:
-            number = left.changes[-1][0] if left.changes else number
+        if left.changes:
+            number = left.changes[-1][0]
             statements = [self.tables.statement(change) for _number, change in left.changes]
-            self._execute(left.statements + statements, history, number)
+            self._execute(statements, history, number)
         self._ahead.clear()
         return number
 

@@ -15,19 +15,22 @@ import contextlib
 import fcntl
 import os
 import socket
+import sqlite3
 import stat
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
 from appliance.features.table import members
+from appliance.store.ends import require_0_4
+from appliance.store.writer_thread import StoreError
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
 from appliance.supervisor.users import account_of
 
 ADMIN_SOCKET = "admin.sock"
 _LOCK = "lock"
-_RESTORED = Path("control", "state.db")  # identifies a restored backup, which has no lock file
+STORED = Path("control", "state.db")  # identifies a restored backup, which has no lock file
 _OF_THE_DISK = "lost+found"
 _SHOWN = 3
 
@@ -40,7 +43,7 @@ def foreign(path: Path) -> str | None:
     prepared = any(
         (path / name).is_file() for names in members("state_files", "STATE_FILES") for name in names
     )
-    if not found or _has_lock(path) or (path / _RESTORED).is_file() or prepared:
+    if not found or _has_lock(path) or (path / STORED).is_file() or prepared:
         return None
     more = " …" if len(found) > _SHOWN else ""
     return f"{path} is not the state directory of an appliance: it contains {', '.join(found[:_SHOWN])}{more}"
@@ -53,6 +56,28 @@ def _has_lock(path: Path) -> bool:
     except FileNotFoundError:
         return False
     return stat.S_ISREG(lock.st_mode) and lock.st_uid in {os.geteuid(), path.stat().st_uid}
+
+
+def made_before_0_4(path: Path) -> str | None:
+    """Return why this version cannot continue a state; None if it can, or none is stored. Raises `OSError`."""
+    if not (path / STORED).exists():
+        return None
+    try:
+        with contextlib.closing(read_only(path)) as database:
+            require_0_4(database.execute)
+    except sqlite3.Error as error:
+        raise OSError(f"{path / STORED}: {error}") from error
+    except StoreError as error:
+        return f"{path}: {error}"
+    return None
+
+
+def read_only(path: Path) -> sqlite3.Connection:
+    """Open what is stored in a state directory. If an appliance closed it, SQLite writes nothing there either."""
+    file = path.absolute() / STORED
+    log = file.with_name(f"{file.name}-wal")
+    still = "" if log.exists() and log.stat().st_size else "&immutable=1"
+    return sqlite3.connect(f"{file.as_uri()}?mode=ro{still}", uri=True)
 
 
 class StateDirectory:

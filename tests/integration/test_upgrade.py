@@ -1,13 +1,14 @@
-"""The appliance is upgraded in place: it starts on the state of each earlier version.
+"""The appliance is upgraded in place: it starts on the state of 0.4, and refuses that of earlier versions.
 
-Each `state-*.sql` has a publisher, a subscriber, a service and its client, a policy and a specification that an
-operator loaded, and three tokens, one of them revoked. The state of 0.3.0 has rows in every table of its version.
+`state-0.4.1.sql` has a publisher, a subscriber, a service and its client, a policy and a specification that an operator
+loaded, and three tokens, one of them revoked. It has rows in every table.
 """
 
 import hashlib
 import re
 import secrets
 import sqlite3
+import subprocess
 import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,8 +20,11 @@ import pytest
 from appliance.signing.request_signing import keys_of
 from tests.integration.conformance.fake_nodes import FakeNodes
 from tests.support.appliance import Appliance
+from tests.support.command import rosrv
+from tests.support.requirements import need_program
+from tests.support.sources import ROOT
 
-VERSIONS = ("0.2.0", "0.3.0")
+STATE = Path(__file__).with_name("state-0.4.1.sql")
 NODES = ("asker", "ears", "negator", "voice")
 NOBODY = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n[Services]\n[Clients]\n"
 
@@ -34,7 +38,6 @@ UNCHANGED = (
 
 
 class Upgraded(NamedTuple):
-    version: str
     before: dict[str, set[tuple[Any, ...]]]
     """The rows of each table."""
     appliance: Appliance
@@ -43,18 +46,14 @@ class Upgraded(NamedTuple):
     revoked: str
 
 
-def dump(version: str) -> str:
-    return Path(__file__).with_name(f"state-{version}.sql").read_text()
-
-
 def rows_of_tables(database: sqlite3.Connection) -> dict[str, set[tuple[Any, ...]]]:
     tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
     return {name: set(database.execute(f"SELECT * FROM {name}")) for (name,) in tables}  # noqa: S608  a table's name
 
 
-def old_state(version: str, directory: Path, nodes: FakeNodes) -> tuple[str, str]:
+def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
     directory.mkdir(parents=True)
-    sql = dump(version)
+    sql = STATE.read_text()
     for name in NODES:
         sql = re.sub(rf"('/{name}','127.0.0.1',)'http://[^']*'", rf"\g<1>'{nodes.uri(name)}'", sql)
     with closing(sqlite3.connect(directory / "state.db")) as database:
@@ -75,17 +74,17 @@ def make_secret(database: sqlite3.Connection, name: str) -> str:
     return text
 
 
-@pytest.fixture(scope="module", params=VERSIONS)
-def upgraded(request: pytest.FixtureRequest) -> Iterator[Upgraded]:
+@pytest.fixture(scope="module")
+def upgraded() -> Iterator[Upgraded]:
     with FakeNodes() as nodes:
         appliance = Appliance(options=("--api", "127.0.0.1:0"), relays=2)
         try:
             folder = appliance.state / "control"
-            token, revoked = old_state(request.param, folder, nodes)
+            token, revoked = old_state(folder, nodes)
             with closing(sqlite3.connect(folder / "state.db")) as database:
                 before = rows_of_tables(database)
             appliance.start()
-            yield Upgraded(request.param, before, appliance, nodes, token, revoked)
+            yield Upgraded(before, appliance, nodes, token, revoked)
         finally:
             appliance.close()
 
@@ -156,12 +155,13 @@ def test_rows_survive(upgraded: Upgraded) -> None:
         after = rows_of_tables(database)
     lost = {name: upgraded.before.get(name, set()) - after[name] for name in UNCHANGED}
     assert {name: rows for name, rows in lost.items() if rows} == {}
-    assert upgraded.version == "0.2.0" or all(upgraded.before.values()), "a table without a row tests nothing"
+    empty = {name for name, rows in upgraded.before.items() if not rows}
+    assert empty == {"token_left"}, (
+        "a table without a row tests nothing; this one was for versions before 0.4"
+    )
 
 
-@pytest.mark.parametrize("upgraded", ["0.3.0"], indirect=True)
 def test_doors_hosts_and_blocks_survive(upgraded: Upgraded) -> None:
-    """Version 0.2.0 had no doors and no blocks."""
     rest = upgraded.appliance.rest(upgraded.token)
     doors = rest.get("/v1/doors").json["doors"]
     assert {one["name"]: (one["address"], one["port"], one["source"], len(one["tickets"])) for one in doors} == {
@@ -175,3 +175,58 @@ def test_doors_hosts_and_blocks_survive(upgraded: Upgraded) -> None:
     assert hosts["robot3"]["token_by"] == "first"  # noqa: S105  a name
     [block] = rest.get("/v1/blocks").json["blocks"]
     assert (block["address"], block["note"], block["until"]) == ("10.9.9.9", "lost", None)
+
+
+@pytest.mark.parametrize("serves", [False, True])
+def test_a_state_of_0_3_is_refused_and_stays_as_it_is(tmp_path: Path, serves: bool) -> None:
+    """Also while the old version serves, which then goes on with it."""
+    folder = tmp_path / "control"
+    folder.mkdir()
+    (tmp_path / "policy.ini").write_text(NOBODY)
+    with closing(sqlite3.connect(folder / "state.db", isolation_level=None)) as old:
+        old.execute("PRAGMA journal_mode=WAL")
+        old.executescript(STATE.read_text())
+        old.executescript("DROP TABLE ends; DELETE FROM setting WHERE name = 'ends';")
+        old.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        if serves:
+            old.execute("INSERT INTO setting VALUES ('newer', '1')")
+        else:
+            old.close()
+        before = contents(tmp_path)
+        given = ("--policy", str(tmp_path / "policy.ini"), "--state", str(tmp_path), "--isolation", "none")
+        done = rosrv("up", *given)
+        assert (done.returncode, "install 0.4.1, start it once" in done.stderr) == (1, True)
+        (tmp_path / "appliance.yaml").write_text(f"state: {tmp_path}\npolicy: {tmp_path}/policy.ini\n")
+        done = rosrv("config", "check", str(tmp_path / "appliance.yaml"))
+        assert (done.returncode, "made by a version before 0.4" in done.stderr) == (1, True)
+        (tmp_path / "appliance.yaml").unlink()
+        assert contents(tmp_path) == before
+        if serves:
+            old.execute("UPDATE setting SET value = '2' WHERE name = 'newer'")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the content of each file, except SQLite's index in shared memory, which readers lock."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.endswith("-shm"))
+    return {str(path): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        ("upgrade 0.3.0", 1),
+        ("install 0.2.0", 1),
+        ("upgrade 0.4.0", 0),
+        ("upgrade 0.5.0~dev0", 0),
+        ("install", 0),
+    ],
+)
+def test_the_package_refuses_an_upgrade_from_below_0_4_before_it_is_unpacked(
+    arguments: str, status: int
+) -> None:
+    need_program("dpkg", "dpkg")
+    script = ROOT / "distribution" / "debian" / "rosrv.preinst"
+    done = subprocess.run(
+        ["sh", str(script), *arguments.split()], check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, "install 0.4.1 first, start it once" in done.stderr) == (status, bool(status))

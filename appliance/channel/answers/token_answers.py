@@ -42,10 +42,7 @@ class Tokens(msgspec.Struct, frozen=True):
     """All tokens that were made, oldest first."""
 
     tokens: Annotated[list[Token], doc("all tokens, including ended ones")]
-    uses_since: Annotated[
-        Moment | None,
-        doc("since when uses are known: the first start of a version that stores them, or null if unknown"),
-    ] = None
+    uses_since: Annotated[Moment, doc("since when uses are known: the first start with this state")]
 
 
 class NewToken(Token, frozen=True, kw_only=True):

@@ -208,6 +208,15 @@ def former_guard(name: str, file: str) -> str:
     )
 
 
+def former_guards(files: Mapping[str, str]) -> list[str]:
+    """Return what to do about each file with a guard of a release before 0.4, before an upgrade or after it."""
+    return [
+        f"{former_guard(file.removesuffix('.rv'), file)}; or, while 0.4 serves: rosrv guard upgrade"
+        for file, text in sorted(files.items())
+        if is_former(text)
+    ]
+
+
 def unknown_guard(name: str, guards: Collection[str]) -> str:
     known = f"the guards are: {', '.join(guards)}" if guards else "none is loaded: see rosrv guard suggest"
     return f"no guard is named {name[:80]}{meant(name, guards)}; {known}"

@@ -27,7 +27,7 @@ from appliance.specifications.checking import check
 from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
-from appliance.supervisor.state_directory import foreign
+from appliance.supervisor.state_directory import foreign, made_before_0_4
 
 _LITTLE_SPACE, _NO_SPACE = 1 << 30, 50 << 20
 _SOON_DAYS = 30
@@ -130,7 +130,7 @@ def _state(state: Path) -> Iterator[SelftestFinding]:
     if not stat.S_ISDIR(mode):
         yield fail("state", f"{state} is not a directory", "use another: --state DIR")
         return
-    if os.access(state, os.R_OK) and (reason := foreign(state)) is not None:
+    if os.access(state, os.R_OK) and (reason := foreign(state) or made_before_0_4(state)):
         yield fail("state", reason, "use another, empty or new: --state DIR")
         return
     if mode & 0o022:

@@ -76,7 +76,7 @@ class PromiseRequest:
 
 @dataclass(frozen=True)
 class ClaimPromise:
-    """The answer to a `PromiseRequest`, which it repeats. An earlier version leaves the last two fields out."""
+    """The answer to a `PromiseRequest`, which it repeats."""
 
     epoch: int
     session: str

@@ -63,8 +63,6 @@ class ReplicatedTokens:
                 self.blocked = [row[0] for row in connection.execute("SELECT address FROM host_block")]
                 left = replicated_ends(connection, TOKENS)
             self._rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
-            if left is None:  # the active appliance has version 0.3.0
-                left = {row.id: (0, row.expires - clock.wall()) for row in self._rows.values()}
             self._keep_ends(left)
             before, self._stated = self._stated, ([*map(self.usable_row, self._rows)], self.blocked)
             return before != self._stated

@@ -43,7 +43,7 @@ class SwitchoverWanted(msgspec.Struct, frozen=True, array_like=True, tag="switch
 
 
 class SwitchoverRefused(msgspec.Struct, frozen=True, array_like=True, tag="switchover refused"):
-    """The active appliance does not hand over. An earlier version ends the link at this message."""
+    """The active appliance does not hand over."""
 
     reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
 

@@ -110,7 +110,7 @@ class ReplicationReceiver:
             await link.send(introduction)
 
     async def _report_obstacle(self, link: ReplicationLink[FromActive]) -> None:
-        """Report a new obstacle. An earlier version ends the link at this message."""
+        """Report a new obstacle."""
         obstacle = self._obstacle()
         if obstacle != self._reported:
             self._reported = obstacle

@@ -130,11 +130,9 @@ def list_tokens(appliance: Appliance) -> None:
         say_row([f"{row.name:<24} {row.role:<12} {row.id}", f"created {moment(row.created)}", end, used])
 
 
-def _use(row: Token, since: float | None) -> str:
+def _use(row: Token, since: float) -> str:
     if row.last_used is not None:
         return f"last used {moment(row.last_used)}"
-    if since is None:
-        return "last use unknown"
     return "never used" if row.created >= since else f"not used since {moment(since)}"
 
 

@@ -42,15 +42,9 @@ class Grants:
         self._count = 0
 
     def restore(self, rows: Iterable[PermissionRow]) -> None:
-        """Restore stored grants, but erase those of an earlier version that were for all names of a host.
-
-        The clients of erased grants look up the service again.
-        """
+        """Restore stored grants."""
         for row in rows:
-            if row.caller_id:
-                self._add(row)
-            else:
-                self._mark(row)
+            self._add(row)
 
     def all(self) -> list[PermissionRow]:
         return [row for rows in self._of_node.values() for row in rows]

@@ -5,7 +5,9 @@ import jsonschema_rs
 import pytest
 import yaml
 
+from appliance.store.state_file import MonitorRevisionRow, StateStore
 from tests.support.command import rosrv
+from tests.support.engines import InlineDatabase
 
 
 def test_the_schema_accepts_only_known_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -13,3 +15,25 @@ def test_the_schema_accepts_only_known_keys(tmp_path: Path, monkeypatch: pytest.
     schema = jsonschema_rs.validator_for(json.loads(rosrv("config", "show", "--schema").stdout))
     assert schema.is_valid(yaml.safe_load(rosrv("config", "show").stdout))
     assert not schema.is_valid({"listn": "x"})
+
+
+def test_guards_of_before_0_4_are_named_in_the_folder_and_in_the_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "monitors").mkdir()
+    (tmp_path / "state" / "control").mkdir(parents=True)
+    former = "// preset sane 1: command=/cmd_vel geometry_msgs/Twist\n"
+    (tmp_path / "monitors" / "sane.rv").write_text(former)
+    (tmp_path / "monitors" / "other.rv").write_text("// a preset of ours\n")
+    store = StateStore(tmp_path / "state" / "control", failed=pytest.fail, kind=InlineDatabase)
+    sources = json.dumps({"files": {"cap.rv": former}})
+    store.save_monitor_revision(MonitorRevisionRow(1, sources, 0.0, "eve", ""))
+    (tmp_path / "appliance.yaml").write_text("monitors: monitors\nstate: state\n")
+    done = rosrv("config", "check")
+    store.close()
+    assert (done.returncode, done.stdout) == (0, "The configuration is valid.\n")
+    assert [line.split()[:3] for line in done.stderr.splitlines()] == [
+        ["rosrv:", "cap", "is"], ["rosrv:", "sane", "is"],
+    ]  # fmt: skip
+    assert done.stderr.count("while 0.4 serves: rosrv guard upgrade") == 2

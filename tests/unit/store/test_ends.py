@@ -17,7 +17,7 @@ from appliance.control.errors import TokenRefusedError
 from appliance.store import access_tokens
 from appliance.store.changes import Change
 from appliance.store.ends import EndKind, EndTable
-from appliance.store.state_file import SCHEMA, StateStore
+from appliance.store.state_file import SCHEMA, RevisionRow, StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.ends import Ending
 from tests.support.engines import InlineDatabase, KilledError
@@ -57,7 +57,7 @@ DATES = {
     " revoked_certificate.moment revocation.moment host_block.since door.added door.removed door_ticket.created"
     " authority.signed",
     "monotonic seconds, for the order": "incarnation.changed",
-    "a length": "enrolment_token.days token_left.seconds",
+    "a length": "enrolment_token.days",
 }
 
 
@@ -411,3 +411,14 @@ async def test_the_clocks_are_noted_more_often_in_a_pair(site: Site, paired: boo
     for _ in range(12):
         site.run(5.0)
     assert site.store.database.number - before == notes
+
+
+def test_the_state_of_a_version_before_0_4_is_refused(tmp_path: Path) -> None:
+    """Its rights would have no end in the table, so each of them would have ended."""
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
+    store.save_revision(RevisionRow(1, "", "", 0.0, "disk", ""))
+    with pytest.raises(
+        StoreError, match="before 0.4: install 0.4.1, start it once, then install this version"
+    ):
+        EndTable(store, AgeClock(tmp_path / "age"))
+    store.close()

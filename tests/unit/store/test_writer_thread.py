@@ -471,17 +471,6 @@ def test_a_large_value_that_is_lost_takes_no_later_change_with_it(tmp_path: Path
     assert names_after_start(tmp_path) == ["fifth", "second"]
 
 
-def test_statements_that_an_earlier_release_left_are_executed(tmp_path: Path) -> None:
-    Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand).close()
-    bodies = [
-        msgspec.msgpack.encode(("INSERT OR REPLACE INTO thing VALUES (?, ?), (?, ?)", ["a", 1, "b", 2])),
-        msgspec.msgpack.encode(("DELETE FROM thing WHERE name = ?", ["a"])),
-    ]
-    data = b"".join(len(body).to_bytes(4, "big") + body for body in bodies)
-    (tmp_path / "state.ahead").write_bytes(data + b"\x00\x00\x01\x00 torn")
-    assert names_after_start(tmp_path) == ["b"]
-
-
 def test_a_change_of_a_later_release_is_an_error_that_names_it(tmp_path: Path) -> None:
     body = msgspec.msgpack.encode(Put("future", [("a", 1)]))
     leave_behind(tmp_path / "state.ahead", Encoded(1, body))

@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 
 from appliance.base.atomic_files import name_to_make
+from appliance.store.state_file import RevisionRow, StateStore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
-from appliance.supervisor.state_directory import StateDirectory
+from appliance.supervisor.state_directory import StateDirectory, made_before_0_4
 from appliance.supervisor.users import account_of
+from tests.support.engines import InlineDatabase
 
 ROLES = (
     Role(name="control", user="rosrv", part="control"),
@@ -158,3 +160,21 @@ def test_a_start_that_was_killed_is_completed(tmp_path: Path) -> None:
     state.prepare(ROLES)
     assert (tmp_path / "control").stat().st_uid == account_of("rosrv").uid
     state.close()
+
+
+def test_a_state_has_the_mark_of_0_4_once_it_has_a_policy(tmp_path: Path) -> None:
+    """A start that was killed at once leaves no policy. The mark may be only in the log of SQLite."""
+    assert made_before_0_4(tmp_path) is None
+    (tmp_path / "control").mkdir()
+    store = StateStore(tmp_path / "control", failed=pytest.fail, kind=InlineDatabase)
+    assert made_before_0_4(tmp_path) is None
+    store.save_revision(RevisionRow(1, "", "", 0.0, "disk", ""))
+    assert str(made_before_0_4(tmp_path)).startswith(
+        f"{tmp_path}: the state was made by a version before 0.4"
+    )
+    store.save_setting("ends", "1")
+    assert made_before_0_4(tmp_path) is None
+    store.close()
+    (tmp_path / "control" / "state.db").write_bytes(b"no database" * 100)
+    with pytest.raises(OSError, match="not a database"):
+        made_before_0_4(tmp_path)
