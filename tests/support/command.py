@@ -45,7 +45,7 @@ def table(verbs: Verbs | None = None) -> Iterator[tuple[str, Verb]]:
     for name, one in (main.all_verbs() if verbs is None else verbs).items():
         if isinstance(one, Group):
             yield from ((f"{name} {inner}", verb) for inner, verb in table(one.verbs))
-        elif not one.now:
+        else:
             yield name, one
 
 
