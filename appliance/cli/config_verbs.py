@@ -34,7 +34,7 @@ _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
     """Report every error in the configuration file and the environment variables. Exit status: 0 valid, 1 errors.
 
-    A state directory that this version cannot continue is an error, too. Guards of releases before 0.4 are named.
+    A state directory that this version cannot continue is also an error. Guards of releases before 0.4 are named.
 
     Example: rosrv config check appliance.yaml
     """

@@ -141,7 +141,7 @@ def found() -> Page:
     tokens = Tokens([
         Token(name="ann", role="operator", id="1", created=0.0, expires=1.0, revoked=None),
         Token(name="root", role="admin", id="2", created=0.0, expires=1.0, revoked=None),
-    ])  # fmt: skip
+    ], uses_since=0.0)  # fmt: skip
     in_force = PolicyInForce(
         revision=2, text=POLICY, file="robot.ini", policy_file="robot.ini", differs_from_file=False, warnings=[],
         confirm_by=None, site_keys=[], robot=["10.0.0.2/32"], hosts={"tablet": "10.77.0.5"}, loaded=0.0, who="eve",
