@@ -13,7 +13,6 @@ import yaml
 
 from appliance.configuration.config_sources import ConfigError, Mistake, json_schema, plain, resolve
 from appliance.configuration.settings import Settings
-from appliance.features.table import members
 from appliance.supervisor.state_directory import STORED, made_before_0_4, read_only
 from rosmop.tool.terminal import printable
 
@@ -63,9 +62,11 @@ def _check_state(settings: Settings) -> None:
         typer.echo(
             f"rosrv: the stored state is not checked: {printable(str(error))}; run this as root", err=True
         )
-    for former_guards in members("presets", "former_guards"):
-        for line in former_guards(files):
-            typer.echo(f"rosrv: {printable(line)}", err=True)
+    for file in sorted(file for file, text in files.items() if text.startswith("// preset ")):
+        text = (
+            "a guard of a release before 0.4, here only a monitor: while 0.4 serves, run rosrv guard upgrade"
+        )
+        typer.echo(f"rosrv: {printable(file)}: {text}", err=True)
 
 
 def _stored_files(state: Path) -> dict[str, str]:

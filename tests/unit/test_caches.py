@@ -35,7 +35,6 @@ FAILURES = {
     "appliance/configuration/config_sources.py::_reader": OURS,
     "appliance/configuration/inventory.py::inventory": OURS,
     "appliance/features/doors/rosbridge_frames.py::_publish_head": NEVER,
-    "appliance/features/guards/released.py::versions_of": OURS,
     "appliance/features/guards/released.py::origin_of": OURS,
     "appliance/features/standby/witness/protocol.py::tag_of": NEVER,
     "appliance/features/views.py::pair_view": OURS,

@@ -42,8 +42,9 @@ def afresh_in_words(row: GuardRow) -> str:
     now = row.state if row.state in ("shadow", "off") else "on"
     if row.afresh == now:
         return ""
-    command = {"on": f"enable {name}", "shadow": f"enable {name} --shadow", "off": f"disable {name}"}[now]
-    write = f"rosrv monitor {command}, on the appliance's machine, writes it there"
+    switch = {"on": f"enable {name}", "shadow": f"enable {name} --shadow", "off": f"disable {name}"}[now]
+    command = f"monitor {switch}"
+    write = f"rosrv {command}, on the appliance's machine, writes it there"
     if row.afresh == "absent":
         return f"it is only in the state directory, not in the folder of specifications: {write}"
     then = {"on": "in force", "shadow": "in shadow mode", "off": "disabled"}[row.afresh]

@@ -203,18 +203,9 @@ def is_former(text: str) -> bool:
 
 def former_guard(name: str, file: str) -> str:
     return (
-        f"{name} is a guard of a release before 0.4: it stays in force as a monitor, which rosrv guard does not"
-        f" change: make a guard in its place: rosrv guard new, with another --name; then rosrv monitor remove {file}"
+        f"{name} is a guard of a release before 0.4: it stays in force as a monitor, which no verb of guards changes;"
+        f" make a guard of another --name in its place (rosrv guard new), then remove it (rosrv monitor remove {file})"
     )
-
-
-def former_guards(files: Mapping[str, str]) -> list[str]:
-    """Return what to do about each file with a guard of a release before 0.4, before an upgrade or after it."""
-    return [
-        f"{former_guard(file.removesuffix('.rv'), file)}; or, while 0.4 serves: rosrv guard upgrade"
-        for file, text in sorted(files.items())
-        if is_former(text)
-    ]
 
 
 def unknown_guard(name: str, guards: Collection[str]) -> str:

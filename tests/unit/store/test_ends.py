@@ -417,8 +417,6 @@ def test_the_state_of_a_version_before_0_4_is_refused(tmp_path: Path) -> None:
     """Its rights would have no end in the table, so each of them would have ended."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     store.save_revision(RevisionRow(1, "", "", 0.0, "disk", ""))
-    with pytest.raises(
-        StoreError, match=r"before 0\.4: install 0\.4\.1, start it once"
-    ):
+    with pytest.raises(StoreError, match=r"before 0\.4: install 0\.4\.1, start it once"):
         EndTable(store, AgeClock(tmp_path / "age"))
     store.close()

@@ -308,7 +308,7 @@ async def test_a_guard_of_before_0_4_stays_in_force_as_a_monitor_that_is_named(t
         [trouble] = GUARDS_VIEW.states[0].alarms(state)
         assert (trouble.severity, trouble.kind, trouble.text) == ("warning", "guard-older:sane", why)
         with pytest.raises(
-            UnknownThingError, match="rosrv guard new, with another --name; then rosrv monitor"
+            UnknownThingError, match=r"rosrv guard new\), then remove it \(rosrv monitor remove sane.rv"
         ):
             await orders.upgrade(guard_requests.GuardUpgrade("sane"), "eve")
         types = {"command": "geometry_msgs/Twist"}
