@@ -152,7 +152,7 @@ class ParkedRobot(FleetRobot):
         with (self.folder / "agent.log").open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _AGENT, str(theirs.fileno()), str(config), str(self.ahead)],
-                cwd=self.folder / "state", env={"PYTHONPATH": f"{ROOT}:{ROOT / 'fleet'}"},
+                cwd=self.folder / "state", env={"PYTHONPATH": f"{ROOT}:{ROOT / 'fleet/src'}"},
                 pass_fds=[theirs.fileno()], stdout=log, stderr=log,
             )  # fmt: skip
         theirs.close()

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 _FILE, _OLD, _NEW = json.loads(os.environ["CHANGED"])
-_NAME = _FILE.removeprefix("fleet/").removesuffix(".py").replace("/", ".")
+_NAME = _FILE.removeprefix("fleet/src/").removesuffix(".py").replace("/", ".")
 _SPEC = importlib.util.find_spec(_NAME)
 assert _SPEC is not None
 assert _SPEC.origin is not None

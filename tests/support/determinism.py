@@ -29,7 +29,7 @@ _FORBIDDEN = {
     "socket.__new__": "makes a socket",
 }
 _CLOCKS = ("clock_gettime", "clock_gettime_ns", "monotonic", "monotonic_ns", "time", "time_ns")
-_OURS = ("appliance", "rosmop", "roswire", "rosrv_fleet", "tests", "lab.")
+_OURS = ("appliance", "rosmop", "roswire", "rosrv_fleet", "fleet", "tests", "lab.")
 
 
 class ChanceError(RuntimeError):

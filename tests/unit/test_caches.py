@@ -14,7 +14,7 @@ from distribution.fact_cache import facts_of_files
 from tests.support.rows import require_rows
 from tests.support.sources import LANGUAGE_TESTS, ROOT
 
-FOLDERS = ("appliance", "roswire", "rosmop", "fleet/rosrv_fleet")
+FOLDERS = ("appliance", "roswire", "rosmop", "fleet/src/rosrv_fleet")
 CACHES = {"cache", "lru_cache", "functools.cache", "functools.lru_cache"}
 NEVER = "cannot fail"
 KEPT = "a failure is a result, and kept"
@@ -167,11 +167,11 @@ BY_HAND = {
     "appliance/rpc/fair_queue.py::_taken_as": OPEN,
     "appliance/specifications/episodes.py::_going": TEXT,  # monitors and topics in force
     "appliance/specifications/episodes.py::_known": "len(self._known) < _MOST else",
-    "fleet/rosrv_fleet/bundles/keys.py::_signers": OURS_ONLY,
-    "fleet/rosrv_fleet/connections.py::_owners": OPEN,
-    "fleet/rosrv_fleet/indexer.py::_killed": OURS_ONLY,
-    "fleet/rosrv_fleet/search.py::_running": OPEN,
-    "fleet/rosrv_fleet/segment_store.py::_locks": LOCKS,
+    "fleet/src/rosrv_fleet/bundles/keys.py::_signers": OURS_ONLY,
+    "fleet/src/rosrv_fleet/connections.py::_owners": OPEN,
+    "fleet/src/rosrv_fleet/indexer.py::_killed": OURS_ONLY,
+    "fleet/src/rosrv_fleet/search.py::_running": OPEN,
+    "fleet/src/rosrv_fleet/segment_store.py::_locks": LOCKS,
     "rosmop/logics/buchi.py::_after": TEXT,
     "rosmop/logics/buchi.py::_chosen": TEXT,
     "rosmop/logics/buchi.py::_moves": TEXT,

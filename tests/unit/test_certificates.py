@@ -45,7 +45,7 @@ for path in sorted((ROOT / "tests/unit/features").glob("*/certificates.py")):
 def test_every_maker_of_certificates_has_its_row() -> None:
     makers = {
         str(path.relative_to(ROOT))
-        for folder in ("appliance", "fleet/rosrv_fleet")
+        for folder in ("appliance", "fleet/src/rosrv_fleet")
         for path in (ROOT / folder).rglob("*.py")
         if _MAKES.search(path.read_text(encoding="utf-8"))
     }

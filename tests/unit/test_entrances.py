@@ -68,22 +68,22 @@ def test_every_process_is_the_row_of_an_entrance() -> None:
 
 
 def test_every_file_that_listens_is_the_row_of_an_entrance() -> None:
-    found = files(_LISTENS, "appliance", "roswire", "fleet/rosrv_fleet")
+    found = files(_LISTENS, "appliance", "roswire", "fleet/src/rosrv_fleet")
     assert found == entrances.LISTENERS.keys()
 
 
 def test_every_secret_is_the_row_of_an_entrance() -> None:
-    assert files(_SECRET, "appliance", "fleet/rosrv_fleet") == entrances.SECRETS.keys()
+    assert files(_SECRET, "appliance", "fleet/src/rosrv_fleet") == entrances.SECRETS.keys()
 
 
 def test_shown_secrets_are_compared_in_one_module() -> None:
     """All other comparisons have their reason here."""
-    assert files(_COMPARED, "appliance", "fleet/rosrv_fleet") == {
+    assert files(_COMPARED, "appliance", "fleet/src/rosrv_fleet") == {
         "appliance/signing/bearer_secrets.py",
         "appliance/store/access_tokens.py",  # a salted, slow hash, for tokens without keys
         "appliance/control/rest/rest_proof.py",  # the code of a challenge, which is not stored
         "appliance/features/standby/witness/protocol.py",  # the code of a datagram
-        "fleet/rosrv_fleet/tokens.py",  # the hash in hexadecimal, in a file
+        "fleet/src/rosrv_fleet/tokens.py",  # the hash in hexadecimal, in a file
     }
 
 
@@ -92,7 +92,7 @@ def test_every_path_without_a_token_is_the_row_of_an_entrance() -> None:
 
 
 def test_every_route_of_the_collector_is_known() -> None:
-    found = {one.removeprefix("fleet/rosrv_fleet/") for one in files(_ROUTES, "fleet/rosrv_fleet")}
+    found = {one.removeprefix("fleet/src/rosrv_fleet/") for one in files(_ROUTES, "fleet/src/rosrv_fleet")}
     assert found == {*entrances.COLLECTOR_ROUTES}
 
 

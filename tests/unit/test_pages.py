@@ -230,7 +230,7 @@ def test_commands_of_the_collector_on_pages_exist() -> None:
 
 
 def test_variables_that_the_product_names_exist() -> None:
-    folders = ("appliance", "fleet", "rosmop", "scripts")
+    folders = ("appliance", "fleet/src", "rosmop", "scripts")
     sources = [file for one in folders for kind in ("py", "sh") for file in (ROOT / one).rglob(f"*.{kind}")]
     compose = [*ROOT.glob("compose*.yaml"), *(ROOT / "fleet").glob("*.y*ml")]
     read = set(_VARIABLE.findall("".join(file.read_text() for file in (*sources, *compose))))

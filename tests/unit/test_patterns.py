@@ -63,10 +63,10 @@ LOCAL = {
     "rosmop/check/": "a process of the compiler, whose processor time is limited (`DRY_RUNS`)",
     "rosmop/learn/": "a process of the operator",
     "rosmop/text/": "a process of the compiler, whose processor time is limited (`DRY_RUNS`)",
-    "fleet/rosrv_fleet/bundles/commands.py": "a process of the operator",
-    "fleet/rosrv_fleet/bundles/keys.py": "names of files in a folder of the operator",
-    "fleet/rosrv_fleet/bundles/publication.py": "names of files in a folder of the operator",
-    "fleet/rosrv_fleet/bundles/repository.py": "names of files in a folder of the operator",
+    "fleet/src/rosrv_fleet/bundles/commands.py": "a process of the operator",
+    "fleet/src/rosrv_fleet/bundles/keys.py": "names of files in a folder of the operator",
+    "fleet/src/rosrv_fleet/bundles/publication.py": "names of files in a folder of the operator",
+    "fleet/src/rosrv_fleet/bundles/repository.py": "names of files in a folder of the operator",
 }
 """Code whose patterns delay only the process that runs it."""
 
@@ -82,7 +82,7 @@ class Pattern(NamedTuple):
 
 
 def files() -> Iterator[Path]:
-    for folder in ("appliance", "rosmop", "roswire", "fleet/rosrv_fleet"):
+    for folder in ("appliance", "rosmop", "roswire", "fleet/src/rosrv_fleet"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             local = str(path.relative_to(ROOT)).startswith(tuple(LOCAL))
             if not (local or path.is_relative_to(LANGUAGE_TESTS)):
@@ -94,7 +94,7 @@ def patterns_of(path: Path) -> Iterator[Pattern]:
     if "re." not in text and "pattern=" not in text:
         return
     tree = ast.parse(text)
-    module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("fleet.")
+    module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("fleet.src.")
     within = nodes(tree)
     used = _methods(within)
     for name, pattern, flags in _constants(tree, _calls(within, "re"), module):

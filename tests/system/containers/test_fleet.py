@@ -184,7 +184,7 @@ def _prepared(folder: Path, lab: Lab, engine: Engine) -> Walk:
         "docker": DOCKER.format(docker=shutil.which("docker")), "ssh": SSH.format(robots=folder / "robots"),
         "scp": '#!/bin/sh\n[ "$*" = "root@arm1:incident.zip ." ]\n',  # `ssh` has written the file here
         "systemctl": '#!/bin/sh\n[ "$*" = "restart rosrv" ]\n',
-        "rosrv-fleet": f'#!/bin/sh\nPYTHONPATH={ROOT}/fleet exec {sys.executable} -m rosrv_fleet "$@"\n',
+        "rosrv-fleet": f'#!/bin/sh\nPYTHONPATH={ROOT}/fleet/src exec {sys.executable} -m rosrv_fleet "$@"\n',
     }  # fmt: skip
     (folder / "bin").mkdir()
     for name, text in programs.items():

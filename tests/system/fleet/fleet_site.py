@@ -63,7 +63,7 @@ class FleetSite:
         return [sys.executable, "-m", "rosrv_fleet", *arguments, "--config", str(self.folder / "fleet.yaml")]
 
     def run(self, *arguments: str, status: int = 0) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
+        environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet" / "src")}
         done = subprocess.run(
             self.command(*arguments), capture_output=True, text=True, check=False, env=environment
         )
@@ -71,7 +71,7 @@ class FleetSite:
         return done
 
     def start(self) -> None:
-        environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
+        environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet" / "src")}
         with (self.folder / "log").open("ab") as log:
             self._process = self.popen(self.command("serve"), stderr=log, env=environment)
         eventually(

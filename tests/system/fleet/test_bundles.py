@@ -42,7 +42,7 @@ class Operator:
     def run(self, *arguments: str, status: int = 0) -> str:
         done = subprocess.run(
             [sys.executable, "-m", "rosrv_fleet", *arguments], capture_output=True, text=True, check=False,
-            env=os.environ | {"PYTHONPATH": str(ROOT / "fleet")},
+            env=os.environ | {"PYTHONPATH": str(ROOT / "fleet" / "src")},
         )  # fmt: skip
         assert done.returncode == status, f"{arguments}: {done.returncode}\n{done.stdout}\n{done.stderr}"
         return done.stdout + done.stderr

@@ -333,7 +333,7 @@ def _fingerprint(pem: str) -> str:
 
 def test_the_health_check_asks_this_collector_only(inviting: FleetSite, tmp_path: Path) -> None:
     environment = {
-        "PYTHONPATH": str(ROOT / "fleet"),
+        "PYTHONPATH": str(ROOT / "fleet" / "src"),
         "ROSRV_FLEET_CONFIG": str(inviting.folder / "fleet.yaml"),
     }
 

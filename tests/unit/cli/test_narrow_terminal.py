@@ -100,7 +100,7 @@ def test_all_columns_are_written_by_these_functions() -> None:
     """A line with aligned parts is a row: `say_row` or `say_table` writes it, so it keeps the rule above."""
     found = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
-        for folder in ("appliance", "rosmop", "fleet/rosrv_fleet")
+        for folder in ("appliance", "rosmop", "fleet/src/rosrv_fleet")
         for path in (ROOT / folder).rglob("*.py")
         if "<" in (text := path.read_text(encoding="utf-8")) and "say" in text
         for node in ast.walk(ast.parse(text))

@@ -252,7 +252,7 @@ def test_a_kill_between_the_record_and_the_change(data: Path, tmp_path: Path) ->
     killed += "robots.write_whole = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
     done = subprocess.run(
         [sys.executable, "-c", f"{killed}cli.app({words!r})"],
-        cwd=ROOT / "fleet",
+        cwd=ROOT / "fleet" / "src",
         capture_output=True,
         check=False,
     )

@@ -13,7 +13,7 @@ SHIPPED = set(re.findall(r'"appliance/(\w+)"', (ROOT / "fleet/pyproject.toml").r
 def test_the_collector_imports_only_what_is_shipped_with_it() -> None:
     program = "import rosrv_fleet.cli, sys; print(*sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT / "fleet"
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT / "fleet" / "src"
     )
     loaded = {name.split(".")[1] for name in done.stdout.split() if name.startswith("appliance.")}
     assert loaded <= SHIPPED
