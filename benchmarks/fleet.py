@@ -35,9 +35,9 @@ from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
 from appliance.formats.terms import Ring
 from benchmarks.fleet_robots import BAD, SimulatedLoad, SimulatedRobots, enrol
 from benchmarks.fleet_rows import fill, searches
-from tests.support.bundle_site import GROUP, PASSPHRASE, SITE, bundle_files, everywhere
-from tests.system.fleet.fleet_site import FleetSite
-from tests.system.fleet.postgres import PostgresCluster, postgres
+from fleet.tests.support.bundle_site import GROUP, PASSPHRASE, SITE, bundle_files, everywhere
+from fleet.tests.support.fleet_site import FleetSite
+from fleet.tests.support.postgres import PostgresCluster, postgres
 
 _PAUSE = threading.Event()  # never set
 _LONGEST_SECONDS = 600.0

@@ -33,9 +33,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from benchmarks.fleet import _family, _ticks
 from benchmarks.parked_robots import ParkedRobot
+from fleet.tests.support.fleet_site import FleetSite
+from fleet.tests.support.postgres import PostgresCluster, postgres
 from tests.support.alert_rules import Alert, FleetAlerts
-from tests.system.fleet.fleet_site import FleetSite
-from tests.system.fleet.postgres import PostgresCluster, postgres
 
 _SCRAPE_SECONDS = 15.0
 _PLANTED_SECONDS = 1500.0

@@ -22,8 +22,8 @@ from appliance.features.fleet.poller import Poller
 from appliance.features.fleet.process import PollLoop
 from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.bundle_api import EVENTS
-from tests.support.bundle_site import GROUP, SITE
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
+from fleet.tests.support.bundle_site import GROUP, SITE
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 
 BAD = "# refused by the gate\n"
 """Simulated appliances refuse a bundle whose policy contains this text."""

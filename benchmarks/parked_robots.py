@@ -18,9 +18,9 @@ from appliance.channel.messages import ForwardingReported, LinkOpened, Stop
 from appliance.configuration.config_sources import resolve
 from appliance.ipsec.removals import RemovalRefusedError, RetentionLimits
 from appliance.signing.own_certificate import make_own_certificate
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 from tests.support.audit import decision
 from tests.support.sources import ROOT
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 from tests.unit.audit.conftest import Notary
 
 _KEPT_DAYS = 0.01  # a quarter of an hour: the night has many removals

@@ -22,7 +22,19 @@ def test_a_missing_rule_is_seen(change: dict[str, str]) -> None:
     tests = [f"tests/{one}" for one in CELLS[change["entrance"]][change["rule"]].split()]
     changed = json.dumps([change["file"], change["old"], change["new"]])
     ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "tests.support.changed_module", *tests],
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-c",
+            "pyproject.toml",
+            "-q",
+            "-n",
+            "0",
+            "-p",
+            "tests.support.changed_module",
+            *tests,
+        ],
         cwd=ROOT,
         env=os.environ | {"CHANGED": changed},
         capture_output=True,

@@ -1,4 +1,5 @@
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -44,6 +45,11 @@ def test_the_command_runs_without_a_checkout(program: Path, tmp_path: Path) -> N
         "https://10.0.0.9:8444"
         in run(program, tmp_path, "robot", "invite", "arm7", "--config", "fleet.yaml").stdout
     )
+
+
+def test_its_gate_needs_its_own_requirements_only() -> None:
+    needs(shutil.which("make"), "make")
+    subprocess.run(["make", "--directory", ROOT / "fleet", "--always-make", "test"], check=True)
 
 
 def test_it_has_the_version_of_the_appliance(program: Path) -> None:

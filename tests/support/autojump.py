@@ -15,7 +15,10 @@ from contextvars import Context
 from types import CoroutineType
 from typing import TYPE_CHECKING, Any, Never, TypeVar, TypeVarTuple
 
+import pytest
+
 from appliance.base import clock
+from tests.support.determinism import may_depend_on_chance
 from tests.support.virtual_clock import VirtualClock
 
 _Result = TypeVar("_Result")
@@ -178,3 +181,13 @@ def autojump(
 def run(main: Coroutine[Any, Any, _Result], *, most_jumps: int = _MOST_JUMPS) -> _Result:
     with autojump(most_jumps=most_jumps) as new_loop, asyncio.Runner(loop_factory=new_loop) as runner:
         return runner.run(main)
+
+
+@pytest.fixture
+def anyio_backend(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]]]:
+    if may_depend_on_chance(request.node):
+        yield "asyncio", {}
+    else:
+        local = not {"sockets", "local_sockets"}.isdisjoint(request.fixturenames)
+        with autojump(kind=LocalLoop if local else AutojumpLoop) as new_loop:
+            yield "asyncio", {"loop_factory": new_loop}

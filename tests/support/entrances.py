@@ -164,13 +164,13 @@ CELLS: dict[str, dict[str, str]] = {
     },
     "collector": {
         "block": _COLLECTOR,
-        "end of a right": "unit/fleet/test_robots.py::test_a_damaged_file_delays_no_revocation",
-        "unknown": "unit/fleet/test_connections.py::test_unproven_addresses_leave_half_of_the_connections",
+        "end of a right": "../fleet/tests/unit/test_robots.py::test_a_damaged_file_delays_no_revocation",
+        "unknown": "../fleet/tests/unit/test_connections.py::test_unproven_addresses_leave_half_of_the_connections",
         "folding": "- it keeps no audit log of strangers; its acts are recorded one by one",
-        "share": "unit/fleet/test_connections.py::test_room_is_made_by_the_address_with_most"
-        " unit/fleet/test_connections.py::test_requests_without_a_token_have_a_share",
-        "binding": "unit/fleet/test_server_tls.py::test_certificates_that_a_robot_signed_count_for_no_robot",
-        "failure": "unit/fleet/test_join_routes.py::test_a_sender_of_wrong_tokens_waits_a_minute",
+        "share": "../fleet/tests/unit/test_connections.py::test_room_is_made_by_the_address_with_most"
+        " ../fleet/tests/unit/test_connections.py::test_requests_without_a_token_have_a_share",
+        "binding": "../fleet/tests/unit/test_server_tls.py::test_certificates_that_a_robot_signed_count_for_no_robot",
+        "failure": "../fleet/tests/unit/test_join_routes.py::test_a_sender_of_wrong_tokens_waits_a_minute",
     },
     "admin socket": {
         "block": "- it stays open, so that an operator can lift a block; only accounts of the machine reach it",

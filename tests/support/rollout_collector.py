@@ -18,7 +18,7 @@ from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.rollouts.store import RolloutStore
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from tests.support.fleet_certificates import FleetAuthority
+from fleet.tests.support.fleet_certificates import FleetAuthority
 
 T = TypeVar("T")
 

@@ -8,7 +8,7 @@ LANGUAGE_TESTS = ROOT / "rosmop" / "tests"
 
 
 def files_of_tests() -> Iterator[Path]:
-    for folder in (ROOT / "tests", LANGUAGE_TESTS, ROOT / "lab"):
+    for folder in (ROOT / "tests", LANGUAGE_TESTS, ROOT / "fleet" / "tests", ROOT / "lab"):
         yield from sorted(folder.rglob("*.py"))
 
 

@@ -1,23 +1,14 @@
 import itertools
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
-from tests.support.autojump import AutojumpLoop, LocalLoop, autojump
+from tests.support.autojump import anyio_backend
 from tests.support.determinism import may_depend_on_chance
 from tests.support.local_sockets import local_sockets as in_one_thread
 
-
-@pytest.fixture
-def anyio_backend(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]]]:
-    if may_depend_on_chance(request.node):
-        yield "asyncio", {}
-    else:
-        local = not {"sockets", "local_sockets"}.isdisjoint(request.fixturenames)
-        with autojump(kind=LocalLoop if local else AutojumpLoop) as new_loop:
-            yield "asyncio", {"loop_factory": new_loop}
+__all__ = ["anyio_backend"]  # a fixture
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -55,7 +55,9 @@ def texts(file: Path) -> Iterator[str]:
 def proposals() -> dict[str, str]:
     """Return the proposed commands, each with the name of a file that proposes it."""
     found: dict[str, str] = {}
-    files = [file for folder in ("appliance", "fleet/src", "rosmop") for file in (ROOT / folder).rglob("*.py")]
+    files = [
+        file for folder in ("appliance", "fleet/src", "rosmop") for file in (ROOT / folder).rglob("*.py")
+    ]
     files += ROOT.glob("appliance/**/console/**/*.js")
     product = [file for file in files if LANGUAGE_TESTS not in file.parents]
     code = (__file__, fact_cache.__file__)

@@ -20,7 +20,8 @@ from tests.unit import test_plain_english
 from tests.unit.test_plain_english import FOLDERS, bad_habits, said_in
 
 PRODUCT = ("appliance/", "rosmop/", "roswire/")
-WITH_FLEET = (*PRODUCT, "fleet/src/")
+FLEET = "fleet/src/"
+WITH_FLEET = (*PRODUCT, FLEET)
 LANGUAGE_TESTS = "rosmop/tests/"
 
 
@@ -237,7 +238,7 @@ RULES = {
         ["def close(self):\n    os.close(self._lock)\n    self._lock = -1"],
     ),
     "clocks": Rule(
-        ("appliance/", "fleet/src/rosrv_fleet/"), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
+        ("appliance/", FLEET), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
         ["time.monotonic_ns()", "datetime.datetime.now()", "from time import time", "date.today()"],
     ),
     "cancellations": Rule(

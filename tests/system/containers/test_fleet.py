@@ -22,6 +22,7 @@ import pytest
 import yaml
 
 from examples.landshark.lab import Host, Lab
+from fleet.tests.support.fleet_site import FleetRobot, push_joined
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.docker import Compose, Engine, build_fleet, project
@@ -29,7 +30,6 @@ from tests.support.processes import LIMIT
 from tests.support.rosmaster import master_at
 from tests.support.sources import ROOT
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, push_joined
 
 pytestmark = pytest.mark.timeout(2400)  # for the first test: the images are built, and twenty robots join
 

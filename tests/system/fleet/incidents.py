@@ -1,7 +1,7 @@
 import time
 from pathlib import Path
 
-from tests.system.fleet.fleet_site import FleetRobot
+from fleet.tests.support.fleet_site import FleetRobot
 from tests.unit.features.evidence.conftest import Control
 
 

@@ -9,13 +9,13 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.signatures import write_public_key
+from fleet.tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
+from fleet.tests.support.fleet_site import FleetSite
 from tests.support.appliance import Appliance
-from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
 from tests.support.certificates import make_certificates
 from tests.support.lying_collector import Visitor, lying_collector
 from tests.support.rosmaster import master_at
 from tests.support.waiting import allowed, eventually
-from tests.system.fleet.fleet_site import FleetSite
 
 PUSHER = (61023, 61014)  # its user, in the group that may read the log
 

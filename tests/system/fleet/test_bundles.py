@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from appliance.features.fleet.connection import CollectorError, robot_connection
+from fleet.tests.support.fleet_site import FleetSite
 from tests.support.appliance import Appliance
 from tests.support.certificates import make_certificates
 from tests.support.sources import ROOT
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetSite
 from tests.system.fleet.test_appliance import pushing
 
 BUNDLE = "site-a/arms/1.tar"

@@ -12,11 +12,11 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 from rosrv_fleet.enrolment import Robot
 
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 from tests.support.certificates import self_signed
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 from tests.system.fleet.incidents import incident
 from tests.system.fleet.test_bundles import BUNDLE, Operator, serve_bundles
 

@@ -12,9 +12,9 @@ import pytest
 from rosrv_fleet.access import COOKIE
 
 from appliance.formats import bundle_verifier
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 from tests.system.fleet.incidents import incident
 from tests.system.fleet.test_bundles import Operator
 from tests.unit.features.evidence.test_bundle import Members, members_of, written

@@ -23,10 +23,10 @@ from appliance.features.fleet.segment_pusher import SegmentPusher
 from appliance.features.fleet.settings import Fleet
 from appliance.formats.fleet_membership import JOIN_PATH
 from appliance.signing.own_certificate import make_own_certificate
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 from tests.support.command import rosrv
 from tests.support.sources import ROOT
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 
 MakeRobot = Callable[..., FleetRobot]
 USED = "the invitation is wrong, already used or expired"

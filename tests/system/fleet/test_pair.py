@@ -8,11 +8,11 @@ import pytest
 
 from appliance.audit.proof.copies import signed_checkpoints
 from examples.landshark.lab import Lab
+from fleet.tests.support.fleet_site import FleetSite
 from tests.support.features.standby.standby_site import StandbySite
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_program, need_root, needs
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetSite
 from tests.system.fleet.test_bundles import BUNDLE, Operator, serve_bundles
 
 COLLECTOR = "10.79.0.50"

@@ -20,11 +20,11 @@ from appliance.features.fleet.bundle_link import BundleHealth, BundleOffered, Bu
 from appliance.features.fleet.connection import robot_context
 from appliance.features.fleet.poller import Poller
 from appliance.formats.terms import BundlePath, Ring
-from tests.support.bundle_site import GROUP, SITE, bundle_files, everywhere
+from fleet.tests.support.bundle_site import GROUP, SITE, bundle_files, everywhere
+from fleet.tests.support.postgres import PostgresCluster
 from tests.support.processes import LIMIT
 from tests.support.rollout_collector import RolloutCollector, collector, serving
 from tests.support.waiting import NoAnswerError, eventually
-from tests.system.fleet.postgres import PostgresCluster
 from tests.unit.features.fleet.robot_site import RobotSite
 
 QUICK = {"healthy_seconds": 0, "share": 0.9}

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from fleet.tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files
 from tests.support.nodes import RosSession
 from tests.support.rosmaster import master_at
 from tests.support.waiting import eventually

@@ -44,10 +44,10 @@ from appliance.features.fleet.connection import CollectorConnection, CollectorEr
 from appliance.features.fleet.segment_pusher import SegmentPusher
 from appliance.ipsec.removals import RemovalRefusedError, RetentionLimits
 from appliance.signing.own_certificate import make_own_certificate
+from fleet.tests.support.collectors import InlineWorkers
 from tests.support.alert_rules import Alert, FleetAlerts
 from tests.support.audit import decision, settle
 from tests.support.autojump import run
-from tests.support.collectors import InlineWorkers
 from tests.support.engines import ByHand
 from tests.support.virtual_clock import ShiftedClock, VirtualClock
 from tests.unit.audit.conftest import Notary

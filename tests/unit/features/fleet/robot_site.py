@@ -4,7 +4,7 @@ from pathlib import Path
 
 from appliance.features.fleet.connection import CollectorConnection, robot_connection
 from appliance.features.fleet.verified_bundles import VerifiedBundles
-from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
+from fleet.tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
 
 
 class RobotSite(BundleSite):

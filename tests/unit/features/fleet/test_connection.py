@@ -17,10 +17,10 @@ from appliance.features.fleet.poller import Poller
 from appliance.features.fleet.segment_pusher import SegmentPusher
 from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.fleet_membership import Invitation
+from fleet.tests.support.bundle_site import GROUP, ROBOT, SITE
+from fleet.tests.support.fleet_certificates import FleetAuthority
 from tests.support.audit import decision
-from tests.support.bundle_site import GROUP, ROBOT, SITE
 from tests.support.command import rosrv
-from tests.support.fleet_certificates import FleetAuthority
 from tests.support.lying_collector import Lie, Visitor, lying_collector
 from tests.support.waiting import allowed, eventually
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path

@@ -11,7 +11,7 @@ from appliance.features.fleet.connection import CollectorError, robot_context
 from appliance.formats.fleet_membership import Invitation
 from appliance.signing.own_certificate import make_own_certificate
 from appliance.supervisor.users import Account
-from tests.support.enrolled_robots import JoiningAppliance
+from fleet.tests.support.enrolled_robots import JoiningAppliance
 from tests.support.virtual_clock import VirtualClock
 
 YEAR = 365 * 86_400.0

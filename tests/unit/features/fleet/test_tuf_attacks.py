@@ -22,7 +22,7 @@ from appliance.features.fleet.verified_bundles import (
 )
 from appliance.formats.bundle_archive import pack
 from appliance.formats.terms import BundlePath, Ring, custom_of
-from tests.support.bundle_site import GROUP, ROBOT, SITE, bundle_files, everywhere, give
+from fleet.tests.support.bundle_site import GROUP, ROBOT, SITE, bundle_files, everywhere, give
 from tests.support.waiting import allowed
 from tests.unit.features.fleet.robot_site import RobotSite
 

@@ -13,7 +13,7 @@ from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.formats.segments import RecordPlace, SegmentHeader, SegmentSummary
 from appliance.signing.log_proof import NO_CHECKPOINT, Checkpoint, genesis
-from tests.system.fleet.fleet_site import FleetRobot
+from fleet.tests.support.fleet_site import FleetRobot
 
 
 class _Placed(NamedTuple):

@@ -13,10 +13,10 @@ import pytest
 
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
 from appliance.formats.segments import SegmentSummary, write_segment
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 
 MakeRobot = Callable[..., FleetRobot]
 

@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from appliance.formats.receipts import SegmentReceipt
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 
 MakeRobot = Callable[..., FleetRobot]
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from appliance.base.atomic_files import write_whole
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 
 MakeRobot = Callable[..., FleetRobot]
 

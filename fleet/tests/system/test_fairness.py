@@ -16,11 +16,11 @@ from rosrv_fleet.collector import make_collector
 from rosrv_fleet.config import load_config
 
 from appliance.formats.segments import SegmentSummary
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
+from fleet.tests.support.forged_segments import forged
+from fleet.tests.system.test_attacks import put
 from tests.support.processes import runs
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
-from tests.system.fleet.forged_segments import forged
-from tests.system.fleet.test_attacks import put
 
 MakeRobot = Callable[..., FleetRobot]
 _ATTACKERS = 6

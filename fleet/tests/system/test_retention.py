@@ -20,11 +20,11 @@ from rosrv_fleet.database import IndexDatabase, migrate
 from rosrv_fleet.indexer import index, make_partition
 from rosrv_fleet.retention import drop_partitions
 
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
+from fleet.tests.support.postgres import PostgresCluster, postgres
+from fleet.tests.system.test_attacks import put, segment
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
-from tests.system.fleet.postgres import PostgresCluster, postgres
-from tests.system.fleet.test_attacks import put, segment
 
 MakeRobot = Callable[..., FleetRobot]
 _DAY = 86_400

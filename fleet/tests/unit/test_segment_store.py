@@ -4,7 +4,7 @@ import pytest
 from rosrv_fleet.segment_store import SegmentStore
 
 from appliance.base.clock import wall_ns
-from tests.support.collectors import upload
+from fleet.tests.support.collectors import upload
 from tests.support.virtual_clock import let_time_pass
 
 _LOG = "0" * 32

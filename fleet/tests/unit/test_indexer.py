@@ -8,8 +8,8 @@ from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
-from tests.support.collectors import InlineWorkers
-from tests.support.enrolled_robots import enrolled_robots
+from fleet.tests.support.collectors import InlineWorkers
+from fleet.tests.support.enrolled_robots import enrolled_robots
 
 _PLACE = SegmentPlace("arm1", "0" * 32, 1, "a" * 64)
 

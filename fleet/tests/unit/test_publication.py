@@ -6,7 +6,7 @@ from rosrv_fleet.bundles.publication import next_timestamp, read_publication
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
 from tuf.api.metadata import Metadata, Timestamp
 
-from tests.support.bundle_site import BundleSite
+from fleet.tests.support.bundle_site import BundleSite
 
 
 def test_a_timestamp_of_a_clock_that_was_ahead_is_replaced(tmp_path: Path) -> None:

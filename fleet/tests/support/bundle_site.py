@@ -17,7 +17,7 @@ from rosrv_fleet.bundles.publication import next_timestamp, read_publication
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
 
 from appliance.formats.terms import BundlePath, Ring, Terms
-from tests.support.fleet_certificates import FleetAuthority
+from fleet.tests.support.fleet_certificates import FleetAuthority
 
 PASSPHRASE = "a passphrase for tests"  # noqa: S105  of keys that a test makes
 SITE, GROUP, ROBOT = "site-a", "arms", "robot-1"

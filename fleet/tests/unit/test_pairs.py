@@ -5,7 +5,7 @@ from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.robots import Robots
 
 from appliance.signing.own_certificate import make_own_certificate
-from tests.support.enrolled_robots import JoiningAppliance
+from fleet.tests.support.enrolled_robots import JoiningAppliance
 
 
 def test_a_standby_joins_as_the_same_robot(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from rosrv_fleet.cli import app
 from rosrv_fleet.segment_store import SegmentStore
 from typer.testing import CliRunner, Result
 
-from tests.support.collectors import upload
-from tests.support.enrolled_robots import enrolled_robots
+from fleet.tests.support.collectors import upload
+from fleet.tests.support.enrolled_robots import enrolled_robots
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import httpx
 import psycopg
 import pytest
 
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
 from tests.support.processes import LIMIT
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 
 MakeRobot = Callable[..., FleetRobot]
 

@@ -10,8 +10,8 @@ from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import RobotSeen
 
 from appliance.base.clock import wall
-from tests.support.collectors import collector_in
-from tests.support.enrolled_robots import JoiningAppliance, enrolled_robots
+from fleet.tests.support.collectors import collector_in
+from fleet.tests.support.enrolled_robots import JoiningAppliance, enrolled_robots
 from tests.support.virtual_clock import let_time_pass, set_wall
 
 

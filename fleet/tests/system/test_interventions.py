@@ -2,7 +2,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 
 
 def test_the_robots_interventions_are_reported_from_the_collector(

@@ -23,8 +23,8 @@ from rosrv_fleet.rollouts.store import RolloutStore
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
-from tests.support.collectors import InlineWorkers
-from tests.support.enrolled_robots import enrolled_robots
+from fleet.tests.support.collectors import InlineWorkers
+from fleet.tests.support.enrolled_robots import enrolled_robots
 
 _DEFECT = "a defect of rosrv-fleet, please report it: RuntimeError: unforeseen"
 

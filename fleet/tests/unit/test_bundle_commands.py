@@ -8,8 +8,10 @@ from rosrv_fleet.bundles.publication import PublicationError, read_publication
 from typer.testing import CliRunner, Result
 
 from appliance.base.atomic_files import write_whole
-from tests.support.bundle_site import PASSPHRASE, POLICY
+from fleet.tests.support.bundle_site import PASSPHRASE, POLICY
 from tests.support.unreadable_folders import make_unreadable
+
+pytestmark = pytest.mark.signing  # `bundle add` checks with the code of the appliance
 
 
 class Desk:

@@ -29,9 +29,9 @@ from appliance.audit.log.signatures import write_public_key
 from appliance.base.atomic_files import write_whole
 from appliance.base.clock import now, using
 from appliance.signing.own_certificate import make_own_certificate
+from fleet.tests.support.collectors import collector_in
+from fleet.tests.support.enrolled_robots import enrolled_robots
 from tests.support.certificates import make_certificates, own_certificate_until
-from tests.support.collectors import collector_in
-from tests.support.enrolled_robots import enrolled_robots
 from tests.support.sources import ROOT
 from tests.support.unreadable_folders import make_unreadable
 from tests.support.virtual_clock import VirtualClock

@@ -13,9 +13,9 @@ import pytest
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
 from appliance.formats.receipts import SegmentReceipt
+from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
+from fleet.tests.support.postgres import PostgresCluster, postgres
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
-from tests.system.fleet.postgres import PostgresCluster, postgres
 
 _ROBOTS = 12
 _ROUNDS = 6

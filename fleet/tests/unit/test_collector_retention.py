@@ -12,8 +12,8 @@ from rosrv_fleet.retention import Pruner
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
 from appliance.base.clock import using, utc_now, wall
-from tests.support.collectors import collector_in, upload
-from tests.support.enrolled_robots import enrolled_robots
+from fleet.tests.support.collectors import collector_in, upload
+from fleet.tests.support.enrolled_robots import enrolled_robots
 from tests.support.virtual_clock import VirtualClock, let_time_pass, set_wall
 
 _DAY = 86_400
