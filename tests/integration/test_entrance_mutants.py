@@ -14,6 +14,11 @@ from tests.support.entrances import CELLS
 ROOT = Path(__file__).parents[2]
 _TABLE = tomllib.loads((ROOT / "tests" / "support" / "entrance_mutants.toml").read_text(encoding="utf-8"))
 
+_PYTEST = (
+    *(sys.executable, "-m", "pytest", "-c", "pyproject.toml", "--rootdir=.", "-qx", "-n", "0"),
+    *("-p", "tests.support.changed_module"),
+)
+
 
 @pytest.mark.parametrize(
     "change", _TABLE["without"], ids=lambda change: f"{change['entrance']}, {change['rule']}"
@@ -22,19 +27,7 @@ def test_a_missing_rule_is_seen(change: dict[str, str]) -> None:
     tests = [f"tests/{one}" for one in CELLS[change["entrance"]][change["rule"]].split()]
     changed = json.dumps([change["file"], change["old"], change["new"]])
     ran = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-c",
-            "pyproject.toml",
-            "-q",
-            "-n",
-            "0",
-            "-p",
-            "tests.support.changed_module",
-            *tests,
-        ],
+        [*_PYTEST, *tests],
         cwd=ROOT,
         env=os.environ | {"CHANGED": changed},
         capture_output=True,

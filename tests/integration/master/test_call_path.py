@@ -20,4 +20,4 @@ def test_the_path_of_a_call_is_the_one_on_the_page(tmp_path: Path) -> None:
     with own_loopback():
         done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
-    assert sorted(done.stdout.split()) == sorted(re.findall(r"`([\w/]+\.py)`", rows)), done.stdout
+    assert sorted(re.findall(r"^[\w/]+\.py$", done.stdout, re.MULTILINE)) == sorted(re.findall(r"`([\w/]+\.py)`", rows)), done.stdout
