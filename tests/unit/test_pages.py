@@ -76,17 +76,6 @@ def test_modules_that_are_named_are_there(page: str) -> None:
     assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
 
 
-def test_the_path_of_a_call_counts_its_files() -> None:
-    page = (ROOT / "docs/dev/architecture.md").read_text()
-    [path] = re.findall(r"^## The path of one registerPublisher\n(.*?)^`", page, re.DOTALL | re.MULTILINE)
-    steps_of_path = re.findall(r"^\|[^|]+\|(.*`.*)\| (\d+) \|$", path, re.MULTILINE)
-    files = [file for text, _number in steps_of_path for file in re.findall(r"`([^`]+)`", text)]
-    assert [int(number) for _text, number in steps_of_path] == [
-        text.count("`") // 2 for text, _ in steps_of_path
-    ]
-    assert re.findall(r"enters (\d+) files", path) == [str(len(files))] == [str(len(set(files)))]
-
-
 def test_the_sandbox_of_each_process_is_in_the_architecture() -> None:
     page = (ROOT / "docs/dev/architecture.md").read_text().split("\n## Sandbox", 1)[1]
     rows = re.findall(
