@@ -278,10 +278,12 @@ class Conversation:
     # --- as text ---
 
     def _stated(self, message: messages.Message) -> str:
-        for word, kind in messages.FACTS.items():
-            if isinstance(message, (kind.stated, kind.withdrawn)):
-                key, *rest = (getattr(message, name) for name in kind.fields)
-                return _fact(word, self._names[key], rest, stated=isinstance(message, kind.stated))
+        match message:
+            case messages.FactWithdrawn((word, key, *rest)):
+                return _fact(word, self._names[key], rest, stated=False)
+        if isinstance(message, messages.RelayFact):
+            word, key, *rest = messages.identity(message)
+            return _fact(word, self._names[key], rest, stated=True)
         return ""
 
     def _shown(self, seen: Seen) -> str:

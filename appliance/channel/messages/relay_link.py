@@ -126,7 +126,7 @@ RelayFact = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | Cl
 
 
 Fact = tuple[str, ...]
-"""What identifies a fact: its kind, the key of its incarnation, and the other fields that `_IDENTITIES` names."""
+"""The identity of a fact: its kind, the key of its incarnation, and the other fields that `_IDENTITIES` names."""
 
 _IDENTITIES: dict[type[RelayFact], tuple[str, ...]] = {
     NodePlaced: ("node", "key"),
