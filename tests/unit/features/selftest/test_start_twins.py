@@ -10,6 +10,7 @@ from appliance.configuration.settings import Settings
 from appliance.features.selftest import file_checks, machine_checks
 from appliance.network.namespaces import read_only_settings
 from appliance.supervisor.restore_mark import set_mark
+from appliance.supervisor.roles import ROS_PROGRAMS
 from distribution.fact_cache import functions, statements
 
 ROOT = Path(__file__).parents[4] / "appliance"
@@ -83,7 +84,7 @@ def test_a_setting_of_the_kernel_that_cannot_be_written_fails(
     assert all(name in found.text for name in missing)
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in machine_checks.ROS_PROGRAMS))
+@pytest.mark.parametrize("name", sorted(path.name for path in ROS_PROGRAMS))
 def test_a_program_without_which_nothing_starts_is_a_failure(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
