@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import importlib.util
 import logging
 import os
 import signal
@@ -13,10 +14,8 @@ import pytest
 import structlog
 
 from appliance.base import clock
-from appliance.network.namespaces import has_privileges
 from tests.support.determinism import WATCH, may_depend_on_chance
 from tests.support.long_files import LONG, is_left_out, waits
-from tests.support.own_namespace import own_loopback
 from tests.support.virtual_clock import VirtualClock
 
 _MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
@@ -48,11 +47,13 @@ def pytest_configure(config: pytest.Config) -> None:
     gc.set_threshold(700, 10, 100)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    if not hasattr(config, "workerinput") or not has_privileges():
+    # Not imported above: an environment for the collector alone has no namespaces, and its gate opens no sockets.
+    if not hasattr(config, "workerinput") or importlib.util.find_spec("pyroute2") is None:
         return
-    inside = contextlib.ExitStack()
-    inside.enter_context(own_loopback())
-    config.add_cleanup(inside.close)
+    if importlib.import_module("appliance.network.namespaces").has_privileges():
+        inside = contextlib.ExitStack()
+        inside.enter_context(importlib.import_module("tests.support.own_namespace").own_loopback())
+        config.add_cleanup(inside.close)
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
