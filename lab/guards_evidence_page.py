@@ -117,8 +117,8 @@ EVIDENCE: Mapping[str, Evidence] = {
         ("each button is a node that sends its state at least every `silent`",),
         ("the button's computer or cable, before `silent`", "a base that ignores a zero velocity"),
         unit=(
-            "test_an_emergency_stop_stays_until_a_reset",
-            "test_an_emergency_stop_is_sent_at_once_and_repeated",
+            "test_a_guard_does_what_its_page_says",
+            "test_after_a_reset_each_node_stands_before_it_moves",
         ),
     ),
     "arm": Evidence(

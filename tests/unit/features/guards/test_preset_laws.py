@@ -175,7 +175,7 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ("estop", "reset", "*", "out of range"): "every number but 0 is true",
     ("estop", "reset", "*", "old"): "a reset is an act, not a state; what it frees waits for a zero",
     ("estop", "reset", "*", "unreadable"): "what is no message resets nothing: the guard holds",
-    ("estop", "reset", "*", "another node"): "`test_two_hands_act_together_and_are_released_between`",
+    ("estop", "reset", "*", "another node"): "`two_hands` of `oracles.py`",
     ("estop", "reset", "*", "after a reset"): "`test_after_a_reset_each_node_stands_before_it_moves`",
 }
 """Why a cell is not judged here. `*` stands for any; the first key that fits counts."""

@@ -30,87 +30,6 @@ def button(on: bool) -> bytes:
     return message("std_msgs/Bool", data=on)
 
 
-class Buttons:
-    """The rules of the page, for buttons and hands of any number."""
-
-    def __init__(self, hands: bool, silent: int) -> None:
-        self.two_hands, self.silent = hands, silent
-        self.buttons: dict[str, tuple[bool, int]] = {}
-        self.hands: dict[str, tuple[bool, int]] = {}
-        self.latched, self.idle, self.heard = False, False, -math.inf
-        self.stood = list[str]()
-
-    def judge(self, at: int) -> None:
-        """Judge all buttons, as the guard does when it hears of one, and every 100 ms."""
-        fresh = all(
-            not on and (not self.silent or at - when <= self.silent) for on, when in self.buttons.values()
-        )
-        self.idle = bool(self.buttons) and fresh
-        if self.latched or not self.idle:
-            self.stood = []
-
-    def press(self, on: bool, at: int, node: str) -> None:
-        self.buttons[node] = (on, at)
-        if on:
-            self.latched, self.stood = True, []
-            self.hands = {each: (down, 0 if down else when) for each, (down, when) in self.hands.items()}
-        self.heard = at
-        self.judge(at)
-
-    def reset(self, on: bool, at: int, node: str) -> None:
-        self.judge(at)
-        was, when = self.hands.get(node, (True, 0))
-        if not on:
-            self.hands[node] = (False, at if was else when)
-        elif not was:
-            counts = self.latched and self.idle and when > 0 and at - when >= 100
-            others = [each for each, (down, since) in self.hands.items()
-                      if each != node and down and since and at - since <= 500]  # fmt: skip
-            self.hands[node] = (True, at if counts else 0)
-            if counts and (not self.two_hands or others):
-                self.latched = False
-                self.hands = {each: (down, 0 if down else when) for each, (down, when) in self.hands.items()}
-        else:
-            self.hands[node] = (True, when)
-
-    def passes(self, moves: bool, at: int, node: str) -> bool:
-        if self.latched or not self.idle or (self.silent and at - self.heard > self.silent):
-            return False
-        if not moves and node not in self.stood:
-            self.stood = [*self.stood, node][:2]
-        return not moves or node in self.stood
-
-
-@pytest.mark.parametrize("hands", [False, True])
-@pytest.mark.parametrize("silent", [0, 2000])
-def test_an_emergency_stop_stays_until_a_reset(hands: bool, silent: int) -> None:
-    random = seeded(7)
-    passed, traces = 0, range(examples(300))
-    for _trace in traces:
-        guard, at, rules = Guarded("estop", twoHands=hands, silent=silent / 1000), 0, Buttons(hands, silent)
-        for _message in range(40):
-            before, at = at, at + random.choice((1, 30, 99, 100, 400, 501))
-            for tick in range(before // 100 * 100 + 100, at + 1, 100):
-                rules.judge(tick)
-            given = random.choice(
-                ("stop", "stop", "reset", "reset", "reset", "command", "command", "command")
-            )
-            on = random.random() < (0.1 if given == "stop" else 0.5)
-            node = random.choice(("/a", "/b"))
-            if given == "stop":
-                guard.tell("stop", button(on), at, node)
-                rules.press(on, at, node)
-            elif given == "reset":
-                guard.tell("reset", button(on), at, node)
-                rules.reset(on, at, node)
-            else:
-                assert (guard.drive(GO if on else twist(), at, node)[0] == 0.5) == (
-                    rules.passes(on, at, node) and on
-                )
-                passed += guard.got[-1][1] == GO
-    assert passed > len(traces) / 10
-
-
 def go(guard: Guarded, at: int) -> None:
     """Release the button `/a`, and let the node `/a` stand."""
     guard.tell("stop", button(False), at)
@@ -121,20 +40,6 @@ def reset(guard: Guarded, at: int, node: str = "/a") -> None:
     for on, when in ((False, at), (True, at + 100)):
         guard.tell("stop", button(False), when)
         guard.tell("reset", button(on), when, node)
-
-
-def test_an_emergency_stop_is_sent_at_once_and_repeated() -> None:
-    guard = Guarded("estop")
-    go(guard, 1)
-    assert runs(guard, 1)
-    stops(guard)
-    guard.tell("stop", button(True), 5)
-    guard.advance(200)
-    assert stops(guard) == [5, 100, 200]
-    guard = Guarded("estop")
-    assert not runs(guard, 1)
-    go(guard, 2)
-    assert runs(guard, 1002) and not runs(guard, 1003)
 
 
 def test_after_a_reset_each_node_stands_before_it_moves() -> None:
@@ -195,35 +100,6 @@ def test_a_ninth_hand_resets_nothing_until_all_are_forgotten() -> None:
         guard.drive(twist(), at + 800)
         assert runs(guard, at + 810) == (place != 9)
         at += 1000
-
-
-@pytest.mark.parametrize(
-    ("acts", "freed"),
-    [
-        ([("/a", False, 0), ("/b", False, 0), ("/a", True, 200), ("/b", True, 700)], True),
-        ([("/a", False, 0), ("/b", False, 0), ("/a", True, 200), ("/b", True, 701)], False),
-        (
-            [("/a", True, 0), ("/b", False, 0), ("/b", True, 200), ("/b", False, 300), ("/b", True, 450)],
-            False,
-        ),
-        (
-            [("/a", False, 0), ("/b", False, 0), ("/a", True, 200), ("/a", False, 300), ("/b", True, 400)],
-            False,
-        ),
-        ([("/a", False, 0), ("/b", False, 0), ("/a", True, 1), ("/b", True, 1)], False),
-        ([("/a", False, 0), ("/a", True, 200), ("/a", False, 300), ("/a", True, 500)], False),
-    ],
-)
-def test_two_hands_act_together_and_are_released_between(
-    acts: list[tuple[str, bool, int]], freed: bool
-) -> None:
-    guard = Guarded("estop", twoHands=True, silent=0)
-    guard.tell("stop", button(True), 1)
-    guard.tell("stop", button(False), 10)
-    for node, on, at in acts:
-        guard.tell("reset", button(on), 1000 + at, node)
-    guard.drive(twist(), 2000)
-    assert runs(guard, 2001) == freed
 
 
 def scan(ranges: list[float]) -> bytes:
