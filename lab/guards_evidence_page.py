@@ -102,7 +102,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         ("a working sensor never repeats all its values",),
         ("wrong values that change", "measurements that come late, at their usual rate"),
         unit=(
-            "test_a_sensor_is_silent_frozen_or_blind",
+            "test_a_guard_does_what_its_page_says",
             "test_a_moving_base_is_stopped_when_its_sensor_falls_silent",
         ),
     ),
@@ -127,10 +127,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         "silent",
         ("the charge, the fix and the check are measured",),
         ("a battery that reports a wrong charge",),
-        unit=(
-            "test_an_interlock_needs_battery_position_and_check",
-            "test_a_base_in_motion_is_stopped_when_its_battery_is_empty",
-        ),
+        unit=("test_a_guard_does_what_its_page_says",),
     ),
     "answer": Evidence(
         ("no standard: a deadline of a goal",),
@@ -169,7 +166,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         "silent",
         ("the two sources have no common cause of an error",),
         ("both are wrong alike, as when one is calculated from the other",),
-        unit=("test_two_sources_agree_for_a_number_of_messages",),
+        unit=("test_a_guard_does_what_its_page_says",),
     ),
     "sane": Evidence(
         ("no standard: finite numbers",),
