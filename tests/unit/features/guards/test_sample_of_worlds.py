@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.world.closed_loop.worlds import WORLDS, replay, run_one
+from lab.closed_loop.worlds import WORLDS, replay, run_one
 
 SEEDS = {
     "deadman": (0, 3), "separation": (0, 14), "fence": (14,), "sensor": (7,), "estop": (4,), "agree": (2,),
