@@ -7,6 +7,7 @@ loaded, and three tokens, one of them revoked. It has rows in every table.
 import hashlib
 import re
 import secrets
+import shutil
 import sqlite3
 import subprocess
 import xmlrpc.client
@@ -21,7 +22,7 @@ from appliance.signing.request_signing import keys_of
 from tests.integration.conformance.fake_nodes import FakeNodes
 from tests.support.appliance import Appliance
 from tests.support.command import rosrv
-from tests.support.requirements import need_program
+from tests.support.requirements import needs
 from tests.support.sources import ROOT
 
 STATE = Path(__file__).with_name("state-0.4.1.sql")
@@ -224,7 +225,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_the_package_refuses_an_upgrade_from_below_0_4_before_it_is_unpacked(
     arguments: str, status: int
 ) -> None:
-    need_program("dpkg", "dpkg")
+    needs(shutil.which("dpkg") is not None, "dpkg, of Debian")
     script = ROOT / "distribution" / "debian" / "rosrv.preinst"
     done = subprocess.run(
         ["sh", str(script), *arguments.split()], check=False, capture_output=True, text=True

@@ -42,7 +42,9 @@ class Tokens(msgspec.Struct, frozen=True):
     """All tokens that were made, oldest first."""
 
     tokens: Annotated[list[Token], doc("all tokens, including ended ones")]
-    uses_since: Annotated[Moment, doc("since when uses are known: the first start with this state")]
+    uses_since: Annotated[
+        Moment, doc("since when uses are known (seconds since the epoch): this state's first start")
+    ]
 
 
 class NewToken(Token, frozen=True, kw_only=True):

@@ -8,7 +8,7 @@ from appliance.features.doors.door_rows import DoorTables, TicketRow
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker, new_ticket
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.store.state_file import StateStore
+from appliance.store.state_file import EndRow, StateStore
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
@@ -111,6 +111,7 @@ def test_a_ticket_of_an_earlier_version_opens_its_door(tmp_path: Path) -> None:
         )
         row = TicketRow("5c0f3d2b9a11", "alice", bytes.fromhex(digest), WALL, WALL + 60.0, "ann")
         DoorTables(store.database).save_ticket(row)
+        store.save_end(EndRow("door ticket", row.id, int((WALL + 60.0) * 1e9), int(WALL * 1e9), 0))
         assert DoorTickets(store, ends_of(store, tmp_path)).find("alice", f"5c0f3d2b9a11.{'A' * 43}") == row
 
 

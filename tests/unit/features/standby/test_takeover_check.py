@@ -43,6 +43,7 @@ class Standby:
         self.policy = home / "policy.ini"
         self.policy.write_text(OPEN_POLICY)
         self.store = StateStore(home / "control", failed=pytest.fail, kind=InlineDatabase)
+        self.store.save_setting("ends", "1")
         self.membership = memberships(home)[0]["b"]
         self.store.save_revision(self.revision(OPEN_POLICY))
 
@@ -119,6 +120,12 @@ async def test_a_standby_without_obstacles(standby: Standby) -> None:
     async with standby.checked() as checked:
         assert checked.check.obstacle == UNCHECKED
         assert await checked.next_obstacle() == ""
+
+
+async def test_the_state_of_an_active_appliance_before_0_4(standby: Standby) -> None:
+    standby.store.database.delete("setting", name="ends")
+    async with standby.checked() as checked:
+        assert "made by a version before 0.4: install 0.4.1" in await checked.next_obstacle()
 
 
 async def test_other_site_keys(standby: Standby) -> None:
