@@ -29,8 +29,7 @@ from typing import Any
 
 import httpx
 import psycopg
-from rosrv_fleet.bundles.keys import KeyFolder
-from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository, KeyFolder
 
 from appliance.formats.terms import Ring
 from benchmarks.fleet_robots import BAD, SimulatedLoad, SimulatedRobots, enrol

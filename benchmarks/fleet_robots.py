@@ -18,8 +18,7 @@ from rosrv_fleet.robots import Robots
 
 from appliance.features.fleet.bundle_link import BundleOffered, BundleStated, RefusedBundle
 from appliance.features.fleet.connection import robot_connection
-from appliance.features.fleet.poller import Poller
-from appliance.features.fleet.process import PollLoop
+from appliance.features.fleet.process import Poller, PollLoop
 from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.bundle_api import EVENTS
 from fleet.tests.support.bundle_site import GROUP, SITE

@@ -16,7 +16,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.messages import ForwardingReported, LinkOpened, Stop
 from appliance.configuration.config_sources import resolve
-from appliance.ipsec.removals import RemovalRefusedError, RetentionLimits
+from appliance.ipsec.signer import RemovalRefusedError, RetentionLimits
 from appliance.signing.own_certificate import make_own_certificate
 from fleet.tests.support.fleet_site import FleetRobot, FleetSite
 from tests.support.audit import decision

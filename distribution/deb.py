@@ -18,11 +18,10 @@ from appliance import __version__
 from appliance.configuration.inventory import RUNS
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution import extension
-from distribution.checkout import ROOT, facts, revision, time_of_commit
+from distribution.checkout import ROOT, BuildError, facts, revision, run, time_of_commit
 from distribution.environment import ARCHITECTURES, INTERPRETERS, Architecture, make_environment
 from distribution.extension import IN_PLACE, ExtensionError
 from distribution.man import write_pages
-from distribution.programs import BuildError, run
 
 HERE = ROOT / "distribution"
 VERSION = __version__.replace(".dev", "~dev")  # dpkg sorts 0.3.0~dev0 before 0.3.0

@@ -15,8 +15,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from distribution.checkout import ROOT
-from distribution.programs import BuildError, run
+from distribution.checkout import ROOT, BuildError, run
 
 UV = ROOT / ".venv/bin/uv"
 PIP = ROOT / ".venv/bin/pip"

@@ -22,8 +22,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance import __version__
-from distribution.checkout import ROOT, revision, time_of_commit
-from distribution.programs import BuildError
+from distribution.checkout import ROOT, BuildError, revision, time_of_commit
 
 _OWN = ("provenance.json", "SHA256SUMS", "SHA256SUMS.sig")
 _MATERIALS = (

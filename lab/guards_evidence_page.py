@@ -12,7 +12,7 @@ from pathlib import Path
 
 from appliance.features.guards.evidence import text_digest
 from appliance.features.guards.presets import PRESETS, Preset
-from distribution.programs import BuildError
+from distribution.checkout import BuildError
 from lab.closed_loop.results import Row, Rows, parsed, present_digests
 from lab.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS
 

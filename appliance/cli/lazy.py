@@ -12,12 +12,36 @@ from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
-from appliance.cli.help_panels import in_order, panel_of
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.terminal import flowed
 
 if TYPE_CHECKING:
     from typer._click import Command, Context, Parameter
+
+
+# The panels of `rosrv --help`, in their order.
+
+PANELS: dict[str, tuple[str, ...]] = {
+    "Begin": ("demo", "survey", "up", "adopt", "release", "status", "selftest", "version"),
+    "Drive and stop": ("guard", "drive", "approve", "approval", "door"),
+    "Decide who may do what": ("policy", "host", "protect", "sign"),
+    "Watch the robot": ("topic", "node", "monitor", "record"),
+    "Review": ("audit", "who-drove", "report", "evidence", "alarm", "limits"),
+    "Let people and programs in": ("token", "sso", "certificate"),
+    "Operate": ("config", "backup", "restore", "purge", "standby", "fleet"),
+}
+_FURTHER = "Further commands"
+
+
+def panel_of(name: str) -> str:
+    return next((panel for panel, names in PANELS.items() if name in names), _FURTHER)
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return the names in the order of the panels; those without one are last, as they are."""
+    known = [name for names_of in PANELS.values() for name in names_of]
+    return sorted(names, key=lambda name: known.index(name) if name in known else len(known))
+
 
 _HELP_OPTIONS = ["-h", "--help"]
 _FOLDERS = ("--state", "--monitors", "--other")
@@ -44,7 +68,7 @@ def application(
 ) -> typer.Typer:
     """Return an application; `further` returns more verbs, for help, completion and a name that `verbs` lacks.
 
-    `panels`: the help lists the commands in the panels of `help_panels`.
+    `panels`: the help lists the commands in the panels of `PANELS`.
     """
     app = typer.Typer(
         cls=_group_of(verbs, further, panels=panels),

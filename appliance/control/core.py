@@ -34,7 +34,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
 from appliance.control.operators.request_method import RequestMethod
-from appliance.control.operators.sessions import Session, Sessions
+from appliance.control.operators.token_orders import Session, Sessions
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.policy.judgement import PolicyContext

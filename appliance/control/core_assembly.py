@@ -20,7 +20,7 @@ from appliance.control.core import (
 )
 from appliance.control.operators.limit_use import OwnUses
 from appliance.control.operators.node_connections import NodeConnections
-from appliance.control.operators.overview import graph_of, hosts_connected
+from appliance.control.operators.queries import graph_of, hosts_connected
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.host_signs import host_signs
 from appliance.policy.model import Address

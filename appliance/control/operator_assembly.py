@@ -17,12 +17,10 @@ from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.new_state import StateAge
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
-from appliance.control.operators.sessions import Sessions
 from appliance.control.operators.switched_off import SwitchedOffWatch
-from appliance.control.operators.token_orders import TokenOrders
-from appliance.control.rest.rest import RestLink
+from appliance.control.operators.token_orders import Sessions, TokenOrders
+from appliance.control.rest.rest import RestLink, RestUses
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.control.rest.rest_uses import RestUses
 
 
 @dataclass(frozen=True, slots=True)

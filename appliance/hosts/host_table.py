@@ -15,8 +15,8 @@ import re
 from appliance.base import clock
 from appliance.base.shipped import earliest_now
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
+from appliance.hosts.appliances import RevokedCertificates
 from appliance.hosts.hosts_file import DeclaredHosts
-from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.policy.model import Address
 from appliance.store.host_tables import (
     CertificateRow,

@@ -1,6 +1,7 @@
 """Make, store and load the authority's private key, encrypted if there is a passphrase."""
 
 import os
+import stat
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,22 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from appliance.base.atomic_files import write_whole
-from appliance.ipsec.key_files import SignerKeyError, require_private
+
+# Reject key files that others may read.
+
+
+class SignerKeyError(Exception):
+    """A key cannot be used."""
+
+
+def require_private(path: Path) -> None:
+    mode = path.stat().st_mode
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise SignerKeyError(
+            f"{path}: others may read this private key (mode {mode & 0o777:o});"
+            " treat it as stolen, or set its mode to 600 if you know better"
+        )
+
 
 Kind = Literal["ecdsa", "ed25519"]
 Key = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey

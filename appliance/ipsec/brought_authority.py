@@ -5,9 +5,8 @@ Without the passphrase, the signer uses its own authority.
 
 from pathlib import Path
 
-from appliance.ipsec.authority_key import Kind, is_encrypted
+from appliance.ipsec.authority_key import Kind, SignerKeyError, is_encrypted, require_private
 from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
-from appliance.ipsec.key_files import SignerKeyError, require_private
 
 FOLDER = "joined"  # of the signer's directory
 

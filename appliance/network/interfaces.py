@@ -9,10 +9,20 @@ import os
 import socket
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
-from appliance.network import netlink
 from appliance.network.namespaces import Namespace, NetworkError
+
+# Load the library for netlink when a network is first changed: it has 200 modules, and most verbs change none.
+
+
+def loaded() -> ModuleType:
+    import pyroute2  # noqa: PLC0415  see the head
+
+    module: ModuleType = pyroute2
+    return module
+
 
 IFNAMSIZ = 15  # characters
 _IFA_F_NODAD = 0x02
@@ -259,7 +269,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Netlink], T]) -> T:
-    pyroute2 = netlink.loaded()
+    pyroute2 = loaded()
 
     def inside() -> T:
         with pyroute2.IPRoute() as route:

@@ -13,12 +13,14 @@
 """
 
 import contextlib
+import errno
 import fcntl
 import ipaddress
 import itertools
 import json
 import math
 import os
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +31,7 @@ from typing import Literal
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.status import FirewallRule
-from appliance.network import close_ports, conntrack, interfaces, vendor_masters
+from appliance.network import close_ports, interfaces, vendor_masters
 from appliance.network.cut import DisturbedConnections, close_port, open_port, refuse_no_port, run_nft
 from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import statuses
@@ -50,6 +52,47 @@ from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
 from appliance.network.port_holders import PortsInUseError, described
 from appliance.network.public_address import PublicAddress, outward_address
+
+# Delete entries of the connection tracker.
+#
+# Address translation applies only to the first packet of a connection. A host that keeps sending UDP (IKE, ESP in
+# UDP) keeps its old entry alive, so changed rules would not redirect its packets.
+
+_FAMILIES = (socket.AF_INET, socket.AF_INET6)
+
+
+def forget(namespace: Namespace, ports: Iterable[int]) -> int:
+    """Delete the entries of the namespace's own addresses; return their number. Raises `NetworkError`."""
+    pyroute2 = interfaces.loaded()
+    own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
+    try:
+        return namespace.run(
+            lambda: sum(_forget(family, port, own) for family in _FAMILIES for port in ports)
+        )
+    except (pyroute2.NetlinkError, OSError) as error:
+        raise NetworkError(f"deleting entries of the connection tracker: {error}") from error
+
+
+def _forget(family: int, port: int, own: set[str]) -> int:
+    pyroute2 = interfaces.loaded()
+    tuples = pyroute2.netlink.nfnetlink.nfctsocket.NFCTAttrTuple
+    wanted = tuples(family=family, proto=socket.IPPROTO_UDP, dport=port)
+    deleted = 0
+    with pyroute2.NFCTSocket(nfgen_family=family) as tracker:
+        for message in list(tracker.dump(tuple_orig=wanted)):
+            entry = tuples.from_netlink(family, message.get_attr("CTA_TUPLE_ORIG"))
+            # Kernels before 5.8 do not filter.
+            if (entry.proto, entry.dport) != (wanted.proto, port) or entry.daddr not in own:
+                continue
+            try:
+                tracker.entry("del", tuple_orig=entry)
+            except pyroute2.NetlinkError as error:
+                if error.code != errno.ENOENT:  # ENOENT: the entry ended before its removal
+                    raise
+            else:
+                deleted += 1
+    return deleted
+
 
 INSIDE = "eth0"
 _CANDIDATES = 64
@@ -354,7 +397,7 @@ class Isolation:
             vendor_masters.leave_alone(self._host, self.settings.left_alone())
 
     def _forget_tunnels(self) -> None:
-        conntrack.forget(self._host, [port.first for port in _TUNNELS])
+        forget(self._host, [port.first for port in _TUNNELS])
 
     def _build(self) -> None:
         settings, inside = self.settings, self.namespace

@@ -10,13 +10,16 @@ from collections.abc import Iterator, Mapping
 from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
-from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
+from appliance.relay.connections.incoming_connection import (
+    IncomingConnection,
+    PendingConnections,
+    RefusedConnection,
+)
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.message_sink import MessageSink
 from appliance.relay.connections.monitor_calls import OwnAnswer, ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_topic import OwnTopicPublisher
-from appliance.relay.connections.pending_connections import PendingConnections
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.connections.service_client import ServiceClient, ServiceTraffic
 from appliance.relay.connections.subscriber import Subscriber

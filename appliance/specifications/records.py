@@ -2,8 +2,9 @@
 
 import datetime
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -11,9 +12,219 @@ import msgspec
 from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.counted import counted
+from appliance.base.varying_numbers import without_numbers
 from appliance.channel.messages import MonitorEvent
-from appliance.specifications.episodes import Repetitions, StoppedTopic, Stops
 from appliance.telemetry.audit_trail import AuditTrail
+
+# Fold what monitors go on doing, so that the audit log has few records of it, and their whole number.
+#
+# - An action that goes on is recorded as before for ten seconds: in each second the first in full, the others as a
+# count.
+#   Then at most once a minute, with the number since the last record; the last record has the whole number and the
+#   time.
+# - Rare actions are recorded in full: each kind of action of a monitor on a topic has 20 records at once, and one
+# more a
+#   minute.
+# - A stop, which sends the safe message of a monitor or puts it in the place of messages, is one record at its begin
+# and
+#   one at its end. Stops that follow each other closely become one, so they also have at most one record a minute.
+#
+# Times of actions are those of the monitors' clock (nanoseconds), which runs evenly; `now` is monotonic (seconds).
+
+RECORDS = 20.0
+"""The records of a kind of action that may follow at once: those of ten seconds."""
+
+PERIOD = 60.0
+"""The seconds after which a kind of action may have one more record."""
+
+QUIET = 2.5
+"""The seconds without an action after which it has ended. Relays report once a second."""
+
+STOPS = 5.0
+"""The stops of a monitor on a topic that may follow at once, each with two records."""
+
+LONG_QUIET = 2 * PERIOD
+"""The seconds without an action after which a stop has ended, if many stops have preceded it closely."""
+
+_MOST = 1000
+_BY_TEXT = frozenset({"verdict", "fault", "log", "missed"})
+
+
+class StoppedTopic(msgspec.Struct, frozen=True):
+    """A stop: a monitor that keeps a topic at its safe message. Times are nanoseconds since the epoch."""
+
+    monitor: str
+    topic: str
+    since: int
+    until: int
+    count: int
+    cause: str = ""
+    host: str = ""
+    node: str = ""
+    record: str = ""
+    """The record of its begin."""
+
+
+@dataclass(slots=True)
+class _Allowance:
+    """The records that may be made now; `most` at once, and one more each `period` seconds."""
+
+    most: float
+    period: float
+    left: float
+    at: float
+
+    def take(self, now: float) -> bool:
+        self.left = min(self.most, self.left + max(0.0, now - self.at) / self.period)
+        self.at = now
+        if self.left < 1:
+            return False
+        self.left -= 1
+        return True
+
+    def full(self, now: float) -> bool:
+        return self.left + max(0.0, now - self.at) / self.period >= self.most
+
+
+@dataclass(slots=True)
+class _GoingOn:
+    """An action that goes on; `waits` is its last report, and stands for `count` actions since `first`."""
+
+    allowance: _Allowance
+    begun: int
+    last: int
+    at: float
+    total: int = 0
+    count: int = 0
+    first: int = 0
+    waits: MonitorEvent | None = None
+
+
+class Repetitions:
+    """Counts repeated actions of monitors, which have one audit record for a time."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, ...], _GoingOn] = {}
+
+    @property
+    def some(self) -> bool:
+        return bool(self._known)
+
+    @property
+    def waits(self) -> bool:
+        """Return whether an action is counted that no record has yet."""
+        return any(known.waits is not None for known in self._known.values())
+
+    def take(self, event: MonitorEvent, now: float) -> MonitorEvent | None:
+        """Return the report to record now, if any; it stands for all actions since the last record."""
+        key = self._key(event)
+        known = self._known.get(key)
+        if known is None or now - known.at > PERIOD:
+            allowance = _Allowance(RECORDS, PERIOD, RECORDS, now) if known is None else known.allowance
+            known = self._known[key] = _GoingOn(allowance, event.time, event.time, now)
+        known.at, known.last = now, max(known.last, event.time)
+        number = event.count or 1
+        known.total += number
+        if not known.count:
+            known.first = int(event.detail.get("first_time") or event.time)
+        known.count += number
+        if not known.allowance.take(now):
+            known.waits = event
+            return None
+        known.waits = None
+        if known.count > number:
+            return _counted(event, known)
+        known.count = 0
+        return event
+
+    def ended(self, now: float) -> Iterator[MonitorEvent]:
+        """Yield the last reports of actions that have ended, with their whole number and time."""
+        for key, known in list(self._known.items()):
+            quiet = now - known.at >= QUIET
+            if known.waits is not None and quiet and known.allowance.take(now):
+                seconds = round((known.last - known.begun) / 1e9, 3)
+                whole = {"total": known.total, "seconds": seconds}
+                yield _counted(known.waits, known, whole)
+                known.waits = None
+            if known.waits is None and quiet and known.allowance.full(now):
+                del self._known[key]
+
+    def _key(self, event: MonitorEvent) -> tuple[str, ...]:
+        kind = event.kind.removeprefix("shadow ")
+        text = without_numbers(event.text) if kind in _BY_TEXT else ""
+        key = (event.kind, event.monitor, event.resource, event.host, text)
+        return key if key in self._known or len(self._known) < _MOST else (event.kind, event.monitor)
+
+
+@dataclass(slots=True)
+class _Going:
+    """A stop that goes on, and after how many seconds without an action it has ended."""
+
+    stop: StoppedTopic
+    at: float
+    quiet: float
+
+
+class Stops:
+    """The stops that go on, and the last one of each monitor; `keep(stops)` stores those that go on."""
+
+    def __init__(self, keep: Callable[[list[StoppedTopic]], None]) -> None:
+        self._keep = keep
+        self._going: dict[tuple[str, str], _Going] = {}
+        self._allowances: dict[tuple[str, str], _Allowance] = {}
+        self.last: dict[str, StoppedTopic] = {}
+
+    @property
+    def some(self) -> bool:
+        return bool(self._going)
+
+    def goes_on(self, monitor: str) -> bool:
+        return any(stop.monitor == monitor for stop in self.going())
+
+    def going(self) -> list[StoppedTopic]:
+        return [going.stop for going in self._going.values()]
+
+    def take(self, event: MonitorEvent, now: float) -> StoppedTopic | None:
+        """Return the stop if it begins with this event."""
+        key, last = (event.monitor, event.resource), int(event.detail.get("last_time") or event.time)
+        going = self._going.get(key)
+        if going is not None:
+            stop = going.stop
+            count, until = stop.count + (event.count or 1), max(stop.until, last)
+            going.stop = self.last[event.monitor] = msgspec.structs.replace(stop, count=count, until=until)
+            going.at = now
+            return None
+        if key not in self._allowances and len(self._allowances) >= _MOST:
+            self._allowances = {one: each for one, each in self._allowances.items() if not each.full(now)}
+        allowance = self._allowances.setdefault(key, _Allowance(STOPS, LONG_QUIET, STOPS, now))
+        first = int(event.detail.get("first_time") or event.time)
+        cause, count = str(event.detail.get("cause", "")), event.count or 1
+        found = StoppedTopic(*key, first, last, count, cause, event.host, event.caller_id)
+        self._going[key] = _Going(found, now, QUIET if allowance.take(now) else LONG_QUIET)
+        self.last[event.monitor] = found
+        return found
+
+    def recorded(self, stop: StoppedTopic, record: str) -> None:
+        going = self._going[stop.monitor, stop.topic]
+        going.stop = self.last[stop.monitor] = msgspec.structs.replace(going.stop, record=record)
+        self._keep(self.going())
+
+    def ended(self, now: float) -> list[StoppedTopic]:
+        ended = [key for key, going in self._going.items() if now - going.at >= going.quiet]
+        stops = [self._going.pop(key).stop for key in ended]
+        if stops:
+            self._keep(self.going())
+        return stops
+
+
+def _counted(
+    event: MonitorEvent, known: _GoingOn, more: Mapping[str, object] = MappingProxyType({})
+) -> MonitorEvent:
+    detail = {**event.detail, "first_time": known.first, "last_time": known.last, **more}
+    counted = msgspec.structs.replace(event, count=known.count, detail=detail)
+    known.count = 0
+    return counted
+
 
 _EVENTS = {
     "verdict": ("monitor verdict", Severity.NOTICE),

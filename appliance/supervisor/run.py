@@ -1,31 +1,37 @@
 """Run the appliance: prepare everything before the first process starts, and clean up after the last."""
 
 import asyncio
+import contextlib
 import json
+import math
 import os
+import signal
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import structlog
 
+from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
 from appliance.features.table import machine_work_in
+from appliance.network.boot_hold import BootHold, HeldPorts, starts_again
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import PeerAccess
 from appliance.network.firewall.iptables import load_modules
-from appliance.network.namespaces import has_privileges
+from appliance.network.namespaces import Namespace, NetworkError, has_privileges
 from appliance.supervisor import signals
-from appliance.supervisor.boot_hold_lifecycle import HoldAround
-from appliance.supervisor.errors import StartError
+from appliance.supervisor.errors import PortInUseError, StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
+from appliance.supervisor.lapse_answers import answer_for_control
 from appliance.supervisor.machine_work import MachineWork
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
-from appliance.supervisor.port_wait import built_when_free
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.role import Facts, Role
@@ -40,6 +46,171 @@ from appliance.supervisor.service_gate import Pairing, ServiceGate
 from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
+
+# Wait while another program holds a port of the appliance, such as a ROS master that the robot started first.
+#
+# Without this wait, the service would end before that program does, and the robot would run on without the appliance.
+# The status of the service, the log and `rosrv status` give the reason. A person at a terminal gets it as an error.
+
+_PORT_LOOK_SECONDS = 2.0
+_SAY_SECONDS = 600.0  # between two equal lines of the log
+
+T = TypeVar("T")
+
+
+def built_when_free(build: Callable[[], T], manager: ServiceManager, admin: socket.socket) -> T | None:
+    """Call `build` until it raises no `PortInUseError`; return its result, or None if a signal ended the wait.
+
+    The requests on the admin socket get the reason. Signals are held while `build` runs.
+    """
+    try:
+        return build()
+    except PortInUseError as error:
+        reason = str(error)
+    return asyncio.run(_built_later(build, reason, manager, admin))
+
+
+async def _built_later(
+    build: Callable[[], T], reason: str, manager: ServiceManager, admin: socket.socket
+) -> T | None:
+    stopped, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stopped.set)
+    loop.add_signal_handler(signal.SIGHUP, lambda: None)  # the policy is read when it starts
+    async with manager.watched():
+        while True:
+            try:
+                async with _said(f"waits: {reason}", manager, admin):
+                    return await _retried(build, reason, stopped)
+            except PortInUseError as error:
+                reason = str(error)
+
+
+async def _retried(build: Callable[[], T], reason: str, stopped: asyncio.Event) -> T | None:
+    """Return what `build` returns, or None if `stopped` is set. Raises `PortInUseError` for another reason."""
+    began = clock.now()
+    while True:
+        with signals.heard(), contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_PORT_LOOK_SECONDS):
+                await stopped.wait()
+        for _ in range(3):  # let the loop deliver a signal of the last moment
+            await asyncio.sleep(0)
+        if stopped.is_set():
+            return None
+        try:
+            return build()
+        except PortInUseError as error:
+            if str(error) != reason or clock.now() - began > _SAY_SECONDS:
+                raise
+
+
+@contextlib.asynccontextmanager
+async def _said(reason: str, manager: ServiceManager, admin: socket.socket) -> AsyncIterator[None]:
+    log.error(reason)
+    manager.starting(reason)
+    answers = asyncio.create_task(answer_for_control(admin.dup, reason))
+    try:
+        yield
+    finally:
+        answers.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await answers
+
+
+# Put, lift and arm the boot hold around a run of the appliance. A hold that fails is logged, and ends nothing.
+
+_LOOK_SECONDS = 5.0
+_KEEP_SECONDS = 0.5
+
+
+class HoldAround:
+    """The boot hold of the service; `used`: this is the service of a single appliance."""
+
+    def __init__(self, settings: Settings, *, used: bool, link: str, hold: BootHold | None = None) -> None:
+        self._hold = hold or BootHold(Namespace.own())
+        self._ports: HeldPorts | None = None
+        self._looked_at = -math.inf
+        self._removed = 0
+        self._served: str | None = None
+        if (
+            used
+            and settings.isolation != "none"
+            and settings.firewall.hold != "off"
+            and self._hold.is_present
+        ):
+            nodes = local_port_range()
+            own = settings.firewall.hold_seconds if settings.firewall.hold == "own" else None
+            self._ports = HeldPorts(settings.listen_address[1], nodes.first, nodes.last, link, own)
+
+    def put(self) -> None:
+        if self._ports is not None:
+            self._looked_at = clock.now()
+            try:
+                if self._hold.put():
+                    self._removed += 1
+                    log.critical("another program removed the boot hold: it is in force again")
+            except (NetworkError, OSError) as error:
+                log.error(
+                    "other machines are not held off while the appliance does not serve", error=str(error)
+                )
+
+    def put_before_restart(self) -> None:
+        """Hold other machines off the master before an ordered restart gives the robot's graph back to its own one."""
+        if self._ports is not None and starts_again():
+            try:
+                self._hold.put(nodes=False)
+            except (NetworkError, OSError) as error:
+                log.error("other machines reach the robot's own master until the restart", error=str(error))
+
+    def keep(self) -> None:
+        """Restore the hold if another program has removed its rules; looks every five seconds at most."""
+        if self._ports is not None and clock.now() - self._looked_at >= _LOOK_SECONDS:
+            self._looked_at = clock.now()
+            if not self._hold.is_intact():
+                self.put()
+
+    async def until(self, is_open: Callable[[], bool]) -> str:
+        """Keep the hold until other machines reach the appliance, and not the robot's own master; see `served`."""
+        while not is_open():
+            self.keep()
+            await asyncio.sleep(_KEEP_SECONDS)
+        return self.served()
+
+    def served(self) -> str:
+        """Lift and arm the hold, once.
+
+        Return an alarm if it is not lifted, if another program had removed its rules, or if the robot's own programs
+        started without the appliance.
+        """
+        if self._served is None:
+            self._served = self._lifted()
+        return self._served
+
+    def _lifted(self) -> str:
+        if not self._hold.is_present:
+            return ""
+        lapsed, trouble = False, ""
+        try:
+            lapsed = self._hold.lift()
+        except (NetworkError, OSError) as error:
+            trouble = f"{error}: run `systemctl stop rosrv-hold`, which tries again"
+            log.error("the boot hold is not lifted", error=str(error))
+        try:
+            self._hold.arm(self._ports)
+        except OSError as error:
+            log.error("the hold of the next boot keeps its last settings", error=str(error))
+        if self._removed and not trouble:
+            trouble = (
+                f"another program removed the boot hold {counted(self._removed, 'time')}, such as `nft flush ruleset`:"
+                " until it was restored, other machines could reach the robot's master and nodes past the appliance"
+            )
+        if trouble or not lapsed or self._ports is None or self._ports.own_seconds is None:
+            return trouble
+        return (
+            f"the appliance served more than {self._ports.own_seconds} s after the hold began, so the robot's own "
+            "programs may have started without it: restart them"
+        )
+
 
 _LIVES_A_MINUTE = 64  # starts of a failing rosout; an old connection occupies each port for a minute
 _UNPRIVILEGED = range(1024, 65_536)

@@ -1,17 +1,114 @@
 """Execute jobs, and return their results: from the journal if it has them, otherwise from workers."""
 
+import ctypes
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import get_context, resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 
 import msgspec
 
-from rosmop.batch.executor import Executor, ThisProcess, WorkerDeath, execute
+from rosmop.batch.executor import Executor, ThisProcess, Work, WorkerDeath, execute
 from rosmop.batch.jobs import Failure, Job, Result, packed, unpacked, work
 from rosmop.batch.journal import ResumeJournal, TemporaryStore
-from rosmop.batch.process_pool import ProcessPool
 from rosmop.batch.ray_cluster import RayCluster
+
+# Execute jobs in processes of this machine. A process that dies takes only its own job with it.
+#
+# `concurrent.futures` gives up all jobs then. Here each process has its own pipe, for bytes, so nothing is unpickled.
+
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl
+
+
+class ProcessPool:
+    """Starts its processes as they are needed."""
+
+    def __init__(self, work: Work, capacity: int) -> None:
+        self.capacity = capacity
+        self._work = work
+        self._context = get_context("spawn")
+        self._idle: list[tuple[BaseProcess, Connection]] = []
+        self._running: dict[Connection, tuple[BaseProcess, int]] = {}
+
+    def submit(self, number: int, job: bytes) -> None:
+        while True:
+            is_new = not self._idle
+            process, pipe = self._start() if is_new else self._idle.pop()
+            try:
+                pipe.send_bytes(job)
+            except OSError:
+                if not is_new:  # it died while it was idle
+                    _end(process, pipe)
+                    continue
+            # A new process that died is noticed by `finished`.
+            self._running[pipe] = process, number
+            return
+
+    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+        results: list[tuple[int, bytes | WorkerDeath]] = []
+        for pipe in wait(list(self._running)):
+            assert isinstance(pipe, Connection)  # noqa: S101  for mypy: no others are waited for
+            process, number = self._running.pop(pipe)
+            try:
+                result = pipe.recv_bytes()
+            except (EOFError, OSError):
+                process.join()
+                results.append((number, WorkerDeath(_reason(process.exitcode))))
+                pipe.close()
+            else:
+                results.append((number, result))
+                self._idle.append((process, pipe))
+        return results
+
+    def close(self) -> None:
+        for process, pipe in [
+            *self._idle, *((process, pipe) for pipe, (process, _number) in self._running.items())
+        ]:  # fmt: skip
+            _end(process, pipe)
+        self._idle, self._running = [], {}
+
+    def _start(self) -> tuple[BaseProcess, Connection]:
+        near, far = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(self._work, far, os.getpid()), daemon=True)
+        resource_tracker.ensure_running()  # its start, with the first process, would unblock SIGINT
+        # The process inherits the mask: Ctrl-C ends the parent only, which ends its processes.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        far.close()
+        return process, near
+
+
+def _end(process: BaseProcess, pipe: Connection) -> None:
+    process.kill()
+    process.join()
+    pipe.close()
+
+
+def _reason(status: int | None) -> str:
+    if status is not None and status < 0:
+        name = signal.Signals(-status).name
+        hint = " (out of memory?)" if -status == signal.SIGKILL else ""
+        return f"its worker was ended by {name}{hint}"
+    return f"its worker ended with status {status}"
+
+
+def _serve(work: Work, pipe: Connection, parent: int) -> None:
+    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+    if os.getppid() != parent:
+        return
+    while True:
+        try:
+            job = pipe.recv_bytes()
+        except EOFError:
+            return
+        pipe.send_bytes(work(job))
 
 
 @dataclass(frozen=True)

@@ -6,19 +6,151 @@ grammars, and properties that exceed the work limit are not certified.
 """
 
 import itertools
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import TypeVar
 
 from rosmop.certify import formula_reader, patterns
-from rosmop.certify.formula_reader import UnsupportedFormulaError, WorkLimitError
+from rosmop.certify.formula_reader import Node, UnsupportedFormulaError, WordReader, WorkLimitError
 from rosmop.certify.future import FutureFollower, State, positive
-from rosmop.certify.guesses import PastGuesses
-from rosmop.certify.machines import StateMachineFollower
 from rosmop.certify.past_formulas import PastFollower
 from rosmop.certify.words import ExpressionDerivatives
 from roswire.counted import counted
+
+# Follow state machines as written: `state [ event -> state, default state, timeout 2s -> state ]`.
+
+FAIL = "fail"
+
+
+class StateMachineFollower:
+    def __init__(self, formula: str, events: Sequence[str]) -> None:
+        self._moves: dict[str, dict[str, str]] = {}
+        self._default: dict[str, str] = {}
+        self._aliases: dict[str, list[str]] = {}
+        self._timeouts: dict[str, tuple[int, str]] = {}
+        self._events = events
+        words = WordReader(formula, ("->", "[", "]", "=", ","))
+        while words.word:
+            name = words.take()
+            if words.accept("["):
+                self._read_state(words, name)
+            elif name == "alias":
+                name = words.take()
+                words.expect("=")
+                self._aliases[name] = self._read_members(words)
+            else:
+                raise UnsupportedFormulaError(f"{name!r} does not begin a state")
+        self.initial = next(iter(self._moves), FAIL)
+
+    def _read_state(self, words: WordReader, state: str) -> None:
+        if state in self._moves:
+            raise UnsupportedFormulaError(f"the state {state!r} is defined twice")
+        moves = self._moves.setdefault(state, {})
+        while not words.accept("]"):
+            event = words.take()
+            if event == "timeout" and words.word[:1].isdecimal() | (words.word[:1] == "."):
+                after = words.duration()
+                words.expect("->")
+                self._timeouts[state] = after, words.take()
+                words.accept(",")
+                continue
+            arrow = words.accept("->")
+            target = words.take()
+            if event == "default":
+                self._default[state] = target
+            elif arrow and event in self._events:
+                moves[event] = target
+            else:
+                raise UnsupportedFormulaError(f"{event!r} is not an event")
+            words.accept(",")
+
+    def _read_members(self, words: WordReader) -> list[str]:
+        members = [words.take()]
+        while words.accept(",") or (words.word and words.word != "alias"):
+            members.append(words.take())
+        return members
+
+    def step(self, state: str, event: str) -> str:
+        return self._moves.get(state, {}).get(event, self._default.get(state, FAIL))
+
+    def timeout(self, state: str) -> tuple[int, str] | None:
+        return self._timeouts.get(state)
+
+    def verdicts(self, state: str) -> tuple[str, ...]:
+        return (state, *(alias for alias, members in self._aliases.items() if state in members))
+
+
+# Replace the operators about the past in a formula about the future.
+#
+# Their values are guessed with every event: a letter is an event and one bit for each operator. On every
+# endless trace, exactly one sequence of guesses satisfies their definitions. So a formula can come true with
+# guesses exactly if it could without them.
+
+MOST_LETTERS = 1024
+
+_DEFINED: Mapping[str, tuple[Callable[[Node, Node, Node], Node], bool]] = {
+    "once": (lambda x, _y, before: ("or", x, before), False),
+    "historically": (lambda x, _y, before: ("and", x, before), True),
+    "since": (lambda x, y, before: ("or", y, ("and", x, before)), False),
+    "dual since": (lambda x, y, before: ("and", y, ("or", x, before)), True),
+}
+"""For each operator: its value, from its operands and its previous value, and the value before the first event."""
+_BEFORE: Mapping[str, bool] = {"previously": False, "dual previously": True}
+"""For each operator: its value at the first event. Later it has the operand's value at the previous event."""
+
+
+class PastGuesses:
+    """The letters of each event, as numbers below `count`, and the formula over sets of them (`one of`)."""
+
+    def __init__(self, formula: Node, events: Sequence[str]) -> None:
+        self._guessed: dict[Node, int] = {}
+        for node in _within(formula):
+            if node[0] in _DEFINED or node[0] in _BEFORE:
+                self._guessed.setdefault(node, len(self._guessed))
+        count = 1 << len(self._guessed)
+        if len(events) * count > MOST_LETTERS:
+            raise WorkLimitError
+        self.count = len(events) * count
+        self.letters = {
+            event: range(number * count, (number + 1) * count) for number, event in enumerate(events)
+        }
+        self.formula = self._over(formula)
+        self.rules = [rule for node in self._guessed for rule in self._rules(node)]
+
+    def kept(self, formula: Node) -> Node:
+        return reduce(lambda left, right: ("and", left, right), self.rules, formula)
+
+    def _over(self, node: Node) -> Node:
+        if node in self._guessed:
+            bit = 1 << self._guessed[node]
+            return ("one of", sum(1 << letter for letter in range(self.count) if letter & bit))
+        if node[0] == "event":
+            return ("one of", sum(1 << letter for letter in self.letters[str(node[1])]))
+        return (node[0], *(self._over(part) if isinstance(part, tuple) else part for part in node[1:]))
+
+    def _rules(self, node: Node) -> list[Node]:
+        mine = self._over(node)
+        operator = str(node[0])
+        operands = [self._over(part) for part in node[1:] if isinstance(part, tuple)]
+        if operator in _BEFORE:
+            first: Node = mine if _BEFORE[operator] else ("not", mine)
+            return [first, ("always", _either(operands[0], ("next", mine), ("next", ("not", mine))))]
+        define, at_first = _DEFINED[operator]
+        worth = {
+            before: ("iff", mine, define(operands[0], operands[-1], ("true",) if before else ("false",)))
+            for before in (False, True)
+        }
+        return [worth[at_first], ("always", _either(mine, ("next", worth[True]), ("next", worth[False])))]
+
+
+def _either(test: Node, yes: Node, no: Node) -> Node:
+    return ("or", ("and", test, yes), ("and", ("not", test), no))
+
+
+def _within(node: Node) -> list[Node]:
+    return [node, *(inner for part in node[1:] if isinstance(part, tuple) for inner in _within(part))]
+
 
 MOST_STEPS = 200_000
 MOST_WORK = 400_000

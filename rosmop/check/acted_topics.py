@@ -7,8 +7,7 @@ cannot judge, it holds these topics and nothing else.
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from rosmop.form import nodes
-from rosmop.form.compiled import SpecificationCode
-from rosmop.form.connected_groups import channel_of
+from rosmop.form.compiled import SpecificationCode, channel_of
 from rosmop.text import tree
 
 _DROPS = (tree.DropStatement, tree.ReturnStatement, tree.StopStatement)

@@ -8,7 +8,6 @@ from rosmop.check import cursors, event_facts, members, order
 from rosmop.check.assignables import Value, path, root
 from rosmop.check.assignments import require_place, store
 from rosmop.check.conversion import condition, convert, number
-from rosmop.check.initializers import elements
 from rosmop.check.invocation import MemberCall
 from rosmop.check.print_statements import OutputStream, formatted
 from rosmop.check.scope import ConstantReference, FunctionScope, HelperFunction
@@ -20,6 +19,35 @@ from rosmop.text.foreign import instead
 from rosmop.types import value_types
 from rosmop.types.messages import nearest, shown
 from rosmop.types.resolve import named_type, record
+from rosmop.types.value_types import Type
+from roswire.counted import counted
+
+# Compile initial and assigned values: converted expressions, or `{a, b, c}` for a vector.
+
+
+def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> nodes.Expression:
+    if isinstance(node, tree.InitializerList):
+        return elements(scope, node, target)
+    return convert(scope, scope.value_of(node), target, scope.site(node))
+
+
+def elements(scope: FunctionScope, node: tree.InitializerList, target: Type) -> nodes.Expression:
+    if not isinstance(target, value_types.VectorType):
+        if len(node.items) == 1:
+            return converted(scope, node.items[0], target)
+        if not node.items:
+            return nodes.Zero(target)
+        raise SpecificationError.at(
+            node.position, f"`{{…}}` makes a vector, not a {target}; set its parts one by one"
+        )
+    if target.length is not None and len(node.items) > target.length:
+        raise SpecificationError.at(
+            node.items[target.length].position,
+            f"more than the {counted(target.length, 'element')} of the array",
+        )
+    items = tuple(converted(scope, item, target.element) for item in node.items)
+    return nodes.Vector(target, items, 0 if target.length is None else target.length - len(items))
+
 
 _MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_THROTTLE|_NAMED)?\Z")
 

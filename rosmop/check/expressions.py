@@ -3,12 +3,14 @@
 import math
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
+
+import msgspec
 
 from rosmop.check import (
     assignments,
     call_expressions,
-    initializers,
     members,
     operators,
     order,
@@ -16,10 +18,10 @@ from rosmop.check import (
 )
 from rosmop.check.assignables import CharacterLvalue, Value, Variable, VariableLvalue
 from rosmop.check.conversion import condition, constant_value, convert, number
-from rosmop.check.margins import noted
 from rosmop.check.scope import FunctionScope
 from rosmop.check.standard_functions import CONSTANTS
 from rosmop.form import nodes
+from rosmop.form.compiled import Comparison
 from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.run.interpreter import constant_of
 from rosmop.runtime.action_context import FaultError
@@ -28,6 +30,65 @@ from rosmop.text import tree
 from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
+
+# Note how close comparisons of numbers came: both sides when they were nearest, while true and while false.
+#
+# The noting expression has the same value, compares the sides in the same type, and charges nothing.
+# Comparisons in `when`, first values and `init` are not noted, nor are loop conditions, whose distance from the
+# end means nothing.
+
+MOST_NOTED = 32
+
+_COMPARED = frozenset({"<", "<=", ">", ">="})
+_TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
+
+
+def noted(
+    scope: FunctionScope, node: tree.BinaryExpression, left: Value, right: Value, value: Value
+) -> Value:
+    compare = value.form
+    if (
+        not scope.notes
+        or node.operator not in _COMPARED
+        or not isinstance(compare, nodes.Compare)
+        or not value_types.is_number(compare.left.type)
+    ):
+        return value
+    known = scope.names.comparisons
+    if node not in known:
+        if len(known) >= MOST_NOTED:
+            return value
+        variables = [(scope.symbols.fresh("g"), scope.symbols.fresh("g")) for _truth in range(2)]
+        constant = (side for side, operand in enumerate((left, right)) if operand.constant is not None)
+        known[node] = Comparison(node.position, next(constant, None), *variables)
+    comparison = known[node]
+    scope.effects.written.update(comparison.variables)
+    kind = compare.left.type
+    sides = [nodes.Read(kind, scope.temporary()) for _side in range(2)]
+    kept = (
+        nodes.Assign(kind, side.name, operand)
+        for side, operand in zip(sides, (compare.left, compare.right), strict=True)
+    )
+    now = [number(side, value_types.DOUBLE) for side in sides]
+    answer = nodes.Conditional(
+        value_types.BOOL,
+        msgspec.structs.replace(compare, left=sides[0], right=sides[1]),
+        nodes.Sequence(value_types.BOOL, (_note(now, comparison.when_true), _TRUE), -1),
+        nodes.Sequence(value_types.BOOL, (_note(now, comparison.when_false), _FALSE), -1),
+    )
+    return replace(value, form=nodes.Sequence(value_types.BOOL, (*kept, answer), -1))
+
+
+def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
+    before = [nodes.Read(value_types.DOUBLE, name) for name in variables]
+    nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
+    kept = (nodes.Assign(value_types.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))
+    return nodes.Logical("and", nearer, nodes.Sequence(value_types.BOOL, (*kept, _TRUE), -1))
+
+
+def _distance(left: nodes.Expression, right: nodes.Expression) -> nodes.Expression:
+    return nodes.Unary(value_types.DOUBLE, "abs", nodes.Arithmetic(value_types.DOUBLE, "-", left, right, -1))
+
 
 _NUMBER = re.compile(r"(0[xX][0-9A-Fa-f]++|[0-9.]++(?:[eE][+-]?[0-9]++)?)([uUlLfF]*+)\Z")
 _DECIMAL = re.compile(r"[1-9][0-9]{0,30}")
@@ -237,7 +298,7 @@ def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
     if node.operator == "=" and isinstance(node.value, tree.InitializerList):
-        return order.of_assignment(scope, target, initializers.elements(scope, node.value, target.type))
+        return order.of_assignment(scope, target, call_expressions.elements(scope, node.value, target.type))
     value, site = value_of(scope, node.value), scope.site(node.value)
     if node.operator == "=" and (target.pure or value_types.is_number(target.type)):
         return order.of_assignment(scope, target, _assigned(scope, target, value, site))

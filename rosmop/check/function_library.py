@@ -145,7 +145,7 @@ bool isfinite_all(auto values) {
 } """
 
 ELEMENTARY = frozenset({"sin", "cos", "atan2", "hypot"})
-"""The functions that the interpreter has in Python, with the same bits (`runtime/elementary.py`)."""
+"""The functions that the interpreter has in Python, with the same bits (`runtime/numbers.py`)."""
 
 FREE = ELEMENTARY | {"turned"}
 

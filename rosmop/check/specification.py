@@ -2,7 +2,9 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from functools import partial
+from hashlib import sha256
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -10,6 +12,7 @@ from rosmop.check.enforcement import blocking_refused, enforcement, remedy_code,
 from rosmop.check.event_facts import declare_facts
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
+from rosmop.check.flow_lint import flow_findings
 from rosmop.check.function_bodies import (
     compile_function,
     compile_handler,
@@ -27,12 +30,9 @@ from rosmop.check.givens import (
     with_topics,
 )
 from rosmop.check.pattern_references import with_references, without_references
-from rosmop.check.phases import Phases, ordered, phases_of, unknown_phases
-from rosmop.check.reachable_types import identity, reached
 from rosmop.check.remedies import with_remedies_checked
 from rosmop.check.safe_messages import declare_safes
 from rosmop.check.scope import CompilationContext, SpecificationNames
-from rosmop.check.set_lint import lint_set
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from rosmop.check.specification_lint import (
     kept_slices,
@@ -41,16 +41,121 @@ from rosmop.check.specification_lint import (
     lint_statements,
     unused_events,
 )
-from rosmop.check.traps import traps
+from rosmop.check.traps import Phases, ordered, phases_of, rival_changes, traps, unknown_phases
 from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
-from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
+from rosmop.form.compiled import Compiled, PropertyCode, Publication, SpecificationCode
 from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
 from rosmop.text import tree
 from rosmop.types.messages import MessageTypes, nearest, shown
 from roswire.definitions import Definitions
+
+# Find the message types that a specification uses. Its state survives new definitions only if they are unchanged.
+#
+# The result may include an unused type, if a string equals the name of a type.
+
+
+def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
+    messages, services = set(definitions.message_types), set(definitions.service_types)
+    waiting: list[str] = []
+    for name in set(_names(node)):
+        if name in messages:
+            waiting.append(name)
+        if name in services:
+            service = definitions.service(name)
+            waiting += [service.request.name, service.response.name]
+    found: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name in messages and name not in found:
+            found.add(name)
+            waiting += [field.type for field in definitions.message(name).fields]
+    return frozenset(found)
+
+
+def identity(node: tree.Specification) -> bytes:
+    return sha256(repr(_plain(node)).encode()).digest()
+
+
+def _plain(node: object) -> object:
+    if isinstance(node, tuple):
+        return tuple(map(_plain, node))
+    if is_dataclass(node):
+        named = ((field, getattr(node, field.name)) for field in fields(node) if field.compare)
+        # A part that a file does not use leaves its digest as it was before the language had this part.
+        parts = (_plain(value) for field, value in named if field.default != () or value != ())
+        return (type(node).__name__, *parts)
+    return node
+
+
+def _names(root: object) -> Iterator[str]:
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, str):
+            yield node.replace("::", "/")
+        elif isinstance(node, tuple | list):
+            if len(node) == 2 and all(isinstance(part, str) for part in node):
+                yield "/".join(node)
+            waiting += node
+        elif isinstance(node, tree.SyntaxNode):
+            waiting += tree.fields_of(node)
+
+
+# Warn of what specifications of a set do to one another, and of their actions.
+
+# Warn of monitors that act on a topic, but do not see messages that another monitor publishes there.
+#
+# A published message only goes through the monitors after its publisher in the order of all specifications.
+
+
+def bypassing(
+    specifications: Sequence[SpecificationCode],
+    publications: Sequence[Publication],
+    functions: Mapping[str, nodes.Function],
+) -> Iterator[Diagnostic]:
+    places = {one.name: place for place, one in enumerate(specifications)}
+    seen: set[tuple[str, str, str]] = set()
+    for publication in publications:
+        if publication.safe:
+            continue
+        for earlier in specifications[: places.get(publication.specification, 0)]:
+            pair = publication.specification, earlier.name, publication.topic
+            if pair in seen or not _acts_on(earlier, publication.topic, functions):
+                continue
+            seen.add(pair)
+            name, topic = publication.specification, publication.topic
+            text = (
+                f"{name} publishes {topic}, but {earlier.name}, which drops or changes messages there, comes before"
+                f" {name} and does not see them: write `order {name} < {earlier.name};`"
+            )
+            yield Diagnostic(publication.position, "warning", text)
+
+
+def _acts_on(code: SpecificationCode, topic: str, functions: Mapping[str, nodes.Function]) -> bool:
+    events = [event.function for event in code.events if event.topic == topic and event.part is None]
+    handlers = [name for each in code.properties for name in each.handlers.values()] if events else []
+    return any(
+        isinstance(node, nodes.Drop | nodes.StopMessage)
+        or (isinstance(node, nodes.WriteBack) and node.writes)
+        for name in (*events, *handlers)
+        for node in nodes.walk(functions[name])
+    )
+
+
+def lint_set(
+    shared: CompilationContext,
+    compiled: Sequence[SpecificationCode],
+    specifications: Sequence[tree.Specification],
+    phases: Phases,
+) -> Iterator[Diagnostic]:
+    if shared.lints and not any(finding.severity == "error" for finding in shared.findings):
+        yield from flow_findings(shared, compiled)
+    yield from bypassing(compiled, shared.publications, shared.functions)
+    yield from rival_changes(specifications, phases)
+
 
 _T = TypeVar("_T")
 
@@ -70,8 +175,8 @@ def compile_files(
 ) -> Compiled:
     """Compile parsed files. Raises `SpecificationError` with all errors.
 
-    With `margins`, comparisons of numbers are noted (`margins.py`). Without `lints`, there are no warnings, and what
-    only finds warnings in files without errors is left out. `topics` replace the topics in the files.
+    With `margins`, comparisons of numbers are noted (`expressions.py`). Without `lints`, there are no warnings, and
+    what only finds warnings in files without errors is left out. `topics` replace the topics in the files.
     """
     shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins, lints=lints)
     pairs = [(file, specification) for file in files for specification in file.specifications]

@@ -7,9 +7,9 @@ from typing import Any
 
 from rosmop.check import call_expressions, loops
 from rosmop.check.assignments import write_store
+from rosmop.check.call_expressions import converted, elements
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.expressions import assignment
-from rosmop.check.initializers import converted, elements
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.findings import Position, SpecificationError

@@ -35,9 +35,8 @@ from rosmop.fast.abi import (
     CompiledModule,
     TopicCode,
 )
-from rosmop.fast.arithmetic import in_seconds
+from rosmop.fast.arithmetic import ELSEWHERE, in_seconds
 from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, REPLACED, RESET, ModuleCodegen, WasmFunction
-from rosmop.fast.function_parts import ELSEWHERE
 from rosmop.fast.memory_layout import NotCompiledError, reason_of
 from rosmop.fast.strings_codegen import mismatch
 from rosmop.fast.wasm import (

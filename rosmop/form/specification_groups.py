@@ -4,8 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rosmop.form import nodes
-from rosmop.form.compiled import SpecificationCode
-from rosmop.form.connected_groups import connected
+from rosmop.form.compiled import SpecificationCode, connected
 from rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 

@@ -5,16 +5,137 @@ exclude nothing, such as a rate that allows any change, are left out.
 """
 
 import math
+import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from decimal import ROUND_CEILING, Decimal
 
-from rosmop.learn import extremes
-from rosmop.learn.rv_text import identifier, literal, number, rounded_down, rounded_up, short_names
 from rosmop.learn.series import HighestValues, Series, Statistic, ValueSeries
 from rosmop.learn.topic_orders import TopicOrders, TopicPair
 from rosmop.learn.topics import TopicContent, TopicRhythm
+from rosmop.text.complaints import FORBIDDEN, RESERVED
 from roswire.counted import counted
+
+# Write numbers, strings, names and conditions of `.rv` text.
+
+_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+_PRINTABLE = re.compile(r"[ -~]*+\Z")
+CPP = {
+    "float32": "float", "float64": "double", "byte": "int8_t", "char": "uint8_t", "string": "std::string",
+    "bool": "bool", **{f"{sign}int{size}": f"{sign}int{size}_t" for sign in ("", "u") for size in (8, 16, 32, 64)},
+}  # fmt: skip
+WORDS = frozenset(FORBIDDEN) | RESERVED
+
+
+def rounded_up(value: float, width: float) -> str:
+    if not width > 0:
+        return number(value)
+    quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
+    return number(float(Decimal(value).quantize(quantum, ROUND_CEILING)))
+
+
+def rounded_down(value: float, width: float) -> str:
+    return number(-float(rounded_up(-value, width)))
+
+
+def number(value: float) -> str:
+    text = repr(value)
+    if isinstance(value, int) and value >= 1 << 63:
+        return f"{text}u"  # only an unsigned type holds it
+    return "0.0" if text == "-0.0" else text
+
+
+def literal(value: object) -> str | None:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f'"{quoted(value)}"' if _PRINTABLE.match(value) else None
+    return number(value) if isinstance(value, int | float) and math.isfinite(value) else None
+
+
+def quoted(text: str) -> str:
+    return "".join(_ESCAPES.get(letter, letter) for letter in text)
+
+
+def one_line(text: str) -> str:
+    """Replace line ends by spaces, and escape other control characters."""
+    words = " ".join(text.split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
+
+
+def formatted(text: str) -> str:
+    return quoted(text).replace("%", "%%")
+
+
+def identifier(text: str) -> str:
+    name = re.sub(r"[^A-Za-z0-9]++", "_", text).strip("_") or "root"
+    return f"n{name}" if name[0].isdigit() else name
+
+
+def short_names(paths: Iterable[str]) -> dict[str, str]:
+    paths = list(paths)
+    names: dict[str, str] = {}
+    for path in paths:
+        steps = path.split(".")
+        for count in range(1, len(steps) + 1):
+            end = ".".join(steps[-count:])
+            others = (other for other in paths if other != path)
+            if count == len(steps) or not any(other == end or other.endswith("." + end) for other in others):
+                name = "_".join(steps[-count:])
+                taken = name in WORDS or name in names.values() or name in _OWN
+                names[path] = f"{name}_field" if taken else name
+                break
+    return names
+
+
+_OWN = frozenset(
+    {"now", "elapsed", "before", "begun", "i", "messages", "opened", "message", "stamped", "abs", "isinf"}
+)
+
+
+# Set a bound beyond the observed values, by extreme value theory on the extremes of independent windows.
+#
+# Gumbel's distribution, which suits exponential tails, is fitted to the largest value of each window by
+# L-moments (Hosking 1990). The bound is the level that is passed once in a given number of windows. No shape
+# parameter is fitted, because some twenty windows are too few: if the quantity has a limit, the margin is wider
+# than needed, which causes no false alarm.
+#
+# If a robot sometimes goes far, the upper quarter of windows has a longer tail: the exponential through its
+# mean excess (Weissman 1978) is the bound if it is higher. An extreme that several windows reach exactly is a
+# stop, such as a joint's limit, and is then the bound.
+
+FEWEST_WINDOWS = 8
+
+_STOP = 3  # the minimum number of windows that reach the same extreme
+_SAME = 1e-9  # relative difference that rounding can cause between equal extremes
+_TAIL = 4  # the tail is the highest of this many equal parts of the values
+_EULER = 0.5772156649015329
+
+
+def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
+    """Return the level that the maximum of a window exceeds once in `windows` windows, or None with too little data.
+
+    With `stops`, the quantity may have a stop. Calculated quantities have none, because rounded differences
+    can be equal by chance.
+    """
+    values = sorted(highs)
+    count = len(values)
+    if count < FEWEST_WINDOWS:
+        return None
+    top = values[-1]
+    if stops and top - values[-_STOP] <= _SAME * abs(top):
+        return top
+    first = sum(values) / count
+    second = sum(index * value for index, value in enumerate(values)) / (count * (count - 1))
+    scale = (2 * second - first) / math.log(2)
+    place = first - _EULER * scale
+    level = place - scale * math.log(-math.log1p(-1 / max(windows, 2.0)))
+    highest = count // _TAIL
+    threshold = values[-highest - 1]
+    excess = sum(values[-highest:]) / highest - threshold
+    return max(level, threshold + excess * math.log(max(windows * highest / count, 1.0)), top)
+
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
@@ -148,7 +269,7 @@ class _Proposer:
         return CandidateSupport(rhythm.count, round(self._known.seconds, 1), len(rhythm.recordings))
 
     def _upper(self, highs: HighestValues, *, stops: bool = False) -> float | None:
-        return extremes.upper(highs.of.values(), self._windows, stops=stops)
+        return upper(highs.of.values(), self._windows, stops=stops)
 
     def _rhythm(
         self, topic: str, rhythm: TopicRhythm, content: TopicContent, support: CandidateSupport

@@ -6,6 +6,7 @@ the same results. Specifications in shadow mode are in separate sets (`shadows`)
 others; after a message is passed on, the caller gives its copies to them (`ShadowCopy.give`).
 """
 
+import math
 import sys
 import weakref
 from bisect import bisect_left, bisect_right
@@ -16,15 +17,13 @@ from typing import Any, NamedTuple
 import msgspec
 
 from rosmop.form import nodes
-from rosmop.form.compiled import Compiled, EventCode, SpecificationCode, Withholding
-from rosmop.form.connected_groups import channel_of
+from rosmop.form.compiled import Compiled, EventCode, SpecificationCode, Withholding, channel_of
 from rosmop.form.findings import Diagnostic
 from rosmop.form.specification_groups import groups
 from rosmop.run.execution import Asked, MonitorExecution, OnFault
 from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, FastLane, FastPath, Lanes, Tried
 from rosmop.run.guards import guards_of
 from rosmop.run.interpreter import Interpreter
-from rosmop.run.margins import begin_margins, taken_margins
 from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, Tap, monitors_of
 from rosmop.run.outcomes import NOBODY, SHADOW_BUDGET, Margin, MessageSender, Outcome
 from rosmop.run.readout import Readout, read_out
@@ -48,6 +47,27 @@ from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import Buffer, WireMessage
 from rosmop.types.value_types import Value
 from roswire.definitions import Definitions
+
+# Measure how close comparisons of numbers came during a replay. Monitors in force do not measure this.
+
+
+def begin_margins(monitors: Sequence[MonitorInstance], variables: dict[str, Any]) -> None:
+    for monitor in monitors:
+        for comparison in monitor.code.comparisons:
+            for left, right in (comparison.when_true, comparison.when_false):
+                variables |= {left: math.inf, right: 0.0}
+
+
+def taken_margins(monitors: Sequence[MonitorInstance], variables: dict[str, Any]) -> Iterator[Margin]:
+    for monitor in monitors:
+        for number, comparison in enumerate(monitor.code.comparisons):
+            for holds, sides in ((True, comparison.when_true), (False, comparison.when_false)):
+                left, right = (variables[name] for name in sides)
+                if not math.isinf(left):
+                    variables[sides[0]] = math.inf
+                    place = monitor.name, number, comparison.position, comparison.threshold
+                    yield Margin(*place, holds, left, right)
+
 
 GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
 

@@ -9,7 +9,7 @@ import operator
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from rosmop.runtime import elementary, formatting, numbers, strings, times, vectors
+from rosmop.runtime import formatting, numbers, strings, times, vectors
 
 Function = Callable[..., object]
 
@@ -30,8 +30,8 @@ FUNCTIONS: Mapping[str, Function] = MappingProxyType(
         **{f"h_{name}f": function for name, function in numbers.FLOAT_MATH.items()},
         "h_min": min,
         "h_max": max,
-        "h_sin_of_a_large_angle": elementary.sin,
-        "h_cos_of_a_large_angle": elementary.cos,
+        "h_sin_of_a_large_angle": numbers.sin,
+        "h_cos_of_a_large_angle": numbers.cos,
         "h_signbit": numbers.signbit,
         "h_isnan": math.isnan,
         "h_isinf": math.isinf,

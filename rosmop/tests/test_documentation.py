@@ -5,10 +5,9 @@ import pytest
 
 from rosmop.check.function_library import FREE, TEXT, functions
 from rosmop.check.loops import MAX_NESTED
-from rosmop.check.members import TIME_METHODS
+from rosmop.check.members import TEXT_METHODS, TIME_METHODS
 from rosmop.check.sources import compiled_from
 from rosmop.check.standard_functions import LIBRARY
-from rosmop.check.string_members import TEXT_METHODS
 from rosmop.check.vector_members import VECTOR_METHODS
 from rosmop.fast.build import certified, require_loadable
 from rosmop.runtime.action_context import BUDGET, MAX_BYTES, MAX_CALLS

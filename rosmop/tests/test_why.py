@@ -17,8 +17,7 @@ from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaEr
 from rosmop.run import explain
 from rosmop.run.engine import MonitorSet
 from rosmop.run.explain import ClockedSteps, Steps, history_of
-from rosmop.run.outcomes import NOBODY, SEQ, EventOccurrence, Explanation, MessageSender, decided_by
-from rosmop.run.subformulas import Meaning
+from rosmop.run.outcomes import NOBODY, SEQ, EventOccurrence, Explanation, Meaning, MessageSender, decided_by
 from rosmop.tests.acting import definitions, message
 from rosmop.tests.logics.driving import compiled, seeded
 from rosmop.tests.logics.temporal import ARITY, BOOLEAN, Printer, draw

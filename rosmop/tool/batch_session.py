@@ -5,7 +5,8 @@ The exit status is 3 if one of several recordings failed. If the only recording 
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,16 @@ from typing import Any
 
 import msgspec
 import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from rosmop.batch.jobs import Failure, Job, Result
 from rosmop.batch.journal import JournalError, ResumeJournal, TemporaryStore
@@ -21,8 +32,44 @@ from rosmop.batch.recording_list import RecordingName, recordings_of
 from rosmop.batch.runner import JobRunner, executor_for
 from rosmop.recordings.recording import RecordingError
 from rosmop.tool.command_context import CommandContext
-from rosmop.tool.progress_bar import progress
 from rosmop.tool.terminal import refused
+
+# Show progress on standard error: a bar on a terminal, lines if the user wants them, nothing otherwise.
+
+
+@contextmanager
+def progress(
+    what: str, total: Callable[[], int], *, shares_screen: bool = False, always: bool = False
+) -> Iterator[Callable[[int], None]]:
+    """Show progress during a block, which passes the finished part of `total()` to the function that it gets.
+
+    If the work `shares_screen`, there is no bar when standard output is a terminal. Without a bar, `always`
+    prints a line for each percent.
+    """
+    console = Console(stderr=True)
+    is_bar = console.is_terminal and not (shares_screen and sys.stdout.isatty())
+    if not is_bar and not always:
+        yield lambda _done: None
+        return
+    columns = (
+        SpinnerColumn(), TextColumn(what), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True, disable=not is_bar) as bar:
+        task = bar.add_task(what, total=total() or None)
+        shown = -1
+
+        def advance(done: int) -> None:
+            nonlocal shown
+            bar.update(task, completed=done)
+            row = bar.tasks[0]
+            if not is_bar and int(row.percentage) > shown:
+                shown = int(row.percentage)
+                left = "" if row.time_remaining is None else f", {row.time_remaining:.0f} s left"
+                sys.stderr.write(f"{what}: {shown} %{left}\n")
+
+        yield advance
+
 
 SOME_FAILED = 3
 _INTERRUPTED = 130

@@ -11,10 +11,9 @@ from rosmop.form.findings import SpecificationError
 from rosmop.recordings.recording import Reader, definitions_of, open_recording
 from rosmop.recordings.replay import OutputBag, refusals, replay
 from rosmop.run.engine import MonitorSet
-from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
+from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session, progress
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
-from rosmop.tool.progress_bar import progress
 from rosmop.tool.replay_report import MOST_IN_ROWS, ReplayReport
 from rosmop.tool.specification_input import read_for_recordings
 from rosmop.tool.terminal import refused, say, say_json

@@ -36,8 +36,7 @@ from appliance.hosts.certificate_requests import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.host_signs import HostSigns
-from appliance.master.endpoints.rank_states import RankStates
-from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.relay_control import RankStates, RelayControl
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Registry

@@ -5,8 +5,7 @@ from pathlib import Path
 from appliance.channel.link import Link
 from appliance.channel.messages import AuthorityStated, CertificateMade
 from appliance.hosts.certificate_requests import Authority, AuthorityError
-from appliance.ipsec.certificate_authority import CertificateAuthority
-from appliance.ipsec.proof_of_possession import RequestRefusedError
+from appliance.ipsec.certificate_authority import CertificateAuthority, RequestRefusedError
 
 
 class NearAuthority(Authority):

@@ -35,8 +35,7 @@ from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.control.rest.rest import RestLink
-from appliance.control.rest.rest_uses import RestUses
+from appliance.control.rest.rest import RestLink, RestUses
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example

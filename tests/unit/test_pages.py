@@ -13,7 +13,7 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.supervisor.role import Facts
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, UNIX
-from distribution import command_line_page, settings_page
+from distribution import command_line_page, generated_pages
 from rosmop.tool.command import app as rosmop_app
 from tests.support.command import commands
 from tests.support.page_steps import steps
@@ -314,8 +314,8 @@ def test_file_names_of_pages_and_examples_have_no_version(page: Path) -> None:
 
 
 def test_sizes_have_one_bound_on_the_settings_page() -> None:
-    assert "size above 0" in settings_page.page()
-    assert "size with a unit or integer" not in settings_page.page()
+    assert "size above 0" in generated_pages.settings_markdown()
+    assert "size with a unit or integer" not in generated_pages.settings_markdown()
 
 
 def test_the_architecture_lists_each_folder_once() -> None:

@@ -54,7 +54,7 @@ LOCAL = {
     "appliance/api/console/console_bundle.py": "the console's own files, at the start",
     "appliance/base/validation_messages.py": "sentences of our libraries about settings and bodies",
     "appliance/cli/": "a process of the operator",
-    "appliance/features/monitor_tools/sources_to_send.py": "a process of the operator",
+    "appliance/features/monitor_tools/load_verb.py": "a process of the operator",
     "appliance/features/policy_tools/": "a process of the operator",
     "appliance/features/selftest/": "a process of the operator",
     "appliance/features/topics/": "a process of the operator",
@@ -64,9 +64,8 @@ LOCAL = {
     "rosmop/learn/": "a process of the operator",
     "rosmop/text/": "a process of the compiler, whose processor time is limited (`DRY_RUNS`)",
     "fleet/src/rosrv_fleet/bundles/commands.py": "a process of the operator",
-    "fleet/src/rosrv_fleet/bundles/keys.py": "names of files in a folder of the operator",
-    "fleet/src/rosrv_fleet/bundles/publication.py": "names of files in a folder of the operator",
     "fleet/src/rosrv_fleet/bundles/repository.py": "names of files in a folder of the operator",
+    "fleet/src/rosrv_fleet/bundles/publication.py": "names of files in a folder of the operator",
 }
 """Code whose patterns delay only the process that runs it."""
 

@@ -12,8 +12,8 @@ from appliance.channel import messages
 from appliance.configuration.settings import Audit, LivenessSection, Settings
 from appliance.control.assembly.assembly import Parts
 from appliance.control.process import _run as run_control
-from appliance.features.standby.lease_watch import LeaseWatch
 from appliance.features.standby.membership import LINK_FILE, Membership, save_membership
+from appliance.features.standby.pairing import LeaseWatch
 from appliance.features.standby.process import EPOCH, LeaseProcess
 from appliance.relay.connections.admission import missing
 from appliance.relay.grant_table import GrantTable

@@ -10,7 +10,7 @@ from typing import Any
 
 from appliance.control import process as control_process
 from appliance.features.standby.lease import ApplianceLease
-from appliance.features.standby.lease_watch import LeaseWatch
+from appliance.features.standby.pairing import LeaseWatch
 from appliance.features.standby.passive import PassiveControl
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replication import Replication

@@ -16,11 +16,11 @@ from appliance.audit.log import log_database, log_writer
 from appliance.audit.log.log import AuditLog
 from appliance.base import clock
 from appliance.channel import child_process
+from appliance.control import process
 from appliance.control import process as control_process
-from appliance.control import supervisor_messages
 from appliance.control.assembly import assembly, endpoints, foundation, listener_limits, open_audit
 from appliance.control.links import supervisor_link
-from appliance.features.standby import passive, replica, replication, takeover_check
+from appliance.features.standby import passive, replica, replication
 from appliance.features.standby import process as lease_process
 from appliance.features.standby.replica_sync import StateComparison
 from appliance.features.standby.replication_frames import ReplicationError
@@ -170,12 +170,12 @@ def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]
         (passive, "replication_context", _handle),
         (passive, "ReplicationListener", partial(_Listener, streams)),
         (passive, "socket", SimpleNamespace(create_server=_listening, socket=_handle)),
-        (takeover_check, "replication_context", _handle),
+        (passive, "replication_context", _handle),
         (replication, "replication_context", _handle),
         (replication, "ReplicationListener", partial(_Listener, streams)),
         (replication, "socket", SimpleNamespace(create_server=_listening)),
-        (supervisor_messages, "socket", sockets),
-        (supervisor_messages, "Channel", _handle),
+        (process, "socket", sockets),
+        (process, "Channel", _handle),
     ]
     before = [(place, name, getattr(place, name)) for place, name, _other in replaced]
     try:

@@ -20,23 +20,134 @@ import msgspec
 import structlog
 
 from appliance.audit.log.budget import Budget
-from appliance.audit.log.disk_space import DiskSpace
 from appliance.audit.log.folding import FoldSettings, RecordFolder
-from appliance.audit.log.housekeeping import WRITE_ERRORS, Housekeeping, Waiter, answer
+from appliance.audit.log.housekeeping import WRITE_ERRORS, Housekeeping, Remover, Waiter, answer
 from appliance.audit.log.ids import IdSource
-from appliance.audit.log.lock_holders import holders
 from appliance.audit.log.log_writer import ChainWriter
-from appliance.audit.log.other_logs import OtherLogs
-from appliance.audit.log.record import AuditRecord, Severity
-from appliance.audit.log.removal import Remover
+from appliance.audit.log.record import AuditRecord, MakeRecord, Severity
 from appliance.audit.log.repetition import summary
 from appliance.audit.log.retention import Retention
 from appliance.audit.log.signatures import CheckpointSigner, RemovalSigner, Signatures, pinned_key_path
 from appliance.base.clock import now, wall_ns
+from appliance.base.counted import counted
 from appliance.base.engine_thread import Drive, EngineThread
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
 from appliance.signing.signed_logs import OtherLog
+
+# Record that the signer signed other logs than the present one, which was therefore replaced or moved away.
+#
+# Each of them is a record in the present log, with its last signed checkpoint, so the chain goes on. The record is
+# repeated at each start until an operator sets that log aside.
+
+
+class OtherLogs:
+    """The other logs that the signer has signed. `hold` receives a record for each change."""
+
+    def __init__(self, make: MakeRecord, hold: Callable[[AuditRecord], None]) -> None:
+        self._make = make
+        self._hold = hold
+        self._missing: dict[str, OtherLog] = {}
+
+    @property
+    def missing(self) -> str | None:
+        """Return which logs no operator set aside, in words; None if there are none."""
+        if not self._missing:
+            return None
+        names = ", ".join(f"{one.log} (up to checkpoint {one.last})" for one in self._missing.values())
+        return (
+            f"the audit log was replaced: the signer also signed {counted(len(self._missing), 'other log')}, {names};"
+            " rosrv audit verify"
+        )
+
+    def named(self, others: Sequence[OtherLog]) -> None:
+        before, self._missing = self._missing, {one.log: one for one in others if one.set_aside is None}
+        for log, other in self._missing.items():
+            if before.get(log) != other:
+                reason = "another log took its place, and no operator has set it aside"
+                self._note("log replaced", Severity.ALARM, reason, other)
+        for other in others:
+            if other.set_aside is not None and other.log in before:
+                self._note("log set aside", Severity.NOTICE, "by an operator on the machine", other)
+
+    def _note(self, event: str, severity: Severity, reason: str, other: OtherLog) -> None:
+        detail = {"log": other.log, "number": other.last, "hash": other.hash}
+        self._hold(self._make(event, severity, reason, detail))
+
+
+# Find the processes that hold SQLite's write locks on the log, in the kernel's list of locks.
+#
+# A correct reader never takes these locks. The files are not opened, because closing a file releases all of this
+# process's locks on it.
+
+_LISTED = Path("/proc/locks")
+_OF_WRITING = range(120, 123)  # bytes of the -shm file: write, checkpoint, recover (walIndex of SQLite)
+_OF_THE_DATABASE = range(0x40000000, 0x40000002)  # bytes of the database: pending, reserved
+
+
+def holders(log: Path) -> list[int]:
+    """Return the ids of the processes with such a lock; -1 is a lock without a process (open file description)."""
+    bytes_of = {}
+    for path, needed in ((log.with_name(f"{log.name}-shm"), _OF_WRITING), (log, _OF_THE_DATABASE)):
+        try:
+            bytes_of[path.stat().st_ino] = needed
+        except OSError:
+            continue
+    try:
+        lines = _LISTED.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return []
+    found = set()
+    for line in lines:
+        # `1: POSIX  ADVISORY  READ 4711 fe:00:2190450 120 120`; a waiting process has `->` after the number
+        words = line.split()
+        if len(words) != 8 or words[1] not in {"POSIX", "OFDLCK"}:
+            continue
+        needed = bytes_of.get(int(words[5].rpartition(":")[2]), range(0))
+        first, last = int(words[6]), 1 << 63 if words[7] == "EOF" else int(words[7])
+        if needed and first <= needed[-1] and needed[0] <= last:
+            found.add(int(words[4]))
+    return sorted(found)
+
+
+# Watch the free space on the log's disk.
+
+_LOOK_SECONDS = 0.5
+_AGAIN = 1.25  # times the reserve must be free before space is no longer scarce, so that alarms do not flap
+
+
+class DiskSpace:
+    """The free space on the disk of the log at `path`.
+
+    `tell` gets the bytes left of the last `reserve` bytes, or None while more is free, and the free bytes.
+    """
+
+    def __init__(self, path: Path, reserve: int, tell: Callable[[int | None, int], None]) -> None:
+        self._folder = path.parent
+        self._reserve = reserve
+        self._tell = tell
+        self.due = float("-inf")
+        self.left: int | None = None
+
+    def look(self, now: float) -> bool | None:
+        """Return True if space just became scarce, False if it just ceased to be, else None. Raises `OSError`."""
+        self.due = now + _LOOK_SECONDS
+        disk = os.statvfs(self._folder)
+        free, before = disk.f_bavail * disk.f_frsize, self.left
+        enough = self._reserve if before is None else self._reserve * _AGAIN
+        self.left = None if free >= enough else min(free, self._reserve)
+        self._tell(self.left, free)
+        return None if (before is None) == (self.left is None) else self.left is not None
+
+    @property
+    def scarce(self) -> str | None:
+        if self.left is None:
+            return None
+        return (
+            f"{self._folder}: {self.left} bytes are free, below the reserve of {self._reserve} (audit.reserve_bytes):"
+            " hosts that cause many records are slowed; make room, or let old records go (audit.retention_bytes)"
+        )
+
 
 Durability = Literal["strict", "batched"]
 _GATHER_SECONDS = 0.02

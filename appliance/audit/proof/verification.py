@@ -21,10 +21,11 @@ from appliance.audit.log.signatures import pinned_key_path, read_public_key, sig
 from appliance.audit.proof.chain_findings import FindingKind, LogFinding, Verification
 from appliance.audit.proof.checkpoints import (
     CheckpointVerifier,
+    SignerMemory,
     last_removal,
+    read_signer_memory,
 )
 from appliance.audit.proof.copies import CopiesVerifier, SignedCheckpoint
-from appliance.audit.proof.signer_memory import SignerMemory, read_signer_memory
 from appliance.base.counted import counted
 from appliance.signing.log_proof import NO_CHECKPOINT, genesis, signature_fault
 

@@ -1,16 +1,28 @@
 """Answer queries about the appliance: status, graph, live registrations, measurements. Queries change nothing."""
 
 import asyncio
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
+from msgspec.structs import asdict
 
 import appliance
 from appliance.base.clock import wall
 from appliance.channel import admin
-from appliance.channel.answers.graph_answers import Graph, Registration, Registrations
+from appliance.channel.answers.graph_answers import (
+    Connection,
+    Graph,
+    Node,
+    Publisher,
+    Registration,
+    Registrations,
+    Service,
+    Topic,
+)
+from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.inventory_answers import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
@@ -30,13 +42,189 @@ from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
 from appliance.control.assembly.policies import Policies
 from appliance.control.links.supervisor_link import Surroundings
-from appliance.control.operators.measurements import measures_of
-from appliance.control.operators.overview import graph_of
 from appliance.features.views import states_in
-from appliance.master.graph.registry import Kind, Life
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic, Traffic
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.policy.live_rights import LiveRight
+from appliance.policy.model import Category
 from appliance.policy.sections import DECIDERS
-from appliance.telemetry.audit_trail import AuditTrail
+from appliance.specifications.allocation import SERVICE, TOPIC
+from appliance.specifications.records import KINDS
+from appliance.telemetry.audit_trail import AuditTrail, Meter
+
+# Describe the graph for operators: nodes, topics, services, connections, traffic.
+
+
+def graph_of(registry: Registry, relay: RelayControl) -> Graph:
+    shown = [
+        incarnation
+        for incarnation in registry.all()
+        if incarnation.life is not Life.REPLACED and not incarnation.own
+    ]
+    live = [incarnation for incarnation in shown if incarnation.life is Life.LIVE]
+    names = {incarnation.key: incarnation.name for incarnation in shown}
+    return Graph(
+        [_node(incarnation) for incarnation in sorted(shown, key=lambda incarnation: incarnation.name)],
+        _topics(registry, relay, live, names),
+        _services(relay, live, names),
+    )
+
+
+def hosts_connected(registry: Registry, carried: RelayTraffic) -> Iterator[set[str]]:
+    for connection in carried.connections.values():
+        holder = registry.by_key(connection.key)
+        yield {connection.host} if holder is None else {connection.host, str(holder.host)}
+
+
+def _node(incarnation: Incarnation) -> Node:
+    return Node(
+        incarnation.name,
+        str(incarnation.host),
+        "live" if incarnation.life is Life.LIVE else "lost",
+        publishes=sorted(incarnation.resources(Kind.PUBLICATION)),
+        subscribes=sorted(incarnation.resources(Kind.SUBSCRIPTION)),
+        offers=sorted(incarnation.resources(Kind.SERVICE)),
+    )
+
+
+def _topics(
+    registry: Registry, relay: RelayControl, live: list[Incarnation], names: dict[str, str]
+) -> list[Topic]:
+    connections = _connections(relay, TOPIC, names)
+    publishers: dict[str, list[Publisher]] = {}
+    subscribers: dict[str, list[str]] = {}
+    for incarnation in live:
+        for registration in incarnation.registrations.values():
+            topic = registration.resource
+            if registration.kind is Kind.PUBLICATION:
+                publisher = Publisher(
+                    **asdict(relay.carried.flow(incarnation.key, topic)), node=incarnation.name
+                )
+                publishers.setdefault(topic, []).append(publisher)
+            elif registration.kind is Kind.SUBSCRIPTION:
+                subscribers.setdefault(topic, []).append(incarnation.name)
+    return [
+        Topic(
+            name,
+            registry.type_of(name),
+            mediated=relay.carries_topic(name),
+            publishers=publishers.get(name, []),
+            subscribers=subscribers.get(name, []),
+            connections=connections.get(name, []),
+        )
+        for name in sorted(publishers.keys() | subscribers.keys())
+    ]
+
+
+def _services(relay: RelayControl, live: list[Incarnation], names: dict[str, str]) -> list[Service]:
+    connections = _connections(relay, SERVICE, names)
+    return [
+        Service(
+            **asdict(relay.carried.flow(incarnation.key, registration.resource)),
+            name=registration.resource,
+            node=incarnation.name,
+            mediated=relay.carries_service(registration.resource),
+            connections=connections.get(registration.resource, []),
+        )
+        for incarnation in live
+        for registration in incarnation.registrations.values()
+        if registration.kind is Kind.SERVICE
+    ]
+
+
+def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[str, list[Connection]]:
+    found: dict[str, list[Connection]] = {}
+    for connection in relay.carried.connections.values():
+        if connection.kind == kind and connection.key in names:
+            row = Connection(names[connection.key], connection.caller_id, connection.host)
+            found.setdefault(connection.resource, []).append(row)
+    return found
+
+
+# Collect the measurements of control. The api formats them for Prometheus.
+
+MOST_DELAYED = 200  # the most topics that have their own histogram
+
+_Labels = tuple[str, str]
+_Number = TypeVar("_Number", int, float)
+_DECISIONS = tuple(
+    (category.value, outcome) for category in Category for outcome in ("allow", "deny", "would deny", "ask")
+)
+
+
+def measures_of(
+    parts: Parts, meter: Meter, status: Status, hosts: list[Host], queued_deliveries: int
+) -> Measures:
+    """Return the measurements; all but `MOST_RESOURCES` topics and services are summed in `OTHERS`.
+
+    For histograms, the limit is `MOST_DELAYED`.
+    """
+    lives = Counter(incarnation.life for incarnation in parts.core.registry.all() if not incarnation.own)
+    kinds = Counter(
+        registration.kind.value for node, registration in parts.core.registry.in_order() if not node.own
+    )
+    records = parts.monitors.records
+    carried = parts.core.carried
+    relayed, delayed = carried_of(carried)
+    done = from_zero(records.counts, ((kind, name) for name in parts.monitors.names() for kind in KINDS))
+    return Measures(
+        status=status,
+        hosts=hosts,
+        queued_deliveries=queued_deliveries,
+        decisions=[(*labels, count) for labels, count in from_zero(meter.decisions, _DECISIONS).items()],
+        decision_seconds=meter.decision_seconds.values(),
+        calls=[(call, histogram.values()) for call, histogram in meter.calls.items()],
+        nodes={"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
+        registrations=dict(kinds),
+        relayed=relayed,
+        delayed=delayed,
+        monitors=[(*labels, count) for labels, count in done.items()],
+        slices={
+            name: (row.slices, row.slice_limit)
+            for name, row in parts.monitors.rollout.rows.items()
+            if row.slice_limit
+        },
+        drop_at=_at(records.at, "drop"),
+        change_at=_at(records.at, "change"),
+        limited=[(*labels, count) for labels, count in carried.limited_messages.items()],
+        memory={
+            what: sum(held.get(what, 0) for held in carried.memory.values())
+            for what in ("frames", "queues", "latched", "headers")
+        },
+        connections=dict(Counter(connection.kind for connection in carried.connections.values())),
+    )
+
+
+def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:
+    sums = by_resource((resource, (count,)) for (what, resource), count in counts.items() if what == kind)
+    return {resource: count for resource, (count,) in sums.items()}
+
+
+def carried_of(carried: RelayTraffic) -> tuple[dict[str, list[int]], dict[str, list[float]]]:
+    rows: list[tuple[str, Traffic]] = [*carried.past.items()]
+    rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
+    return by_resource((name, (row.messages, row.bytes, row.dropped)) for name, row in rows), by_resource(
+        ((name, (*row.delays, row.delay_seconds)) for name, row in rows if row.delays), MOST_DELAYED
+    )
+
+
+def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dict[_Labels, int]:
+    """Add 0 for events that have not happened yet, because a Prometheus counter must start at 0."""
+    return dict.fromkeys(expected, 0) | dict(counts)
+
+
+def by_resource(
+    rows: Iterable[tuple[str, tuple[_Number, ...]]], most: int = MOST_RESOURCES
+) -> dict[str, list[_Number]]:
+    sums: dict[str, list[_Number]] = {}
+    for resource, values in rows:
+        name = resource if resource in sums or len(sums) < most else OTHERS
+        row = sums.setdefault(name, [0] * len(values))
+        for place, more in enumerate(values):
+            row[place] += more
+    return sums
+
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 

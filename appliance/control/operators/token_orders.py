@@ -1,24 +1,55 @@
 """Make, rotate, list and revoke the access tokens of REST.
 
 The api gets data to recognise tokens, but never their secrets; if compromised, it can report wrong uses. A session
-(`sessions.py`) never replaces the token with its id.
+never replaces the token with its id.
 """
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import cast
+from typing import NamedTuple, Protocol, cast
 
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
+from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import TokenRefusedError
-from appliance.control.operators.sessions import Sessions
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
+
+# Define people's sessions, which a feature that signs people in offers to the rest of control.
+#
+# A session is a token that a person's browser made for itself, so roles, quotas, orders and records treat both alike.
+
+
+class Session(NamedTuple):
+    """A person who is signed in.
+
+    `subject` is the provider's permanent identifier, and `mail` empty unless it is verified. `groups` select the
+    person's door.
+    """
+
+    id: str
+    name: str
+    subject: str
+    mail: str
+    role: TokenRole
+    groups: tuple[str, ...]
+    expires: float
+
+
+class Sessions(Protocol):
+    """The sessions of this control process; they end with it."""
+
+    def rows(self) -> list[TokenRow]:
+        """Return the usable sessions as rows of tokens."""
+
+    def of(self, session_id: str) -> Session | None:
+        """Return the session, or None if it has ended."""
+
 
 TOKENS = EndKind("token", dated=True)
 FIRST_NAME = "first"

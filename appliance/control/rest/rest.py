@@ -13,14 +13,15 @@ A flooded or compromised api cannot block RVMaster:
 
 import asyncio
 import os
-from collections import deque
-from collections.abc import Callable
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 import structlog
 
 from appliance.audit.log.record import Severity
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.base.withdrawal import awaited
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, ChallengeWanted, WaitingRequest, encode, verb_of
@@ -29,6 +30,7 @@ from appliance.channel.link import Link
 from appliance.channel.messages.api import (
     ConnectionAnswered,
     ConnectionPassed,
+    LongRequest,
     RequestAnswered,
     RequestMade,
     RequestsRunning,
@@ -42,8 +44,55 @@ from appliance.channel.messages.api import (
 from appliance.channel.operations import ORDERS
 from appliance.control.operators.administration import Administration
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError, UsableTokens
-from appliance.control.rest.rest_uses import RestUses
+from appliance.policy.host_sets import canonical_address
+from appliance.policy.model import Address, address_of
 from appliance.telemetry.audit_trail import AuditTrail
+
+# Note who uses REST and the console from which host, for the answer to a block (`HostUses`).
+
+_RECENT_SECONDS = 900.0
+_MOST_RECENT = 1000
+
+
+class RestUses:
+    """The people and programs that lately used REST and the console, and the requests that still run.
+
+    `blocked()` returns the hosts that REST must refuse.
+    """
+
+    def __init__(self, blocked: Callable[[], Iterable[Address]] = tuple) -> None:
+        self.blocked = blocked
+        self._recent: OrderedDict[tuple[Address, str], float] = OrderedDict()  # oldest first
+        self._running: list[LongRequest] = []
+
+    def called(self, host: str, who: str) -> None:
+        key = _address(host), who
+        if key[0] is None or not who:
+            return
+        self._recent[key[0], who] = clock.now()
+        self._recent.move_to_end((key[0], who))
+        while len(self._recent) > _MOST_RECENT:
+            self._recent.popitem(last=False)
+
+    def running(self, requests: list[LongRequest]) -> None:
+        self._running = requests
+
+    def of(self, host: Address) -> Iterable[str]:
+        now = clock.now()
+        for (address, who), at in self._recent.items():
+            if address == host and now - at < _RECENT_SECONDS:
+                yield f"session of {who} (REST, last call {now - at:.0f} s ago)"
+        for one in self._running:
+            if _address(one.host) == host:
+                yield f"{counted(one.count, 'follower')} of {one.who} ({one.path})"
+
+
+def _address(text: str) -> Address | None:
+    try:
+        return canonical_address(address_of(text))
+    except ValueError:
+        return None
+
 
 _log = structlog.get_logger()
 _MOST_WAITING = 64

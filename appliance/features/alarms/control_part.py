@@ -1,9 +1,84 @@
 """Build the part of control for alarms."""
 
-from appliance.control.core import ControlPart, Core
+from appliance.channel.alarms import AlarmList, activity, open_alarms
+from appliance.control.core import Alarms, ControlPart, Core
+from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.alarms.orders import AlarmOrders
-from appliance.features.alarms.requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
+from appliance.features.alarms.requests import (
+    LONGEST_SILENCE_SECONDS,
+    AlarmAcknowledge,
+    AlarmSilence,
+    AlarmsWanted,
+)
+from appliance.telemetry.audit_trail import AuditTrail
+
+# Answer operators' requests about alarms. `control/operators/handled_alarms.py` stores acknowledgements and
+# silences.
+
+
+class AlarmOrders:
+    """Answers requests about the alarms in the status."""
+
+    def __init__(self, alarms: Alarms, trail: AuditTrail) -> None:
+        self._handled = alarms.handled
+        self._trail = trail
+        self._status = alarms.status
+
+    async def listed(self, _request: AlarmsWanted) -> AlarmList:
+        return self._list()
+
+    async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
+        self._must_be_present(request.kind)
+        kind, earlier = request.kind, self._handled.state(request.kind)
+        self._handled.acknowledge(kind, who, request.note)
+        text = f"{kind} is acknowledged"
+        self._record("alarm acknowledged", text, kind, who, request.note, earlier=earlier)
+        return self._list()
+
+    async def silence(self, request: AlarmSilence, who: str) -> AlarmList:
+        kind, seconds, earlier = request.kind, request.seconds, self._handled.state(request.kind)
+        if seconds is None:
+            if not self._handled.end(kind):
+                raise UnknownThingError(
+                    f"the alarm {kind[:200]} is neither silenced nor acknowledged: rosrv alarm list"
+                )
+            self._record("alarm sounds again", f"{kind} is an alarm again", kind, who, "", earlier=earlier)
+            return self._list()
+        if not 1 <= seconds <= LONGEST_SILENCE_SECONDS:
+            raise SenselessError(f"silence an alarm for 1 to {LONGEST_SILENCE_SECONDS:.0f} seconds")
+        self._must_be_present(kind)
+        until = self._handled.silence(kind, who, request.note, seconds)
+        self._record(
+            "alarm silenced",
+            f"{kind} is silenced for {seconds:.0f} s",
+            kind,
+            who,
+            request.note,
+            earlier=earlier,
+            until=until,
+        )
+        return self._list()
+
+    def _list(self) -> AlarmList:
+        status = self._status()
+        return AlarmList([*open_alarms(status), *activity(status)], status.name)
+
+    def _must_be_present(self, kind: str) -> None:
+        present = [alarm.kind for alarm in self._list().alarms]
+        if kind not in present:
+            known = f"there are: {', '.join(present)}" if present else "there is none now"
+            raise UnknownThingError(f"there is no alarm {kind[:200]!r}; {known}")
+
+    def _record(self, event: str, text: str, kind: str, who: str, note: str, **more: object) -> None:
+        self._trail.happened(
+            event,
+            f"{text}: {note}" if note else text,
+            resource=kind,
+            who=who,
+            note=note,
+            whole=True,
+            more=more,
+        )
 
 
 async def begin(core: Core) -> ControlPart:

@@ -7,12 +7,17 @@
 """
 
 import asyncio
+import hashlib
+import hmac
+import html
+import json
 import socket
 import ssl
 from pathlib import Path
 
 import structlog
 
+from appliance.audit.log.record_format import printable
 from appliance.base import clock
 from appliance.base.input_files import path_for_library, read_given
 from appliance.channel import messages
@@ -20,8 +25,50 @@ from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.features.approvals.hook_link import CallSent, CallWaits, HookLink
-from appliance.features.approvals.hook_request import LEAST_SECRET, body_of, request_of
 from appliance.features.approvals.settings import ApprovalHook
+
+# The POST for a call that waits. No I/O.
+#
+# 1. The signature covers the time and the body, so a receiver can reject repetitions and changes.
+# 2. Text of an agent is shown without control characters, and without the characters of HTML and of links in chats.
+
+LEAST_SECRET = 16
+_LONGEST_TEXT = 200
+_DOES = {"publish": "publish", "call": "call", "write": "write"}
+
+
+def body_of(call: CallWaits, left: float, robot: str, console: str) -> bytes:
+    """Return the JSON; `left` is the number of seconds until the call expires."""
+    host, node, resource, type_ = map(_harmless, (call.host, call.caller_id, call.resource, call.type))
+    does = _DOES.get(call.category, "use")
+    where = f"{_harmless(robot)}: " if robot else ""
+    link = f"{console}/console/robot" if console else ""
+    fields = {
+        "event": "approval wanted", "robot": _harmless(robot), "number": call.number, "host": host, "node": node,
+        "category": call.category, "resource": resource, "type": type_, "expires_in_seconds": round(left, 1),
+        "console": link,
+        "text": f"{where}{host} wants to {does} {resource}: approval {call.number}, {left:.0f} s left. {link}".rstrip(),
+    }  # fmt: skip
+    return json.dumps(fields).encode()
+
+
+def request_of(wanted: ApprovalHook, body: bytes, secret: bytes, seconds: int) -> bytes:
+    """Return the whole request; `seconds` is the time of the signature, since the epoch."""
+    signature = hmac.new(secret, f"{seconds}.".encode() + body, hashlib.sha256).hexdigest()
+    head = (
+        f"POST {wanted.target} HTTP/1.1",
+        f"Host: {wanted.host[1]}",
+        "Content-Type: application/json",
+        f"Content-Length: {len(body)}",
+        f"ROSRV-Signature: t={seconds},v1={signature}",
+        "Connection: close",
+    )
+    return "\r\n".join((*head, "", "")).encode() + body
+
+
+def _harmless(text: str) -> str:
+    return html.escape(printable(text[:_LONGEST_TEXT]))
+
 
 _log = structlog.get_logger()
 MOST_WAITING = 64

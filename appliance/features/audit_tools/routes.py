@@ -6,7 +6,8 @@ import itertools
 import json
 import pathlib
 from collections.abc import AsyncIterator, Iterator
-from typing import Annotated, Literal, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from fastapi import Depends, Header, Query, Request, Response
@@ -28,19 +29,119 @@ from appliance.api.routes.log_reader import (
     readable,
     readable_by,
 )
+from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record import Severity
-from appliance.audit.log.record_format import as_object
+from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.chain_proofs import evidence, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.proof.verification import verify
+from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary, summary_of_log
+from appliance.audit.search.equality import equality_of
 from appliance.audit.search.query import Filter
-from appliance.audit.search.search import Follower, export
+from appliance.audit.search.search import Follower, export, search
 from appliance.channel.answers.field_docs import doc
-from appliance.features.audit_tools.audit_summary import add_summary
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
-from appliance.features.audit_tools.record_pages import PAGE, page_of, streamed
+from appliance.features.audit_tools.unrecorded import unrecorded
 from appliance.quotas.table import REST_STREAMS
+
+# Make the pages and streams of audit records that a client may read.
+
+_EQUALITY = {
+    "type": "object",
+    "properties": {
+        "key": {"type": "string", "description": "equal in equal records"},
+        "reason": {"type": "string", "description": "equal in equal records, or empty if equal to each"},
+        "reach": {"type": "integer", "description": "how many of the last rows the record can join"},
+        "times": {"type": "integer", "description": "how often the event happened"},
+        "value": {"type": "string", "description": "the reason, without the words about repetitions"},
+        "began": {"type": "string", "format": "date-time", "description": "time of the first event"},
+        "ended": {"type": "string", "format": "date-time", "description": "time of the last event"},
+    },
+    "required": ["key", "reason", "reach", "times", "value", "began", "ended"],
+    "additionalProperties": False,
+}
+PAGE = {
+    "type": "object",
+    "properties": {
+        "records": {"type": "array", "items": RECORD_REFERENCE},
+        "cursor": {
+            "type": ["string", "null"],
+            "description": "cursor of the next page, or null on the last page",
+        },
+        "equality": {
+            "type": "array",
+            "items": _EQUALITY,
+            "description": "only with equality=1: for each record, what makes equal ones one row",
+        },
+        "notes": {
+            "type": "array",
+            "items": {"type": "string"},
+            "description": "only if there are any: an event or category that this version does not record",
+        },
+    },
+    "required": ["records", "cursor"],
+    "additionalProperties": False,
+}
+_STEP = 500
+
+
+def page_of(
+    path: pathlib.Path,
+    wanted: Filter,
+    cursor: str | None,
+    limit: int,
+    bearer: Bearer,
+    *,
+    newest_first: bool,
+    equality: bool = False,
+) -> dict[str, Any]:
+    """Return a page, whose cursor reveals nothing about hidden records."""
+    found: list[LogEntry] = []
+    more: str | None = cursor
+    count = limit + 1
+    while len(found) <= limit:
+        entries, more = search(path, wanted, more, count, newest_first=newest_first)
+        found += readable(entries, bearer, wanted.text)
+        if more is None:
+            break
+        count = _STEP  # many records may be hidden; large steps skip them faster
+    last = str(found[limit - 1].sequence) if len(found) > limit else None
+    page: dict[str, Any] = {"records": [as_object(entry) for entry in found[:limit]], "cursor": last}
+    if equality:
+        page["equality"] = [equality_of(entry.record) for entry in found[:limit]]
+    return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
+
+
+def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
+    return as_object(entry) | ({"equality": equality_of(entry.record)} if equality else {})
+
+
+# `/v1/audit/summary`: the denials by host. A summary may read much of the log, so only one is made at a time.
+
+
+def add_summary(router: Routes, audit_log: Path) -> None:
+    one = Work("summaries of the audit log", 1)
+
+    @router.get("/summary")
+    async def summarise_audit(
+        bearer: Viewer,
+        since: Annotated[
+            str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")
+        ] = None,
+        until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
+        limit: Annotated[int, Query(ge=1, le=LARGEST_SUMMARY, description="largest number of hosts")] = 20,
+    ) -> DenialSummary:
+        """The denials of each host: number, first and last time, most frequent rules or reasons, and callers."""
+        begin, end = (None if time is None else given(time) for time in (since, until))
+        async with one.turn(bearer):
+            try:
+                return await asyncio.to_thread(
+                    summary_of_log, audit_log, Filter(since=begin, until=end), limit
+                )
+            except LogUnreadableError as error:
+                raise ProblemError(503, "log-unreadable", str(error)) from error
+
 
 _T = TypeVar("_T")
 Form = Literal["ndjson", "csv"]

@@ -7,8 +7,7 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.features.doors import requests
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
-from appliance.features.doors.door_tickets import DoorTickets
-from appliance.features.doors.door_visits import DoorVisits
+from appliance.features.doors.door_visits import DoorTickets, DoorVisits
 from appliance.features.doors.orders import DoorOrders
 from appliance.features.doors.settings import Doors
 

@@ -37,7 +37,6 @@ from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParamet
 from appliance.features.doors.heard_topic import HeardTopic, one_type, two_types
 from appliance.features.doors.host_shares import check_share, of_hosts
 from appliance.features.doors.known_types import DoorMessage, KnownType, KnownTypes, SharedFrames, TypeKey
-from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.lookout import HostsOf
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.node_hosts import ROBOT
@@ -54,6 +53,55 @@ from roswire.node import (
 from roswire.node.network import OwnedTasks, PeerUnreachableError
 from roswire.node.tcpros_streams import ANY
 from roswire.tcpros import Body
+
+# End topics some seconds after their last client has left, unless a client comes back.
+
+
+class Lingering:
+    """Calls `end(topic)` `seconds` after `left(topic)`, unless `used(topic)` comes first. All share one timer."""
+
+    def __init__(self, seconds: float, end: Callable[[str], object]) -> None:
+        self._seconds = seconds
+        self._end = end
+        self._ends: dict[str, float] = {}  # the first to end first
+        self._timer: asyncio.TimerHandle | None = None
+
+    def left(self, topic: str) -> None:
+        self.used(topic)
+        self._ends[topic] = asyncio.get_running_loop().time() + self._seconds
+        if self._timer is None:
+            self._start()
+
+    def used(self, topic: str) -> None:
+        self._ends.pop(topic, None)
+
+    def pop(self) -> str | None:
+        """Return the topic that would end first, which the caller ends."""
+        topic = next(iter(self._ends), None)
+        if topic is not None:
+            del self._ends[topic]
+        return topic
+
+    def close(self) -> None:
+        self._ends.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _start(self) -> None:
+        first = next(iter(self._ends.values()))
+        self._timer = asyncio.get_running_loop().call_at(first, self._ring)
+
+    def _ring(self) -> None:
+        self._timer = None
+        now = asyncio.get_running_loop().time()
+        while self._ends:
+            topic, when = next(iter(self._ends.items()))
+            if when > now:
+                self._start()
+                return
+            del self._ends[topic]
+            self._end(topic)
+
 
 _SMALL_BYTES = 1 << 16
 """A message of up to this size, such as a stop, is written even if the memory is in use."""

@@ -25,8 +25,7 @@ from appliance.channel.link import Link
 from appliance.configuration.settings import Settings
 from appliance.control.core import Core
 from appliance.features.doors import door_link
-from appliance.features.doors.door_rows import DoorRow
-from appliance.features.doors.door_table import DoorTable
+from appliance.features.doors.door_table import DoorRow, DoorTable
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.doors.view import LATELY_SECONDS, DoorHealth
 from appliance.policy.model import Address

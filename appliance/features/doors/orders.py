@@ -2,26 +2,99 @@
 
 import asyncio
 import contextlib
+import struct
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import structlog
 
 from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.limit_answers import LimitUse
+from appliance.channel.messages import OwnHeaderStated, OwnPublished
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.core import Core
+from appliance.control.core import Core, RelayOrders
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.control.operators.token_orders import Session
 from appliance.features.doors import requests as door_requests
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import DoorProcesses
-from appliance.features.doors.door_rows import DoorRow, TicketRow
-from appliance.features.doors.door_table import DoorTable
-from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker
-from appliance.features.doors.door_visits import DoorVisits
-from appliance.features.doors.own_doors import OwnDoors
+from appliance.features.doors.door_table import DoorRow, DoorTable, TicketRow, is_door_name
+from appliance.features.doors.door_visits import DoorTickets, DoorVisits, left_by_its_maker
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.doors.view import DoorsState
-from appliance.features.doors.viewer_topics import ViewerTopics
 from appliance.policy.model import address_of
+
+# Publish how many viewers each door has: `/rosrv/viewers/NAME`, a latched `std_msgs/UInt32`.
+#
+# [Subscribers] of the policy decides who may read it, as with any topic. A `-` of the door's name is `_` there.
+
+UINT32 = ("std_msgs/UInt32", "304a39449588c7f8ce2df6e8001c5fce", "uint32 data\n")
+"""The type of the topics, its md5sum and its definition."""
+
+
+class ViewerTopics:
+    """The topics of all doors, with the counts that they told last."""
+
+    def __init__(self, relay: RelayOrders, node: str) -> None:
+        self._relay = relay
+        self._node = node
+        self._counts: dict[str, int] = {}  # as published, by door
+
+    def tell(self, counts: Iterable[tuple[str, int]]) -> None:
+        """Publish the counts that changed, by the name of the door, and end the topics of all other doors."""
+        now = dict(counts)
+        if now.keys() != self._counts.keys():
+            headers = [OwnHeaderStated(self._topic(name), *UINT32, latching=True) for name in now]
+            self._relay.publish_only("doors", headers)
+        before, self._counts = self._counts, now
+        for name, count in now.items():
+            if before.get(name) != count:
+                self._relay.publish(OwnPublished(self._topic(name), struct.pack("<I", count)))
+
+    def _topic(self, name: str) -> str:
+        return f"{self._node}/viewers/{name.replace('-', '_')}"
+
+
+# Find the door of a signed-in caller: the door with the token's name, or with the name of a person's group.
+#
+# An administrator chooses these names. A name that the provider gives a person opens no door, because people can
+# choose it at some providers.
+
+
+class CallerDoor(NamedTuple):
+    """The door of a caller; without a `row`, `reason` has the cause and the remedy."""
+
+    name: str
+    row: DoorRow | None
+    reason: str
+
+
+class OwnDoors:
+    """The doors of all callers; `people()` returns the sessions of people."""
+
+    def __init__(self, table: DoorTable, people: Callable[[], Iterable[Session]]) -> None:
+        self._table = table
+        self._people = people
+
+    def of(self, who: str) -> CallerDoor:
+        groups = self._groups(who)
+        names = [name for name in ([who] if groups is None else groups) if is_door_name(name)]
+        live = {row.name: row for row in self._table.live()}
+        found = next((name for name in names if name in live), None)
+        if found is not None:
+            return CallerDoor(found, live[found], "")
+        if names:
+            return CallerDoor(names[0], None, f"you have no door: rosrv door add {names[0]}")
+        if groups is None:
+            text = f"no door can have the name {who[:80]}: use a token with the name of a door (a-z, 0-9, _ and -)"
+        else:
+            text = f"no group of {who[:140]} has the name of a door: name one in sso.doors of appliance.yaml"
+        return CallerDoor("", None, text)
+
+    def _groups(self, who: str) -> list[str] | None:
+        people = [person for person in self._people() if person.name == who]
+        return [group for person in people for group in person.groups] if people else None
+
 
 _LOOK_SECONDS = 1.0
 _RETRY_SECONDS = 10

@@ -7,32 +7,34 @@ import asyncio
 import ipaddress
 import os
 import socket
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import structlog
 import uvloop
+from msgspec import Raw
 
-from appliance.api.front.rates import peer_key
+from appliance.api.front.access import peer_key
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.doors import door_link
-from appliance.features.doors.assembled_door import assembled_door
-from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
+from appliance.features.doors.client_requests import CallOfService
 from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections
-from appliance.features.doors.door_link import node_name
+from appliance.features.doors.door_link import MOST_SHOWN, ClientShown, SocketWanted, node_name
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
-from appliance.features.doors.door_node import DoorNode
+from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
-from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.lookout import HostsOf, Lookout
+from appliance.features.doors.message_writer import Now
 from appliance.features.doors.node_hosts import NodeHosts
-from appliance.features.doors.passed_sockets import PassedSockets
 from appliance.features.doors.quotas import DOOR_TOPICS
+from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
@@ -40,8 +42,143 @@ from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.node import NodeLimits, RosNode
-from roswire.node.network import OwnedTasks
+from roswire.node.network import BUFFER_BYTES, ByteWriter, ListeningServer, OwnedTasks, Serve
 from roswire.standard import standard_definitions
+
+# The network of a door's node, which gets each socket from control (`door_link.py`).
+
+_SECONDS = 10.0
+
+
+class PassedSockets:
+    """A `NodeNetwork` with sockets from control. `ask(message)` sends a request, and returns False without a link."""
+
+    def __init__(self, source: str, ask: Callable[[SocketWanted], bool]) -> None:
+        self.source = source
+        self._ask = ask
+        self._waiting: dict[int, asyncio.Future[socket.socket]] = {}
+        self._number = 0
+
+    async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
+        """Return a connection to a port of the appliance; `host` is ignored."""
+        del host
+        connection = await self._socket(port)
+        return await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)
+
+    async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
+        del host
+        connection = await self._socket(port)
+        await asyncio.get_running_loop().create_connection(lambda: receiver, sock=connection)
+
+    async def serve(self, serve: Serve) -> ListeningServer:
+        listener = await self._socket(0)
+        return _Server(await asyncio.start_server(serve, sock=listener, limit=BUFFER_BYTES))
+
+    async def _socket(self, port: int) -> socket.socket:
+        self._number += 1
+        number = self._number
+        future = self._waiting[number] = asyncio.get_running_loop().create_future()
+        try:
+            if not self._ask(SocketWanted(number, port)):
+                raise ConnectionRefusedError("the appliance is being restarted")
+            async with asyncio.timeout(_SECONDS):
+                made: socket.socket = await future
+                return made
+        finally:
+            del self._waiting[number]
+
+    def given(self, number: int, descriptor: int) -> None:
+        future = self._waiting.get(number)
+        if future is None or future.done():
+            os.close(descriptor)
+            return
+        made = socket.socket(fileno=descriptor)
+        made.setblocking(False)
+        future.set_result(made)
+
+    def refused(self, number: int, reason: str) -> None:
+        future = self._waiting.get(number)
+        if future is not None and not future.done():
+            future.set_exception(ConnectionRefusedError(reason))
+
+    def lost(self) -> None:
+        for number in [*self._waiting]:
+            self.refused(number, "the appliance is being restarted")
+
+
+class _Server:
+    def __init__(self, server: asyncio.Server) -> None:
+        self._server = server
+        self.port = int(server.sockets[0].getsockname()[1])
+
+    def close(self) -> None:
+        self._server.close()
+
+
+# Count the frames and refusals of each connection in the last minute, for operators.
+
+SAMPLE_SECONDS = 5
+_SAMPLES = 60 // SAMPLE_SECONDS
+
+
+class _Counts(NamedTuple):
+    received: int
+    sent: int
+    refusals: int
+
+
+class CountedClient:
+    """A connection with its counts. `queues` gets the queue of its protocol once the protocol is known."""
+
+    def __init__(self, session: DoorSession, peer: str, ticket: str, queues: list[ViewerQueue[Any]]) -> None:
+        self.session = session
+        self.ticket = ticket
+        self.peer = peer
+        self._since = clock.wall()
+        self._queues = queues
+        self._samples: deque[_Counts] = deque([_Counts(0, 0, 0)], maxlen=_SAMPLES)
+
+    @property
+    def dropped(self) -> int:
+        return sum(queue.dropped for queue in self._queues)
+
+    def _counts(self) -> _Counts:
+        return _Counts(self.session.received, self.session.sent, self.session.refusals)
+
+    def sample(self) -> None:
+        self._samples.append(self._counts())
+
+    def shown(self) -> ClientShown:
+        lately = (now - before for now, before in zip(self._counts(), self._samples[0], strict=True))
+        return ClientShown(self.peer, self.ticket, self.session.protocol_name, self._since, *lately)
+
+
+def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
+    oldest_first = sorted((one.shown() for one in clients), key=lambda one: one.since)
+    yield from oldest_first[:MOST_SHOWN]
+
+
+# Assemble the parts of a door that all its clients share.
+
+
+def assembled_door(
+    node: RosNode,
+    types: KnownTypes,
+    *,
+    most_topics: int,
+    calls: ClientMemory,
+    hosts: HostsOf,
+    now: Callable[[], Now] = present_time,
+) -> tuple[DoorNode, Lookout]:
+    def answer(request: CallOfService) -> Awaitable[Raw] | None:
+        return rosapi.answer(request)
+
+    sight = MasterSight(node, now)
+    door = DoorNode(node, types, answer, most_topics=most_topics, calls=calls, hosts=hosts)
+    lookout = Lookout(sight, types, door, hosts)
+    rosapi = Rosapi(sight, types, lookout)
+    return door, lookout
+
 
 _AGAIN_SECONDS = 1.0
 _REPORT_SECONDS = 1.0

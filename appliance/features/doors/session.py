@@ -11,13 +11,14 @@
    not take.
 6. A client that holds memory which all clients share (`door_memory.py`) must take frames: `_LEAST_TAKEN` bytes in
    `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages for other clients may find no space.
-7. A client must finish what it has begun (`unfinished.py`), even if it answers pings. Its handshake takes at most
+7. A client must finish what it has begun (`door_memory.py`), even if it answers pings. Its handshake takes at most
    `handshake_seconds`.
 """
 
 import asyncio
 import contextlib
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -48,12 +49,47 @@ from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
-from appliance.features.doors.refusal_counts import MOST_REFUSALS, REFUSAL_SECONDS, RefusalCounts
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.tcpros import Body
 from roswire.xmlrpc import Value
+
+# Count the refusals of the topics of one client, to disconnect a program that does not read them. No I/O, no clock.
+#
+# Some libraries show a program no `status`, so it would go on for hours without an effect. They show the reason of a
+# closing frame. A call that waits for an approval is repeated until the operator answers, so it does not count, and
+# no
+# client is disconnected while one of its calls waits.
+
+MOST_REFUSALS = 100
+REFUSAL_SECONDS = 30.0
+HELD = "held for approval"
+"""A call with these words in its reason waits for an operator."""
+_HELD_SECONDS = 120.0  # as long as a held call waits
+_MOST_TOPICS = 100
+
+
+class RefusalCounts:
+    """The refusals of one client. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._times: dict[str, deque[float]] = {}
+        self._held_until = 0.0
+
+    def exceeded(self, topic: str, reason: str, now: float) -> bool:
+        """Count a refusal of a topic (empty: of a call). Return whether the client must be disconnected."""
+        if HELD in reason:
+            self._held_until = now + _HELD_SECONDS
+            return False
+        if not topic:
+            return False
+        if topic not in self._times and len(self._times) >= _MOST_TOPICS:
+            self._times.clear()
+        times = self._times.setdefault(topic, deque(maxlen=MOST_REFUSALS))
+        times.append(now)
+        return len(times) == MOST_REFUSALS and now - times[0] <= REFUSAL_SECONDS and now >= self._held_until
+
 
 _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated

@@ -45,8 +45,7 @@ from appliance.channel.admin import (
     Trouble,
 )
 from appliance.channel.operations import request_named
-from appliance.features.evidence.page import Names, Page
-from appliance.features.evidence.recorded import RecordingSummary
+from appliance.features.evidence.page import Names, Page, RecordingSummary
 from appliance.features.evidence.requests import EvidenceExported, LogSealed
 from appliance.formats import bundle_verifier
 from appliance.signing import log_proof

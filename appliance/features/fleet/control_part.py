@@ -1,5 +1,7 @@
 """The part of control: the progress of the pusher, the gate of bundles, and the fleet of a pair."""
 
+import msgspec
+
 from appliance.channel.messages import ForwardingLink
 from appliance.control.core import ControlPart, Core
 from appliance.control.errors import SenselessError
@@ -8,9 +10,44 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.features.fleet.bundle_gate import BundleGate
 from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.features.fleet.bundle_link import BundleLink
-from appliance.features.fleet.fleet_of_pair import compare_fleets
 from appliance.features.fleet.requests import BundleTake, OrderedBundle
 from appliance.features.fleet.settings import POLLER, PUSHER, Fleet
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+
+# Notice after a takeover that only one appliance of a pair belongs to a fleet.
+#
+# If the new active appliance is not in the fleet of the earlier one, it pushes no log, and the collector may believe
+# that the robot is quiet.
+
+_SETTING = "fleet of the active appliance"
+
+
+class FleetOfAppliance(msgspec.Struct, frozen=True):
+    """The fleet of an appliance; `robot` is empty if it belongs to none."""
+
+    name: str
+    robot: str = ""
+    collector: str = ""
+
+
+def compare_fleets(fleet: Fleet, store: StateStore, trail: AuditTrail, *, name: str) -> None:
+    own = FleetOfAppliance(name, fleet.robot, fleet.collector or "")
+    try:
+        last = msgspec.json.decode(store.settings().get(_SETTING, ""), type=FleetOfAppliance)
+    except ValueError:  # not stored yet, or by another version
+        last = own
+    if last.name != name and last.collector and (last.robot, last.collector) != (own.robot, own.collector):
+        trail.happened(
+            "fleet not joined",
+            f"{last.name} is {last.robot or 'enrolled'} at {last.collector}, and {name} is not: it pushes no log there"
+            f" and takes no bundles; join also: rosrv-fleet robot invite {last.robot or 'NAME'} --appliance {name}",
+            robot=last.robot,
+            collector=last.collector,
+        )
+        return  # the state keeps the fleet until this appliance joins, or the other one leaves
+    store.save_setting(_SETTING, msgspec.json.encode(own).decode())
+
 
 _LONGEST_BUNDLE = 16 << 20
 

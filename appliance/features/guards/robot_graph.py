@@ -13,7 +13,23 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from appliance.features.guards import message_types as types
+from rosmop.types.roles import types_of_roles
+
+# The message types that guards know, by the roles of topics in the language.
+
+_ROLES = types_of_roles()
+VELOCITIES = _ROLES["Velocity"]
+TRAJECTORIES = _ROLES["Trajectory"]
+GOALS = _ROLES["Goal"]
+COMMANDS = _ROLES["Command"]
+RESULTS = _ROLES["Result"]
+POSES = _ROLES["Pose"]
+SCANS = _ROLES["Scan"]
+BATTERIES = _ROLES["Battery"]
+VALUED = tuple(kind for kind in _ROLES["Sensor"] if "/" in kind)
+"""The sensors whose values are judged; of all others, only the silence is."""
+GOAL = "control_msgs/FollowJointTrajectoryActionGoal"
+
 
 COMMAND = re.compile(r"cmd|command|setpoint|drive|ackermann", re.IGNORECASE)
 _OBSERVER = re.compile(
@@ -23,8 +39,8 @@ _NOT_A_BASE = re.compile(
     r"(?:^|[/_])(?:arms?|servo|servo_server|jog|jog_arm_server|cartesian|twist_controller|manipulator|gripper|tool|tcp|ee"
     r"|ptu|pan_tilt|gimbal|head|torso)(?=[/_]|$)"
 )  # fmt: skip
-_JOINT_COMMANDS = {*types.TRAJECTORIES, "std_msgs/Float64MultiArray"}
-_MEASURED = {*types.POSES, "sensor_msgs/LaserScan", "sensor_msgs/JointState", "sensor_msgs/Imu"}
+_JOINT_COMMANDS = {*TRAJECTORIES, "std_msgs/Float64MultiArray"}
+_MEASURED = {*POSES, "sensor_msgs/LaserScan", "sensor_msgs/JointState", "sensor_msgs/Imu"}
 
 MOST_COMMANDS = 20
 _MOST_STEPS = 10
@@ -67,9 +83,7 @@ class RobotGraph:
     @cached_property
     def velocities(self) -> list[TopicFacts]:
         """The topics named as commands of velocities, those between a node and a multiplexer too."""
-        return [
-            topic for topic in self.topics if topic.type in types.VELOCITIES and COMMAND.search(topic.name)
-        ]
+        return [topic for topic in self.topics if topic.type in VELOCITIES and COMMAND.search(topic.name)]
 
     @cached_property
     def velocity_commands(self) -> list[TopicFacts]:
@@ -86,9 +100,7 @@ class RobotGraph:
 
     @cached_property
     def arms(self) -> list[TopicFacts]:
-        return [topic for topic in self.topics if topic.type in types.TRAJECTORIES and _used(topic)][
-            :MOST_COMMANDS
-        ]
+        return [topic for topic in self.topics if topic.type in TRAJECTORIES and _used(topic)][:MOST_COMMANDS]
 
     @cached_property
     def robots(self) -> list[GraphedRobot]:
@@ -118,7 +130,7 @@ class RobotGraph:
 
     def ends(self, command: TopicFacts) -> frozenset[str]:
         """Return the nodes that carry out a command of any type."""
-        return (self.drivers(command) if command.type in types.VELOCITIES else frozenset()) or _used(command)
+        return (self.drivers(command) if command.type in VELOCITIES else frozenset()) or _used(command)
 
     def robot_of(self, command: TopicFacts) -> GraphedRobot:
         return next(robot for robot in self.robots if command in robot.commands)
@@ -195,13 +207,13 @@ class RobotGraph:
             topic.type == "nav_msgs/Odometry" and node in topic.subscribers and topic.publishers != (node,)
             for topic in self.topics
         )
-        return used and self.publishes(node, types.POSES)
+        return used and self.publishes(node, POSES)
 
     def _moves_an_arm(self, command: TopicFacts) -> bool:
         if _NOT_A_BASE.search(command.name):
             return True
         drivers = self.drivers(command)
-        measured = any(self.publishes(node, types.POSES) for node in drivers)
+        measured = any(self.publishes(node, POSES) for node in drivers)
         return not measured and any(self.publishes(node, _JOINT_COMMANDS) for node in drivers)
 
     def _same_robot(self, one: TopicFacts, other: TopicFacts) -> bool:

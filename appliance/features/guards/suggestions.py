@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from appliance.features.guards import message_types as types
+from appliance.features.guards import robot_graph as types
 from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, RobotGraph, TopicFacts, near
 
 _WORD = re.compile(r"[a-z]+")

@@ -2,8 +2,9 @@
 
 import ipaddress
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import typer
@@ -13,8 +14,11 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.filter_options import Since, Until, times_given
 from appliance.audit.search.query import Filter
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel.admin import PolicyWanted, StatusWanted, TokenList
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.channel.answers.token_answers import Tokens
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.verified import last_verification
 from appliance.cli.connection.admin_client import NotRunningError
@@ -22,7 +26,6 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error, write_new
-from appliance.features.logbook import live_facts
 from appliance.features.logbook.log_source import Log, OpenedLogs, Other, logs_of
 from appliance.formats.interventions import READ
 from appliance.formats.machine_report import (
@@ -37,9 +40,124 @@ from appliance.formats.machine_report import (
 )
 from appliance.formats.report_words import page, report_lines
 from appliance.policy.judgement import PolicyContext
-from appliance.policy.model import address_of
+from appliance.policy.model import Category, address_of
+from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import say
+
+# Say which interfaces the running appliance has, what protects each, and who may act on it. No I/O.
+
+_ACTS = (Category.PUBLISH, Category.CALL, Category.WRITE)
+_WORDS = {Category.PUBLISH: "publish", Category.CALL: "call", Category.WRITE: "write"}
+_STOP = "stop the robot remotely"
+_ALSO_STOPS = {
+    Category.PUBLISH: f" ({_STOP}, if it takes commands)", Category.CALL: f" ({_STOP}, if it is a stop)",
+}  # fmt: skip
+
+
+def interfaces(
+    status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens, records: Reading
+) -> Iterator[MachineInterface]:
+    """Yield the ways in. `status` is the answer of `rosrv status --json`; the records have the places of doors."""
+    rules = f"policy revision {policy.revision} decides each call by the sender's address"
+    lenient = status["policy"]["audit_only"]
+    if lenient:
+        rules += f"; audit-only, so only recorded: {', '.join(lenient)}"
+    blocked = status["blocks"]["hosts"]
+    yield MachineInterface(
+        name="ROS Master API", where=str(status["master"]), commands="registrations, parameters",
+        protection=f"{rules}; {counted(blocked, 'host')} blocked",
+    )  # fmt: skip
+    monitors = status["monitors"]
+    yield MachineInterface(
+        name="topics and services (relay)", where="ports of [Ports] in the policy",
+        commands="messages and service calls",
+        protection=f"{rules}; {monitors['enabled']} of {counted(monitors['loaded'], 'monitor')} enabled;"
+        f" relaying: {status['relaying']}, isolation: {status['isolation']}",
+    )  # fmt: skip
+    usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
+    by_role = ", ".join(
+        f"{sum(token.role == role for token in usable)} {role}"
+        for role in ("viewer", "investigator", "operator", "admin")
+    )
+    yield MachineInterface(
+        name="REST and console", where="api of appliance.yaml", commands="orders of the token's or person's role",
+        protection=f"TLS; tokens: {by_role}; single sign-on: {_sign_on(records).get('issuer', 'off')}",
+    )  # fmt: skip
+    yield MachineInterface(
+        name="admin socket", where="the appliance's machine", commands="all orders",
+        protection="permissions of the file: root and the appliance's group",
+    )  # fmt: skip
+    for door in (status.get("doors") or {}).get("doors", ()):
+        yield MachineInterface(
+            name=f"door {door['name']}", where=records.places.get(door["name"], "see `rosrv door list`"),
+            commands="what the policy grants its name", protection="a ticket; the policy; monitors of its topics",
+        )  # fmt: skip
+    tunnels = status["ipsec"]
+    if tunnels["esp"] is not None:
+        yield MachineInterface(
+            name="IPsec tunnels", where="UDP 500 and 4500, ESP", commands="none of their own: they carry the others",
+            protection=f"certificates of {counted(tunnels['enrolled'], 'host')}; {' '.join(tunnels['key_exchange'])}",
+        )  # fmt: skip
+    if status.get("standby") is not None:
+        yield MachineInterface(
+            name="the other appliance and the witness", where="TCP and UDP 7411 and 7412",
+            commands="the state, and who serves", protection="mutual TLS; signed datagrams",
+        )  # fmt: skip
+
+
+def rights(
+    policy: Policy, in_force: PolicyInForce, tokens: Tokens, records: Reading
+) -> Iterator[MachineRight]:
+    """Yield each right to act on the machine, or to change its safety settings."""
+    usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
+
+    def holders(*roles: str) -> str:
+        return ", ".join(sorted({token.name for token in usable if token.role in roles})) or "no token"
+
+    keys = in_force.site_keys
+    signed = f", signed by one of {counted(len(keys), 'site key')}" if keys else ""
+    yield MachineRight(what="every order", who="root and the appliance's group", by="the appliance's machine")
+    yield MachineRight(
+        what=f"change policies, monitors and guards{signed}", who=holders("admin"), by="token, role admin"
+    )
+    yield MachineRight(
+        what="load policies and guards that exist already, set guards' values, switch monitors, approve",
+        who=holders("operator"),
+        by="token, role operator",
+    )  # fmt: skip
+    sign_on = _sign_on(records)
+    if "roles" in sign_on:
+        claim = f"the claim {sign_on.get('roles_claim', '')} of {sign_on.get('issuer', '')}"
+        yield MachineRight(
+            what="the rights of the roles admin and operator, over single sign-on",
+            who=f"people with {sign_on['roles']}",
+            by=claim,
+        )
+    yield MachineRight(
+        what=f"{_STOP}: block a host, whose motions guards then stop", who=holders("admin", "operator"),
+        by="token, role admin or operator",
+    )  # fmt: skip
+    yield from _ends(policy)
+    for category in _ACTS:
+        for rule in policy.rules(category):
+            name = rule.key.text if rule.key is not None else "all others"
+            yield MachineRight(
+                what=f"{_WORDS[category]} {name}{_ALSO_STOPS.get(category, '')}", who=rule.shown,
+                by=rule.place,
+            )  # fmt: skip
+
+
+def _ends(policy: Policy) -> Iterator[MachineRight]:
+    for rule in policy.rules(Category.COMMAND):
+        if rule.key is None or rule.key.text == "shutdown":
+            yield MachineRight(what=f"{_STOP}: end a node", who=rule.shown, by=rule.place)
+
+
+def _sign_on(records: Reading) -> Mapping[str, str]:
+    """Return the settings of single sign-on; empty if it is off, or if an earlier version wrote the log."""
+    return records.settings.get("sso", {})
+
 
 _VERIFY, _VERIFY_BOTH = "rosrv audit verify", "rosrv audit verify --other DIR"
 _VERB = "rosrv report"
@@ -142,8 +260,8 @@ class _Live(msgspec.Struct):
             )
         return cls(
             str(state["name"]),
-            list(live_facts.interfaces(state, text, made, records)),
-            list(live_facts.rights(compiled, text, made, records)),
+            list(interfaces(state, text, made, records)),
+            list(rights(compiled, text, made, records)),
         )
 
 

@@ -1,5 +1,8 @@
 """The command `rosrv monitor load`."""
 
+import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,11 +13,61 @@ from appliance.channel.admin import AdminAnswer
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced
+from appliance.cli.monitor_program import MONITOR
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.monitor_tools.in_force import Force, Hold, Shadow, given_to_monitors
-from appliance.features.monitor_tools.sources_to_send import read_to_send
-from rosmop.form.findings import SpecificationError
+from appliance.specifications.specification_files import Sources, signatures_of
+from rosmop.form.findings import Position, SpecificationError
+from rosmop.tool.specification_input import definition_folders, definition_texts, read_specifications
 from rosmop.tool.terminal import printable
+
+# Read specifications and message definitions to send them to the appliance.
+
+_NOT_UTF_8 = re.compile("[\udc80-\udcff]")
+_SAVE_AS_UTF_8 = "these bytes are not UTF-8; save the file as UTF-8"
+_STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # its value extends to the end of the line
+
+
+def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
+    """Return the sources to send, from the files that `read_specifications` and `read_definitions` accept.
+
+    Raises `SpecificationError`.
+    """
+    named: dict[str, Path] = {}
+    for file in files:
+        other = named.setdefault(file.name, file)
+        if os.path.realpath(other) != os.path.realpath(file):
+            raise MONITOR.usage_error(
+                f"{other} and {file} have the same file name, by which the appliance identifies specifications; "
+                "rename one of them"
+            )
+    definitions: dict[str, str] = {}
+    for folder in definition_folders(MONITOR, files, folders):
+        texts, places = definition_texts(MONITOR, folder)
+        definitions |= {name: _sendable(text, places[name]) for name, text in texts.items()}
+        named |= {name: Path(places[name]) for name in texts}
+    texts = read_specifications(MONITOR, files)
+    for path, text in texts.items():
+        found = _NOT_UTF_8.search(text)
+        if found is not None:
+            line = text.count("\n", 0, found.start()) + 1
+            column = found.start() - text.rfind("\n", 0, found.start())
+            raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
+    sent = {Path(path).name: text for path, text in texts.items()}
+    return Sources(sent, definitions, signatures_of(named))
+
+
+def _sendable(text: str, place: str) -> str:
+    """Replace invalid UTF-8 in a definition's comments, and reject it elsewhere."""
+    lines = text.split("\n")
+    for number, line in enumerate(lines):
+        if line.isascii() or not _NOT_UTF_8.search(line):
+            continue
+        content = line if _STRING_CONSTANT.match(line) else line.partition("#")[0]
+        if _NOT_UTF_8.search(content):
+            raise SpecificationError.at(Position(place, number + 1, 1), _SAVE_AS_UTF_8)
+        lines[number] = _NOT_UTF_8.sub("\N{REPLACEMENT CHARACTER}", line)
+    return "\n".join(lines)
 
 
 @speaks

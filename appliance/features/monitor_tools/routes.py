@@ -23,7 +23,7 @@ from appliance.channel.answers.monitor_answers import (
     Monitors,
     MonitorState,
 )
-from appliance.features.monitor_tools.monitor_models import Described, Happened, History, Monitor, Replaced
+from appliance.features.monitor_tools.monitor_judgement import Described, Happened, History, Monitor, Replaced
 
 if TYPE_CHECKING:
     from appliance.features.monitor_tools.monitor_judgement import Compiler

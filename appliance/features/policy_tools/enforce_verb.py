@@ -20,6 +20,7 @@ from appliance.features.policy_tools.audit_only import EnforcedText, EnforceErro
 from appliance.features.policy_tools.learn import Observation, needed_rights
 from appliance.features.policy_tools.live_verbs import say_loaded
 from appliance.features.policy_tools.policy_input import (
+    RecordedPeriod,
     body_in_force,
     context_of,
     live_now,
@@ -27,7 +28,6 @@ from appliance.features.policy_tools.policy_input import (
     usage_error,
 )
 from appliance.features.policy_tools.policy_verbs import compiled_with
-from appliance.features.policy_tools.recorded_requests import RecordedPeriod
 from appliance.policy.actions import BadWordError
 from appliance.policy.live_rights import Ending, LiveRight, endings
 from appliance.policy.model import Request

@@ -22,8 +22,7 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
-from appliance.features.policy_tools.denials import asks_policy
-from appliance.features.policy_tools.explanations import explained, granted
+from appliance.features.policy_tools.explanations import asks_policy, explained, granted
 from appliance.features.policy_tools.grant import UngrantableError
 from appliance.features.policy_tools.live_verbs import say_loaded
 from rosmop.tool.terminal import printable, say

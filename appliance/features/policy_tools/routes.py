@@ -1,7 +1,10 @@
 """`/v1/policy/explain`, `/v1/policy/uses`, `/v1/policy/test`, `/v1/audit/ID/why`, `/grant`: nothing is loaded."""
 
 import asyncio
-from dataclasses import asdict
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -16,14 +19,23 @@ from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord, readable_by
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.api.routes.operation_routes import AnsweringRoutes
-from appliance.audit.search.search import recorded_in_full
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import export, recorded_in_full
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
-from appliance.channel.answers.policy_answers import Granted, Why
+from appliance.channel.answers.graph_answers import Registration
+from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
 from appliance.features.policy_tools import policy_routes
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation
-from appliance.features.policy_tools.denials import asks_policy
-from appliance.features.policy_tools.explanations import explained, explanation, granted, judge_text
+from appliance.features.policy_tools.explanations import (
+    asks_policy,
+    explained,
+    explanation,
+    granted,
+    judge_text,
+)
 from appliance.features.policy_tools.grant import UngrantableError
+from appliance.features.policy_tools.policy_input import RecordedPeriod, period_since
 from appliance.features.policy_tools.policy_models import (
     Case,
     Draft,
@@ -32,11 +44,66 @@ from appliance.features.policy_tools.policy_models import (
     PolicyUses,
     Question,
     RuleText,
+    RuleUsed,
     Tested,
 )
-from appliance.features.policy_tools.policy_uses import policy_uses
+from appliance.features.policy_tools.rule_uses import RuleUses
 from appliance.policy.cases import CaseResult
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Category
+
+# Find the uses of each rule of the policy in force, for `/v1/policy/uses`.
+
+MOST_READ = 100_000
+"""The most records that one request reads, newest first in each kind. With more, what was not seen is unknown."""
+
+
+def policy_uses(
+    path: Path, current: PolicyKnown, registrations: Iterable[Registration], since: int, most: int = MOST_READ
+) -> PolicyUses:
+    """Return the uses since a time (nanoseconds since the epoch). Raises `LogUnreadableError`."""
+    known = PolicyContext.of(msgspec.structs.asdict(current))
+    policy = known.complete(known.compiled(current.text, current.file))
+    records = _NewestRecords(path, most)
+    period: RecordedPeriod = replace(period_since(partial(export, path), since, since), read=records)
+    uses = RuleUses(policy)
+    for request in period.requests():
+        uses.add(request.observation, request.count)
+    uses.add_live(LiveRight.of(msgspec.structs.asdict(row)) for row in registrations)
+    removed = period.removed or records.cut
+    return PolicyUses(
+        revision=current.revision,
+        since=period.start / 1e9,
+        whole=not removed,
+        rules=[
+            RuleUsed(
+                RuleText(row.rule.section, row.rule.key, row.rule.file, row.rule.line),
+                row.state,
+                row.used,
+                list(row.unused),
+                list(row.unknown),
+            )
+            for row in uses.rules(period.unnamed, removed=removed)
+        ],
+    )
+
+
+class _NewestRecords:
+    """Reads at most `left` records, newest first; `cut`: there are more."""
+
+    def __init__(self, path: Path, left: int) -> None:
+        self._path, self._left = path, left
+        self.cut = False
+
+    def __call__(self, wanted: Filter) -> Iterator[LogEntry]:
+        for entry in export(self._path, wanted, newest_first=True):
+            if self._left == 0:
+                self.cut = True
+                return
+            self._left -= 1
+            yield entry
+
 
 _NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
 _MOST_SHOWN = 1000

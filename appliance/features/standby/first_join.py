@@ -1,23 +1,28 @@
 """`rosrv standby join` on the appliance that has all data: make the keys and the files of all machines."""
 
 import contextlib
+import json
 import os
+import secrets
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from ipaddress import IPv4Address
 from itertools import groupby
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 import typer
 from msgspec.structs import replace
 
+from appliance.base.atomic_files import write_whole
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.up_inputs import read_node_ports
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings, load_resolved
-from appliance.features.standby.kit import Kits, PairPlan, make_kits
+from appliance.features.standby.link_certificates import make_link_certificate
 from appliance.features.standby.membership import (
     LEFT_FILE,
     Membership,
@@ -27,10 +32,163 @@ from appliance.features.standby.membership import (
     save_membership,
 )
 from appliance.features.standby.process import EPOCH, stored_epoch
-from appliance.features.standby.sealed_authority import sealed_authority
+from appliance.features.standby.witness.one_file import witness_program
+from appliance.features.standby.witness.settings import settings_of
+from appliance.ipsec.authority_key import is_encrypted
+from appliance.ipsec.brought_authority import FOLDER
+from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import foreign
 from rosmop.tool.terminal import refused, say
+
+# Bring the key of an authority, encrypted with a passphrase, to the other appliance.
+#
+# The other appliance keeps it beside its own authority (`ipsec/brought_authority.py`).
+
+
+class SealedAuthority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An authority's certificate, and its private key encrypted with a passphrase (both PEM)."""
+
+    certificate: str
+    key: str
+
+
+def sealed_authority(signer: Path) -> SealedAuthority | None:
+    path = signer / KEY_FILE
+    key = path.read_bytes() if path.exists() else b""
+    if not is_encrypted(key):
+        return None
+    return SealedAuthority((signer / CERTIFICATE_FILE).read_text(encoding="ascii"), key.decode("ascii"))
+
+
+def keep_sealed(signer: Path, sealed: SealedAuthority, owner: tuple[int, int] | None) -> None:
+    if not is_encrypted(sealed.key.encode()):
+        raise ValueError("the key of the authority is not encrypted: set ipsec.ca_passphrase_file there")
+    folder = signer / FOLDER
+    for made in (signer, folder):
+        with contextlib.suppress(FileExistsError):
+            made.mkdir(mode=0o700)
+            if owner is not None:
+                os.chown(made, *owner)
+    write_whole(folder / CERTIFICATE_FILE, sealed.certificate.encode(), 0o644, owner)
+    write_whole(folder / KEY_FILE, sealed.key.encode(), 0o600, owner)
+
+
+# Make the memberships of two appliances, and the kits for the robot's computers. No I/O.
+#
+# All keys and the lease file are new each time: a new kit never changes the lease of an earlier kit, and an old kit
+# that is installed again grants nothing.
+
+WITNESS_PORT = 7411
+_STATE = "/var/lib/rosrv-witness"
+_SHUT = "rosrv-witness-shut.service"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairPlan:
+    """The decisions of an operator; `address` and `name` are those of the appliance that has all data."""
+
+    name: str
+    address: str
+    other: str
+    other_address: str
+    witness: str
+    fixed: str
+    port: int
+    ports: tuple[str, ...]
+    """Ports and ranges, such as `11311` and `19001-26000`."""
+    master_port: int
+    epoch: int
+    """Greater than that of any earlier lease."""
+    followers: Mapping[str, str]
+
+
+class KitFile(NamedTuple):
+    name: str
+    text: str
+    mode: int
+
+
+class Kits(NamedTuple):
+    """The memberships, and the files of each folder: `witness`, `follower-NAME`."""
+
+    own: Membership
+    other: Membership
+    folders: Mapping[str, tuple[KitFile, ...]]
+
+
+def make_kits(plan: PairPlan) -> Kits:
+    peer_key = secrets.token_hex(32)
+    keys = {name: secrets.token_hex(32) for name in (plan.name, plan.other)}
+    links = {name: make_link_certificate() for name in keys}
+    addresses = {plan.name: plan.address, plan.other: plan.other_address}
+
+    def membership(name: str, other: str) -> Membership:
+        return Membership(
+            name=name,
+            other=other,
+            address=addresses[name],
+            other_address=addresses[other],
+            fixed=plan.fixed,
+            witness=plan.witness,
+            witness_port=WITNESS_PORT,
+            port=plan.port,
+            ports=plan.ports,
+            witness_key=keys[name],
+            peer_key=peer_key,
+            certificate=links[name].certificate,
+            key=links[name].key,
+            other_certificate=links[other].certificate,
+        )
+
+    if plan.name == plan.other:
+        raise ValueError(f"both appliances have the name {plan.name}: give --name or --other-name")
+    followers = {
+        name: {"address": address, "key": secrets.token_hex(32)} for name, address in plan.followers.items()
+    }
+    common: dict[str, Any] = {
+        "listen": f"{plan.witness}:{WITNESS_PORT}",
+        "fixed": plan.fixed,
+        "ports": plan.ports,
+        "state": f"{_STATE}/lease-{secrets.token_hex(4)}",
+    }
+    appliances = {name: {"address": address} for name, address in addresses.items()}
+    with_keys = {name: one | {"key": keys[name]} for name, one in appliances.items()}
+    settings = {"witness": common | {"appliances": with_keys, "followers": followers}}
+    for name, one in followers.items():
+        own = {"appliances": appliances, "followers": {name: one}, "follows_as": name}
+        settings[f"follower-{name}"] = common | own
+    return Kits(
+        membership(plan.name, plan.other),
+        membership(plan.other, plan.name),
+        {folder: _files(plan, body) for folder, body in settings.items()},
+    )
+
+
+def _files(plan: PairPlan, body: dict[str, Any]) -> tuple[KitFile, ...]:
+    settings_of(body)  # the computer accepts what this accepts
+    service = "rosrv-witness-follow.service" if "follows_as" in body else "rosrv-witness.service"
+    values = {
+        "name": plan.name,
+        "epoch": str(plan.epoch),
+        "lease": body["state"],
+        "own": plan.address,
+        "other": plan.other_address,
+        "fixed": plan.fixed,
+        "master": str(plan.master_port),
+    }
+    package = files("appliance.features.standby")
+    found = [
+        KitFile("witness.py", witness_program(), 0o755),
+        KitFile("witness.json", json.dumps(body, indent=2) + "\n", 0o600),
+    ]
+    for name in (service, _SHUT, "install.sh", "remove.sh"):
+        text = package.joinpath("kit_files", name).read_text("utf-8")
+        for key, value in values.items():
+            text = text.replace(f"@{key}@", value)
+        found.append(KitFile(name, text, 0o755 if name.endswith(".sh") else 0o644))
+    return tuple(found)
+
 
 AGENT_PORTS = range(9090, 9100)
 """Ports at the fixed address for the doors of agents, which may be added later."""

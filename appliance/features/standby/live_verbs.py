@@ -1,22 +1,68 @@
 """The commands `rosrv standby status|switch`, for a running appliance."""
 
 import threading
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
 
+from appliance.api.front.moments import in_full
 from appliance.base import clock
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import moment, say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
-from appliance.features.standby.standby_view import standby_view
+from appliance.features.standby.summary import follower_troubles
+from appliance.features.standby.view import answer_in_words, connection, lag_in_words
 from rosmop.tool.terminal import printable, say
+
+# Show the state of two appliances on a terminal: for `rosrv standby status`, and `rosrv status` on a standby.
+
+_RED = "bold red"
+
+
+def standby_view(state: StandbyState) -> StatusView:
+    return StatusView(
+        1 if state.troubles or state.witness.follower_trouble else 0, StandbyScreen(state), in_full(state)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class StandbyScreen:
+    """The state as text, problems first."""
+
+    state: StandbyState
+
+    def __rich_console__(self, _console: Console, _options: ConsoleOptions) -> RenderResult:
+        state = self.state
+        for trouble in [*state.troubles, *(trouble.text for trouble in follower_troubles(state))]:
+            yield Text(f"! {trouble}", style=_RED)
+        other, witness = state.other, state.witness
+        grid = Table.grid(padding=(0, 2))
+        role = f"{state.role} since {moment(state.since)}, epoch {state.epoch}"
+        grid.add_row("this appliance", f"{state.name} ({state.address}): {role}")
+        seen = lag_in_words(other) if state.role == "active" else connection(other)
+        holder = f", {witness.holder or 'no appliance'} holds the lease" if not witness.refusal else ""
+        grid.add_row("other appliance", f"{other.name} ({other.address}): {seen}")
+        grid.add_row("witness", f"{witness.address}: {answer_in_words(witness)}{holder}")
+        grid.add_row("robot's address", f"{state.fixed}, for the active appliance")
+        if state.role == "active":
+            grid.add_row("answers", _answers(state))
+        yield grid
+
+
+def _answers(state: StandbyState) -> str:
+    if state.answers_alone:
+        return "do not wait for the standby, because it is not in sync"
+    return "wait until the standby has stored each change"
+
 
 _VERB = "rosrv standby"
 _SWITCH_SECONDS = 20.0

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyWanted
-from appliance.features.standby.samples import samples_of
+from appliance.features.standby.view import samples_of
 from appliance.features.view import PairView, Samples
 
 

@@ -1,38 +1,254 @@
 """Stand by: follow the active appliance until this one is activated. Only the file of the replica changes."""
 
 import asyncio
+import contextlib
+import math
 import socket
+import sqlite3
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import closing, suppress
 from functools import partial
+from pathlib import Path
 
 import structlog
 
 from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
-from appliance.channel.channel import Channel
+from appliance.channel.admin import AdminAnswer, encode
+from appliance.channel.channel import Channel, ChannelFullError
+from appliance.channel.link import Link
+from appliance.channel.messages import Message
+from appliance.channel.messages.api import (
+    ConnectionAnswered,
+    ConnectionPassed,
+    RequestAnswered,
+    RequestMade,
+    RestServed,
+    TokenKept,
+    TokensStated,
+)
 from appliance.configuration.settings import Settings
+from appliance.control.assembly.active_role import STATE_ERRORS
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.operators.admin_socket import AdminServer
+from appliance.control.operators.admin_socket import AdminServer, RequestHandler
+from appliance.control.operators.token_orders import TOKENS, kept_by_api
+from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
+from appliance.control.start_rehearsal import StartRehearsal
 from appliance.features.standby.answers import OtherAppliance, StandbyState
 from appliance.features.standby.inheritance import CopyAge
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.orders import StandbyAdministration
-from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replica_sync import INCOMPLETE, ReplicaSync, StateComparison, is_recovered
-from appliance.features.standby.replication import Pair, host_endpoint, state_of
+from appliance.features.standby.replication import (
+    Pair,
+    ReplicationListener,
+    follow_at,
+    host_endpoint,
+    state_of,
+)
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
-from appliance.features.standby.replication_transport import ReplicationListener, follow_at
-from appliance.features.standby.takeover_check import TakeoverCheck
+from appliance.features.standby.summary import UNCHECKED
 from appliance.features.standby.tunnels import StandbyTunnels
+from appliance.signing.request_signing import TokenKeys
 from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.specifications.rollout import Parts
+from appliance.specifications.specification_revisions import Check
+from appliance.store.access_tokens import TokenRow
+from appliance.store.ends import replicated_ends
 from appliance.store.state_file import SCHEMA
 from appliance.store.writer_thread import StoreError
+
+# Check on a standby that control could start if this appliance took over now, and would not give the lease away.
+#
+# The check also writes to the disk of the state and to the audit log, and compiles the specifications, so that a
+# takeover need not. It is repeated, because the appliance's own files, disk and ports may change. While it fails,
+# this
+# appliance does not claim the lease, but still follows the active one and stays in the in-sync set.
+
+_CHECK_AGAIN_SECONDS = 15.0
+
+
+class TakeoverCheck:
+    """The check; set `news` when the policy or the specifications of the active appliance have changed."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        membership: Membership,
+        compile_specifications: Check,
+        parts: Parts,
+        *,
+        again: float = _CHECK_AGAIN_SECONDS,
+    ) -> None:
+        self._membership = membership
+        self._rehearsal = StartRehearsal(settings, compile_specifications, parts, robot=membership.witness)
+        self._again = again
+        self.obstacle = UNCHECKED
+        self.news = asyncio.Event()
+
+    async def run(self, changed: Callable[[], None]) -> None:
+        while True:
+            self.news.clear()
+            obstacle = await self._find_obstacle()
+            if obstacle != self.obstacle:
+                if self.obstacle not in ("", UNCHECKED):
+                    _log.info("the reason why this appliance cannot take over is gone", reason=self.obstacle)
+                self.obstacle = obstacle
+                changed()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(self._again):
+                    await self.news.wait()
+
+    async def _find_obstacle(self) -> str:
+        try:
+            await self._load()
+        except STATE_ERRORS as error:
+            reason, *more = str(error).splitlines() or [repr(error)]
+        except Exception as error:  # noqa: BLE001  whatever it is, it would also end the start
+            what = f"the state of the active appliance is not understood ({error!r})"
+            reason, more = f"{what}; update this appliance to the same version", []
+        else:
+            return ""
+        if reason != self.obstacle:
+            _log.error("this appliance cannot take over", reason=reason, more=more)
+        return reason
+
+    async def _load(self) -> None:
+        await self._rehearsal.run()
+        if self.obstacle != "":  # the membership stays the same, and each call writes files
+            replication_context(self._membership, self._rehearsal.folder, server=True)
+
+
+# Serve the api of a standby: it knows the replicated tokens, and gets the same answers as the admin socket.
+
+_MOST_WAITING = 64
+_READ_SECONDS = 2.0
+_TAKING_OVER = "the appliance is taking over: try again"
+_NO_DOORS = "this appliance is the standby: open the door at the active appliance (rosrv standby status)"
+
+
+class ReplicatedTokens:
+    """The tokens in the replica, read again from time to time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._rows: dict[str, TokenRow] | None = None
+        self._ends: dict[str, tuple[int, float]] = {}  # by token: its stored end, and seconds since the boot
+        self._stated: object = None
+        self.blocked: list[str] = []
+        """The addresses that operators block."""
+
+    @property
+    def known(self) -> bool:
+        return self._rows is not None
+
+    def read(self) -> bool:
+        """Read the replica; return whether the tokens or blocks for the api have changed."""
+        with suppress(sqlite3.Error):  # no state yet
+            with closing(sqlite3.connect(f"file:{self._path}?mode=ro", uri=True)) as connection:
+                connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time
+                keys = {row[0]: TokenKeys(*row[1:]) for row in connection.execute("SELECT * FROM token_keys")}
+                found = connection.execute("SELECT * FROM token").fetchall()
+                self.blocked = [row[0] for row in connection.execute("SELECT address FROM host_block")]
+                left = replicated_ends(connection, TOKENS)
+            self._rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
+            self._keep_ends(left)
+            before, self._stated = self._stated, ([*map(self.usable_row, self._rows)], self.blocked)
+            return before != self._stated
+        return False
+
+    def _keep_ends(self, left: Mapping[str, tuple[int, float]]) -> None:
+        """Keep the earliest known time of each end: an older reading of the clocks gives a token no more time."""
+        ends, now = {}, clock.since_boot()
+        for name, (at, seconds) in left.items():
+            earlier = self._ends.get(name)
+            same = earlier is not None and earlier[0] == at
+            ends[name] = at, min(now + seconds, earlier[1] if earlier is not None and same else math.inf)
+        self._ends = ends
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        row, end = (self._rows or {}).get(token_id), self._ends.get(token_id)
+        lasts = row is not None and row.revoked is None and end is not None and clock.since_boot() < end[1]
+        return row if lasts else None
+
+    def usable(self) -> list[TokenKept]:
+        now = clock.wall() - clock.since_boot()
+        rows = filter(None, map(self.usable_row, self._rows or {}))
+        return [kept_by_api(row._replace(expires=now + self._ends[row.id][1])) for row in rows]
+
+
+class PassiveRest:
+    """The link to the api of a standby, and the pin of its key."""
+
+    def __init__(self, administration: RequestHandler, tokens: ReplicatedTokens) -> None:
+        self._administration = administration
+        self._tokens = tokens
+        self._askers = RequestAuthenticator(tokens, require_proof=False)
+        self._link = Link(self._received)
+        self.pin = ""
+        self._serving: dict[int, asyncio.Task[None]] = {}
+
+    def attach(self, channel: Channel) -> None:
+        """Until the tokens can be read, the api answers 503: the appliance is starting."""
+        self._link.attach(channel)
+        self._tokens.read()
+        if self._tokens.known:  # with an empty list, the api would tell users that their tokens are revoked
+            self._state_tokens()
+
+    def release(self) -> Channel | None:
+        for number, task in self._serving.items():
+            task.cancel()
+            self._answer(number, AdminAnswer(False, error=_TAKING_OVER, trouble="busy"))
+        return self._link.release()
+
+    async def run(self) -> None:
+        while True:
+            if await asyncio.to_thread(self._tokens.read):
+                self._state_tokens()
+            await asyncio.sleep(_READ_SECONDS)
+
+    def _received(self, message: object) -> None:
+        if isinstance(message, RestServed):
+            self.pin = message.pin
+        if isinstance(message, ConnectionPassed):
+            self._send(ConnectionAnswered(message.number, 503, _NO_DOORS))
+        if not isinstance(message, RequestMade):
+            return  # the standby records no calls: the active appliance records its own
+        if len(self._serving) >= _MOST_WAITING:
+            text = "too many requests wait for the appliance: try again"
+            self._answer(message.number, AdminAnswer(False, error=text, trouble="busy"))
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(message))
+        self._serving[message.number] = task
+        task.add_done_callback(lambda _task: self._serving.pop(message.number, None))
+
+    async def _serve(self, made: RequestMade) -> None:
+        try:
+            who = await self._askers.asker(made)
+        except UnprovenError as error:
+            self._answer(made.number, AdminAnswer(False, error=str(error), trouble="forbidden"))
+            return
+        self._answer(made.number, await self._administration.carry_out(made.request, who=who))
+
+    def _answer(self, number: int, answer: AdminAnswer[object]) -> None:
+        self._send(RequestAnswered(number, encode(answer)))
+
+    def _state_tokens(self) -> None:
+        self._send(TokensStated(self._tokens.usable(), self._tokens.blocked))
+
+    def _send(self, message: Message) -> None:
+        try:
+            self._link.send(message)
+        except ChannelFullError:
+            self._link.close()
+            _log.error("the api does not read its answers: its link is closed")
+
 
 _AGAIN_SECONDS = 0.3
 _ADMIN = "admin"

@@ -4,7 +4,7 @@ It does nothing else, so neither a busy nor a restarted control loses the lease.
 it is used.
 
 This appliance claims only while its control is present, which a standby withdraws while it could not serve
-(`takeover_check.py`). `service_watch.py` decides when an active appliance gives the lease away.
+(`passive.py`). `ServiceWatch` decides when an active appliance gives the lease away.
 """
 
 import asyncio
@@ -13,8 +13,9 @@ import secrets
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Self
 
+import msgspec
 import structlog
 
 from appliance.base import clock
@@ -26,16 +27,240 @@ from appliance.features.standby import lease_link
 from appliance.features.standby.lease import (
     SILENCE,
     ApplianceLease,
+    ClaimPromise,
     LeaseError,
     Outgoing,
+    PeerMessage,
+    PromiseRequest,
+    TakeOver,
+    WitnessAnswer,
     WitnessRequest,
 )
 from appliance.features.standby.membership import Membership, load_membership
-from appliance.features.standby.peer_link import PeerChannel
-from appliance.features.standby.service_watch import ServiceWatch
 from appliance.features.standby.witness.lease_file import write_synced
-from appliance.features.standby.witness.protocol import HIGHEST
-from appliance.features.standby.witness_link import WitnessChannel
+from appliance.features.standby.witness.protocol import (
+    ANSWER,
+    EXPIRY,
+    HIGHEST,
+    REQUEST,
+    name_in,
+    seal,
+    unseal,
+)
+
+# The datagrams between an appliance and the witness.
+
+_MOST_PENDING = 32
+
+_Count = Annotated[int, msgspec.Meta(ge=0, le=HIGHEST)]
+
+
+class _AnswerBody(msgspec.Struct, frozen=True):
+    boot: str
+    session: str
+    number: _Count
+    stale: bool = False
+    last: _Count = 0
+    ok: bool = False
+    reason: str = ""
+    epoch: _Count = 0
+    holder: str = ""
+    in_sync: frozenset[str] = frozenset()
+    expired: bool = False
+    trouble: str = ""
+    followers: str = ""
+
+
+class WitnessChannel:
+    """Writes requests and reads answers. `session` is a nonce of this process, so no earlier answer has it."""
+
+    def __init__(self, name: str, key: bytes, session: str) -> None:
+        self._name = name
+        self._key = key
+        self._session = session
+        self._boot = ""
+        self._number = 0
+        self._pending: dict[int, WitnessRequest] = {}
+
+    def write(self, request: WitnessRequest) -> bytes:
+        self._number += 1
+        self._pending[self._number] = request
+        if len(self._pending) > _MOST_PENDING:
+            del self._pending[next(iter(self._pending))]
+        body = {
+            "boot": self._boot,
+            "session": self._session,
+            "number": self._number,
+            "do": request.operation,
+            "epoch": request.epoch,
+        }
+        return seal(REQUEST, self._name, self._key, body)
+
+    def read(self, datagram: bytes) -> tuple[WitnessRequest, WitnessAnswer] | None:
+        """Return an answer with its request.
+
+        If the nonce or number of the request was old, the answer has only the present ones, for the next request.
+        """
+        if name_in(datagram) != self._name:
+            return None
+        try:
+            body = msgspec.convert(unseal(ANSWER, self._key, datagram), _AnswerBody)
+        except msgspec.ValidationError:
+            return None
+        request = self._pending.pop(body.number, None) if body.session == self._session else None
+        if request is None:
+            return None
+        if body.stale:
+            self._boot, self._number = body.boot, max(self._number, body.last)
+            return None
+        answer = WitnessAnswer(
+            body.ok,
+            body.reason,
+            body.epoch,
+            body.holder,
+            body.in_sync,
+            body.expired,
+            body.trouble,
+            body.followers,
+        )
+        return request, answer
+
+
+# Judge whether the control of an active appliance serves the robot, by its reports.
+#
+# An appliance that holds the lease without serving is worse than none, because the other one sees a healthy holder.
+# So
+# the lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready.
+#
+# A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
+# relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
+#
+# If the lease is given away soon, all limits are doubled until this appliance serves steadily, so that two appliances
+# that cannot serve do not keep passing it back and forth.
+
+OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
+SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
+START_SECONDS = 5.0
+RESTART_SECONDS = 10.0
+STEADY_SECONDS = 4.0
+_MOST_DOUBLINGS = 5
+
+
+class ServiceWatch:
+    """The reports of control while this appliance is active."""
+
+    def __init__(self) -> None:
+        self._active = False
+        self._cold = False
+        self._keeps_state = True
+        self._served = 0.0  # time of the last report without an obstacle; at first of the activation
+        self._serves = False  # whether the present control has served
+        self._ready: float | None = None  # time of the first report without an obstacle in this activation
+        self._obstacle = ""
+        self._obstacle_since = 0.0
+        self._doublings = 0
+
+    def linked(self) -> None:
+        self._serves, self._obstacle = False, ""
+
+    def reported(self, now: float, obstacle: str, *, keeps_state: bool) -> None:
+        self._keeps_state = keeps_state
+        if not obstacle:
+            self._served, self._serves, self._cold = now, True, False
+            self._ready = now if self._ready is None else self._ready
+            if now - self._ready > STEADY_SECONDS:
+                self._doublings = 0
+        elif not self._obstacle:
+            self._obstacle_since = now
+        self._obstacle = obstacle
+
+    def fault(self, now: float, *, active: bool, present: bool = True) -> str:
+        """Note whether the lease is held (`active`), and whether control stands by or serves (`present`); return why
+        to give the lease away, or an empty string.
+        """
+        if active and not self._active:
+            self._served, self._cold = now, not present
+            self._ready = None
+            self.linked()
+        self._active = active
+        if not active:
+            return ""
+        if self._cold and not self._keeps_state:
+            return "control has just started when the lease came back"
+        scale = 1 << self._doublings
+        if self._obstacle:
+            late = now - self._obstacle_since > scale * OBSTACLE_SECONDS
+            return self._obstacle if late else ""
+        silent = now - self._served
+        limit = START_SECONDS if self._ready is None else RESTART_SECONDS
+        if silent <= scale * (SILENT_SECONDS if self._serves else limit):
+            return ""
+        what = "has not reported" if self._serves else "has not been ready"
+        return f"control {what} for {silent:.1f} s"
+
+    def given_away(self) -> None:
+        if self._cold:
+            return  # the other one stands by, and nothing was tried here
+        steady = self._ready is not None and self._served - self._ready > STEADY_SECONDS
+        if not steady:
+            self._doublings = min(self._doublings + 1, _MOST_DOUBLINGS)
+
+
+# The datagrams between two appliances, each authenticated with a shared key.
+#
+# A promise repeats the nonce and the number of its request. An active appliance uses one nonce per epoch, so a
+# request
+# is new only if it has a greater epoch, or the same nonce and a greater number.
+
+PURPOSES: dict[type[PeerMessage], bytes] = {
+    PromiseRequest: b"rosrv promise request 1\0",
+    ClaimPromise: b"rosrv promise 1\0",
+    TakeOver: b"rosrv take over 1\0",
+}
+
+
+class PeerChannel:
+    """Seals and unseals the datagrams of one end."""
+
+    def __init__(self, name: str, other: str, key: bytes) -> None:
+        self._name = name
+        self._other = other
+        self._key = key
+        self._last: PromiseRequest | None = None
+
+    def write(self, message: PeerMessage) -> bytes:
+        return seal(PURPOSES[type(message)], self._name, self._key, msgspec.to_builtins(message))
+
+    def read(self, datagram: bytes) -> PeerMessage | None:
+        if name_in(datagram) != self._other:
+            return None
+        for kind, purpose in PURPOSES.items():
+            body = unseal(purpose, self._key, datagram)
+            if body is not None:
+                try:
+                    message = msgspec.convert(body, kind)
+                except msgspec.ValidationError:
+                    return None
+                fits = 0 <= message.epoch <= HIGHEST and 0 <= message.number <= HIGHEST
+                return message if fits and self._is_new(message) else None
+        return None
+
+    def _is_new(self, message: PeerMessage) -> bool:
+        if not isinstance(message, PromiseRequest):
+            return True  # the caller compares a promise or order with its request
+        last = self._last
+        new = (
+            last is None
+            or message.epoch > last.epoch
+            or (
+                (message.epoch, message.session) == (last.epoch, last.session)
+                and message.number > last.number
+            )
+        )
+        if new:
+            self._last = message
+        return new
+
 
 EPOCH = "epoch"
 _CONTROL_SECONDS = 1.0

@@ -11,9 +11,10 @@ import asyncio
 import contextlib
 import os
 import socket
+import ssl
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import msgspec
 import structlog
@@ -28,12 +29,84 @@ from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
+from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_sender import ReplicationSender
-from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.summary import UNCHECKED, takeover_obstacles
 from appliance.features.standby.tunnels import StandbyTunnels
 from appliance.features.standby.witness.protocol import EXPIRY
 from appliance.store.writer_thread import Database, StoreError
+
+# Carry the replication over TLS 1.3: the active appliance listens, the standby connects.
+
+_HANDSHAKE_SECONDS = 5.0
+_PAUSE_SECONDS = 1.0
+_MOST_CONNECTIONS = 8  # one is in use; others are in their handshake, or replace it
+
+
+class _Server(Protocol):
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None: ...
+
+
+class ReplicationListener:
+    """Accepts the other appliance's connections."""
+
+    def __init__(self, server: _Server, context: ssl.SSLContext) -> None:
+        self._server = server
+        self._context = context
+        self._connections: set[asyncio.Task[None]] = set()
+
+    async def run(self, listening: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        listening.setblocking(False)
+        try:
+            while True:
+                try:
+                    connection, _address = await loop.sock_accept(listening)
+                except OSError as error:  # such as too many open files
+                    _log.warning("a connection for replication was not accepted", error=str(error))
+                    await asyncio.sleep(_PAUSE_SECONDS)
+                    continue
+                if len(self._connections) >= _MOST_CONNECTIONS:
+                    connection.close()
+                    continue
+                task = loop.create_task(self._serve(connection))
+                self._connections.add(task)
+                task.add_done_callback(self._connections.discard)
+        finally:
+            for task in self._connections:
+                task.cancel()
+            await asyncio.gather(*self._connections, return_exceptions=True)
+
+    async def _serve(self, connection: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader()
+        protocol = asyncio.StreamReaderProtocol(reader)
+        try:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # asyncio omits it here
+            transport, _ = await loop.connect_accepted_socket(
+                lambda: protocol, connection, ssl=self._context, ssl_handshake_timeout=_HANDSHAKE_SECONDS
+            )
+        except OSError as error:
+            connection.close()
+            _log.warning("a connection for replication was refused", error=str(error))
+            return
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+        try:
+            await self._server.serve(reader, writer)
+        except ReplicationError as error:
+            _log.warning("the replication to the standby ended", reason=str(error))
+
+
+async def follow_at(address: str, port: int, context: ssl.SSLContext, receiver: ReplicationReceiver) -> None:
+    try:
+        async with asyncio.timeout(2 * _HANDSHAKE_SECONDS):
+            reader, writer = await asyncio.open_connection(
+                address, port, ssl=context, ssl_handshake_timeout=_HANDSHAKE_SECONDS
+            )
+    except (OSError, TimeoutError) as error:
+        raise ReplicationError(f"{address}:{port} does not answer: {error}") from error
+    await receiver.follow(reader, writer)
+
 
 _GAP_SECONDS = 0.9  # without an answer of the witness; less than the confidence of a follower
 _ADMITTED_SECONDS = 2.0  # after the next answer, until all followers admit this appliance again

@@ -1,11 +1,74 @@
 """Show two appliances in the status, the alarms and the metrics."""
 
+import math
+
 from appliance.base.metric import counter, gauge
-from appliance.features.standby.answers import StandbyState
-from appliance.features.standby.samples import samples_of
-from appliance.features.standby.status_line import standby_line
-from appliance.features.standby.summary import PATIENCE_SECONDS, follower_troubles, standby_troubles
-from appliance.features.view import FeatureView, StateView
+from appliance.features.standby.answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.summary import (
+    PATIENCE_SECONDS,
+    both_active,
+    follower_troubles,
+    is_silent,
+    lag_of,
+    lasting,
+    standby_troubles,
+)
+from appliance.features.view import FeatureView, Pieces, Samples, StateView
+
+# Write the state of two appliances in one line.
+
+
+def standby_line(state: StandbyState) -> tuple[str, Pieces]:
+    other, witness = lag_in_words(state.other), answer_in_words(state.witness)
+    line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
+    return "standby", [(line, "yellow" if state.troubles else "")]
+
+
+def lag_in_words(other: OtherAppliance) -> str:
+    if other.connected:
+        return "in sync" if other.in_sync else lag_of(other)
+    return connection(other)
+
+
+def answer_in_words(witness: WitnessSeen) -> str:
+    seconds = witness.answered_seconds
+    if seconds is None:
+        return "has never answered"
+    if is_silent(witness):
+        return f"silent for {lasting(seconds)}"
+    return "refuses" if witness.refusal else "answers"
+
+
+def connection(other: OtherAppliance) -> str:
+    if other.connected:
+        return "connected"
+    away = "" if other.trouble_seconds is None else f" for {lasting(other.trouble_seconds)}"
+    return f"away{away}" + (f": {other.reason}" if other.reason else "")
+
+
+# The samples of the metrics of two appliances.
+
+
+def samples_of(state: StandbyState) -> dict[str, Samples]:
+    other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
+    return {
+        "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],
+        "rosrv_standby_connected": [((), other.connected)],
+        "rosrv_standby_in_sync": [((), other.in_sync)] if active else [],
+        "rosrv_standby_can_take_over": [((), not state.troubles)],
+        "rosrv_standby_obstacle": [((), bool(state.obstacle))],
+        "rosrv_standby_behind_changes": [((), other.behind_changes)] if active else [],
+        "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
+        "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],
+        "rosrv_standby_other_witness_age_seconds": [((), seen)]
+        if (seen := other.witness_seconds) is not None
+        else [],
+        "rosrv_standby_witness_trouble": [((), bool(state.witness.trouble or state.witness.refusal))],
+        "rosrv_standby_both_active": [((), both_active(state))] if active else [],
+        # Until the epoch is known after a restart: a counter that falls to 0 and returns would look like takeovers.
+        "rosrv_standby_takeovers_total": [((), state.epoch)] if state.epoch else [],
+    }
+
 
 _METRICS = (
     gauge(
@@ -62,6 +125,6 @@ STANDBY_VIEW = FeatureView(
         ),
     ),
     pair="appliance.features.standby.pair_view:StandbyPairView",
-    passive_status="appliance.features.standby.standby_view:standby_view",
+    passive_status="appliance.features.standby.live_verbs:standby_view",
     verification="appliance.features.standby.takeover_table:verification",
 )

@@ -5,9 +5,8 @@ from functools import partial
 from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.tunnels import requests
-from appliance.features.tunnels.certification import Certification
+from appliance.features.tunnels.certification import Certification, rest_address
 from appliance.features.tunnels.enrolment import HostEnrolment, find_endpoint
-from appliance.features.tunnels.rest_address import rest_address
 
 
 def machines(core: Core) -> dict[str, int]:

@@ -11,29 +11,215 @@ import ssl
 from collections.abc import Awaitable, Callable
 from functools import partial
 
+from appliance.audit.log.record import Severity
+from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.base.withdrawal import take_effect
+from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Settings
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels import tunnel_answers as answers
-from appliance.features.tunnels.certification import Certification
-from appliance.features.tunnels.checked_ports import PortChecks
+from appliance.features.tunnels.certification import NO_TUNNELS, Certification
 from appliance.features.tunnels.enrolment_kit import filled
-from appliance.features.tunnels.enrolment_tokens import LONGEST_SECONDS, MOST
-from appliance.features.tunnels.host_view import HostView
-from appliance.features.tunnels.rest_address import NO_TUNNELS
-from appliance.features.tunnels.self_service import HostSelfService
-from appliance.features.tunnels.tunnel_answers import Endpoint
-from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
+from appliance.features.tunnels.enrolment_tokens import LONGEST_SECONDS, MOST, BadEnrolmentTokenError
+from appliance.features.tunnels.host_view import HostView, span
+from appliance.features.tunnels.tunnel_answers import Endpoint, KitParts, NewCertificate, PortsReport, Renewed
+from appliance.hosts.host_table import LONGEST_DAYS, HostForbiddenError, HostRefusedError
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHostsError
 from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.host_names import HostInWords
 from appliance.policy.model import Address
 from appliance.signing.fingerprints import fingerprint
-from appliance.store.host_tables import EnrolmentTokenRow
+from appliance.store.host_tables import EnrolmentTokenRow, HostRow, PortsRow
+
+# Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
+#
+# 1. A token is used up before the authority is asked, so if two hosts send the same token, only one gets a
+# certificate.
+#    If no certificate is issued, the token becomes valid again, unless its name was revoked in between.
+# 2. A host that renews must send from the virtual address of its name, which the firewall accepts only through IPsec.
+#    The signer checks the signature by the name's present key.
+# 3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses
+#    its connection in between, it can use either certificate.
+
+_ANSWER_SECONDS = 1.0  # time for the answer to leave through the host's tunnel
+_RENEWALS = 20  # most renewals in a certificate's life; each lengthens the list of revoked certificates
+_RENEWED = "hosts.renewed."
+
+
+class HostSelfService:
+    """Serves the requests that hosts make for themselves."""
+
+    def __init__(self, certification: Certification) -> None:
+        self._certification = certification
+        self._table = certification.table
+        self._tunnels = certification.tunnels
+        self._trail = certification.trail
+        kept = certification.store.settings()
+        self._renewals = {  # time of the last renewal by name, in seconds since the epoch
+            name.removeprefix(_RENEWED): float(moment)
+            for name, moment in kept.items()
+            if name.startswith(_RENEWED)
+        }
+
+    async def enrol(self, request: host_requests.HostEnrol) -> KitParts:
+        async with self._certification.changing:
+            try:
+                awaited = self._certification.awaited.take(request.token)
+            except BadEnrolmentTokenError as error:
+                self._trail.happened("enrolment refused", str(error), decision="deny", host=request.peer)
+                raise HostForbiddenError(str(error)) from error
+            name = awaited.name
+            try:
+                await self._tunnels.open()
+                with self._certification.unless_revoked(name):
+                    made = await self._certification.issue(name, request.request, awaited.days)
+                take_effect()
+            except HostForbiddenError:
+                raise
+            except (HostRefusedError, WithdrawnError):
+                self._certification.awaited.give_back(awaited)
+                raise
+            self._certification.enrolled(
+                name, awaited.address, made, awaited.who, token=awaited.id, peer=request.peer
+            )
+            return await self._certification.finish(name, awaited.kit)
+
+    async def renew(self, request: host_requests.HostRenewItself) -> NewCertificate:
+        name = request.name
+        async with self._certification.changing:
+            row = self._in_its_tunnel(name, request.peer)
+            certificate = self._table.certificates.get(name)
+            if certificate is None or not certificate.certificate:
+                raise HostRefusedError(
+                    f"the certificate of {name} is not stored here: issue a new one (rosrv host kit {name})"
+                )
+            life = row.expires - certificate.made
+            self._require_patience(name, life)
+            with self._certification.unless_revoked(name):
+                made = await self._certification.issue(
+                    name,
+                    request.request,
+                    life / 86_400,
+                    proof=request.proof,
+                    former=certificate.certificate.encode(),
+                )
+            take_effect()
+            self._table.keep_next(name, made)
+            self._note_renewal(name)
+            await self._certification.store.settled()
+            authority = await self._certification.authority_certificate()
+            return NewCertificate(
+                name, made.serial, made.expires, made.certificate.decode(), authority.decode()
+            )
+
+    async def renewed(self, request: host_requests.HostRenewed) -> Renewed:
+        name = request.name
+        before = self._in_its_tunnel(name, request.peer).serial
+        # Without the authority's key the previous certificate could not be put on the list of revoked certificates.
+        await self._certification.require_authority()
+        row = self._table.take_next(name)
+        if row is None:
+            raise HostRefusedError(f"{name} has no renewed certificate waiting: renew first")
+        self._certification.renewed(name, before, row.serial, row.expires, name)
+        await self._certification.store.settled()
+        asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
+        return Renewed(name)
+
+    def _in_its_tunnel(self, name: str, peer: str) -> HostRow:
+        address = ipaddress.ip_address(peer)
+        mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+        row = self._table.at(str(mapped or address)) if self._tunnels.enclosed else None
+        if row is None or row.name != name or not self._table.declared.wants(name):
+            self._trail.happened(
+                "renewal refused", f"not in the tunnel of {name[:80]}", decision="deny", host=peer
+            )
+            raise HostForbiddenError(
+                f"{peer} is not the address of {name} in its tunnel: run this on {name}, while the tunnel is up"
+            )
+        return row
+
+    def _require_patience(self, name: str, life: float) -> None:
+        wait = life / _RENEWALS
+        since = clock.wall() - self._renewals.get(name, -wait)
+        if 0 <= since < wait:  # `since` is negative after the clock was set back; the host then need not wait
+            raise HostRefusedError(f"{name} renewed {span(since)} ago: try again in {span(wait - since)}")
+
+    def _note_renewal(self, name: str) -> None:
+        self._renewals[name] = clock.wall()
+        self._certification.store.save_setting(_RENEWED + name, repr(self._renewals[name]))
+
+
+# Keep the results of port checks from other machines.
+
+_CLOCKS_DIFFER = 86_400.0
+_MOST_PORTS = 100
+
+
+class PortChecks:
+    """The results by machine; `machines()` returns the number of nodes by address."""
+
+    def __init__(
+        self,
+        certification: Certification,
+        view: HostView,
+        machines: Callable[[], dict[str, int]],
+        in_words: HostInWords,
+    ) -> None:
+        self._certification = certification
+        self._table = certification.table
+        self._tunnels = certification.tunnels
+        self._trail = certification.trail
+        self._view = view
+        self._machines = machines
+        self._in_words = in_words
+
+    async def tell(self, request: host_requests.HostPorts, who: str) -> PortsReport:
+        self._table.require(request.expected)
+        key, state = self._known_machine(request.name), request.state
+        now = clock.wall()
+        checked = now if request.checked is None else request.checked
+        if checked > now + _CLOCKS_DIFFER:
+            raise HostRefusedError(
+                "the time of the check is more than a day in the future: correct the clock of the host, or of the"
+                " appliance"
+            )
+        row = PortsRow(key, state, sorted(set(request.open))[:_MOST_PORTS], min(checked, now), who)
+        self._table.keep_ports(row)
+        self._trail.happened(
+            "ports checked",
+            f"the ROS ports of {self._in_words(key)} are {state}" + (f": {row.open}" if row.open else ""),
+            severity=Severity.WARNING if state == "open" else Severity.NOTICE,
+            name=key,
+            state=state,
+            open=row.open,
+            checked=row.checked,
+            who=who,
+        )
+        await self._certification.store.settled()
+        return PortsReport(self._view.ports(key), self._table.revision, key)
+
+    def in_clear_text(self) -> dict[str, int]:
+        pool = self._table.pool
+        return {
+            address: nodes
+            for address, nodes in self._machines().items()
+            if not (one := ipaddress.ip_address(address)).is_loopback and one not in pool
+        }
+
+    def _known_machine(self, name: str) -> str:
+        if name in self._table.rows or name in self._table.declared.hosts:
+            return name
+        try:
+            address = str(ipaddress.ip_address(name))
+        except ValueError:
+            self._table.enrolled_row(name)  # raises an error that lists the enrolled hosts
+            raise
+        behind = [tunnel.name for tunnel in self._tunnels.seen.values() if tunnel.remote == address]
+        row = self._table.at(address)
+        return row.name if row is not None else behind[0] if len(behind) == 1 else address
 
 
 class HostEnrolment(TunnelHosts):

@@ -22,7 +22,7 @@ from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.enrolment_kit import archive
 from appliance.features.tunnels.kits import KitOptions, kit_of
-from appliance.features.tunnels.rest_bodies import ENDPOINT, HOST_NAME, KitWishes
+from appliance.features.tunnels.requests import ENDPOINT, HOST_NAME, KitWishes
 from appliance.ipsec.requests import make_key, signing_request
 
 _UNKNOWN: Responses = {404: {"description": "There is no such host."}}

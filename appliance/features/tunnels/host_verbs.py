@@ -13,9 +13,16 @@ from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import moment, say_json, say_row
-from appliance.features.tunnels.kit_output import key_and_request, placed, wishes_of, write_kit, write_script
+from appliance.features.tunnels.kit_output import (
+    key_and_request,
+    new_output,
+    placed,
+    usage_error,
+    wishes_of,
+    write_kit,
+    write_script,
+)
 from appliance.features.tunnels.kits import KitOptions
-from appliance.features.tunnels.private_output import new_output, usage_error
 from appliance.features.tunnels.requests import (
     HostAdd,
     HostList,

@@ -27,7 +27,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.tunnels.charon import CharonError, ViciClient
 from appliance.features.tunnels.refusals import Refusal, RefusalParser
-from appliance.ipsec.key_files import SignerKeyError, require_private
+from appliance.ipsec.authority_key import SignerKeyError, require_private
 from appliance.ipsec.leftovers import clear_leftovers
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.ipsec.strongswan import PROGRAM, configuration

@@ -2,10 +2,96 @@
 
 from typing import Annotated, Literal
 
+import msgspec
+
 from appliance.channel.admin import AdminRequest, WaitingRequest
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.host_answers import PortsState
+from appliance.channel.rest_bodies import WHOLE
 from appliance.channel.rest_operation import Versioned, parameter, rest
-from appliance.features.tunnels import rest_bodies as bodies
 from appliance.features.tunnels import tunnel_answers
+
+# Define the bodies of REST requests about hosts in tunnels. An unknown field is an error.
+
+HOST_NAME = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$"
+ENDPOINT = r"^[A-Za-z0-9][A-Za-z0-9.:-]{0,252}$"
+PORTS = r"^[0-9]{1,5}(?:-[0-9]{1,5})?$"
+SERVICE = r"^(?:tcp|udp)/[0-9]{1,5}(?:-[0-9]{1,5})?$"
+LONGEST_REQUEST = 16 << 10
+LONGEST_DAYS = 398
+LONGEST_TOKEN_SECONDS = 7 * 86_400
+HostName = Annotated[str, doc("name of the host, `host:NAME` in the policy", pattern=HOST_NAME + WHOLE)]
+Endpoint = Annotated[str, msgspec.Meta(pattern=ENDPOINT + WHOLE)]
+Service = Annotated[str, msgspec.Meta(pattern=SERVICE + WHOLE)]
+Address = Annotated[str, msgspec.Meta(max_length=64)]
+Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
+Days = Annotated[float, doc("until the certificate ends", gt=0, le=LONGEST_DAYS)]
+TokenSeconds = Annotated[float, msgspec.Meta(ge=60, le=LONGEST_TOKEN_SECONDS)]
+SigningRequest = Annotated[str, doc("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
+GivenMoment = (
+    Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)] | Annotated[str, msgspec.Meta(max_length=64)]
+)
+
+
+class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The contents of a kit besides the certificate."""
+
+    endpoint: Annotated[
+        Endpoint | None,
+        doc(
+            "address or name at which the host reaches the appliance; by default, `ipsec.endpoint` of the"
+            " configuration, else the machine's address towards its default route (422 if it has none)"
+        ),
+    ] = None
+    ports: Annotated[
+        str, doc("the host's local port range, which its firewall closes", pattern=PORTS + WHOLE)
+    ] = "32768-60999"
+    open: Annotated[
+        list[Service], doc("the host's services that stay open, such as tcp/22", max_length=100)
+    ] = []
+
+
+class TokenWishes(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A one-time token for a host, new or enrolled before."""
+
+    address: Annotated[Address | None, doc("its virtual address; by default, the next free one")] = None
+    days: Days = 90
+    token_seconds: Annotated[TokenSeconds, doc("seconds for which the one-time token is valid")] = 3600
+
+
+class NewHost(TokenWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A host to enrol."""
+
+    name: HostName
+    how: Annotated[
+        Literal["token", "kit"],
+        doc(
+            "token: the host makes its own key and presents a one-time token (POST /v1/enrol); kit: an archive with a"
+            " private key in it, to be copied to the host"
+        ),
+    ] = "token"
+    request: Annotated[
+        SigningRequest | None,
+        doc("with how=kit: signing request for the host's own key; the kit then has no private key"),
+    ] = None
+
+
+class NewKit(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A new certificate for an enrolled host, in a kit; the earlier one is revoked."""
+
+    days: Days = 90
+    request: SigningRequest | None = None
+
+
+class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The findings of `rosrv protect --check`."""
+
+    state: Annotated[PortsState, doc("its state")]
+    open: Annotated[list[Port], doc("TCP ports that accepted a connection", max_length=100)] = []
+    checked: Annotated[GivenMoment | None, doc("RFC 3339, or seconds since the epoch; by default, now")] = (
+        None
+    )
+
 
 HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 _NO_HOST = {404: "There is no such host."}
@@ -16,18 +102,18 @@ _KIT = (
 _CHARON_SECONDS = 45.0  # charon may have to be started first
 OneHost = Annotated[
     str,
-    parameter("name of the host", min_length=1, max_length=63, pattern=bodies.HOST_NAME, examples=["ocu-1"]),
+    parameter("name of the host", min_length=1, max_length=63, pattern=HOST_NAME, examples=["ocu-1"]),
 ]
 
 
 @rest(
     "admin", "POST", "/v1/hosts", name="enrol_host", words="Enrol a host: by a one-time token that it presents with"
-    " its own signing request, or by a kit.", body=bodies.NewHost, says={"how": "token"}, fixed={"new": True},
+    " its own signing request, or by a kit.", body=NewHost, says={"how": "token"}, fixed={"new": True},
     of=HOSTS, status=201, good="Enrolled: the kit (how=kit); or a one-time token (how=token)",
     seconds=_CHARON_SECONDS,
 )  # fmt: skip
 @rest(
-    "admin", "POST", "/v1/hosts/{name}/token", name="host_token", body=bodies.TokenWishes, fixed={"new": False},
+    "admin", "POST", "/v1/hosts/{name}/token", name="host_token", body=TokenWishes, fixed={"new": False},
     of=HOSTS, seconds=_CHARON_SECONDS,
 )  # fmt: skip
 class HostToken(WaitingRequest[tunnel_answers.EnrolmentToken], frozen=True, tag="host token"):
@@ -72,7 +158,7 @@ class HostEnrol(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host 
 
 
 @rest(
-    "admin", "POST", "/v1/hosts/{name}/kit", name="new_host_kit", body=bodies.NewKit, of=HOSTS, problems=_NO_HOST,
+    "admin", "POST", "/v1/hosts/{name}/kit", name="new_host_kit", body=NewKit, of=HOSTS, problems=_NO_HOST,
     seconds=_CHARON_SECONDS, filled=("request",), good="The kit: an archive (.tar.gz)", machine_only=_KIT,
 )  # fmt: skip
 class HostRenew(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host renew"):
@@ -132,7 +218,7 @@ class HostRevoke(AdminRequest[tunnel_answers.Revoked], frozen=True, tag="host re
 
 
 @rest(
-    "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", body=bodies.PortsTold, of=HOSTS,
+    "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", body=PortsTold, of=HOSTS,
     problems=_NO_HOST, answer_field="ports",
 )  # fmt: skip
 class HostPorts(AdminRequest[tunnel_answers.PortsReport], frozen=True, tag="host ports"):

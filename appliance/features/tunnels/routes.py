@@ -2,7 +2,7 @@
 
 1. A host that sends wrong tokens must wait, and all such hosts share one limit. A host that sent no wrong token never
    waits, so an attacker with many addresses cannot keep out a valid token.
-2. Only a host in its tunnel can renew (`self_service.py`).
+2. Only a host in its tunnel can renew (`enrolment.py`).
 3. Signing requests are not parsed here: only the signer does so.
 """
 
@@ -15,8 +15,8 @@ from fastapi import Header, Request, Response
 from msgspec import convert
 from msgspec.structs import asdict
 
+from appliance.api.front.access import Buckets
 from appliance.api.front.problems import ProblemError, too_many
-from appliance.api.front.rates import Buckets
 from appliance.api.front.route_roles import answered
 from appliance.api.front.routing import Responses, Routes, answer, body, content, file
 from appliance.api.front.services import Services
@@ -30,7 +30,7 @@ from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_kit import archive, members
 from appliance.features.tunnels.host_routes import ANSWERS, OneName, add_host_routes
 from appliance.features.tunnels.kits import KitOptions, kit_of
-from appliance.features.tunnels.rest_bodies import SigningRequest
+from appliance.features.tunnels.requests import SigningRequest
 from appliance.features.tunnels.tunnel_answers import NewCertificate
 
 TOKEN = r"^rosrv-enrol_[0-9a-f]{12}_[A-Za-z0-9_-]{43}$"  # noqa: S105  the form of one

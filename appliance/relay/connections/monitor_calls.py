@@ -15,8 +15,7 @@ from appliance.channel.messages import (
     MonitorCallWanted,
     OwnServiceAnswered,
 )
-from appliance.relay.connections.held_requests import HeldRequests
-from appliance.relay.connections.own_service import OwnService
+from appliance.relay.connections.own_service import HeldRequests, OwnService
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect

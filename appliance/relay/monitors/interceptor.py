@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING
 
 from appliance.base import clock
@@ -20,6 +21,7 @@ from appliance.channel.messages import (
     MonitorSwitched,
     SpecificationsRefused,
     SpecificationsStated,
+    SpecificationsTaken,
     StateWanted,
     StopBegun,
     StopWanted,
@@ -27,8 +29,6 @@ from appliance.channel.messages import (
     ValuesWanted,
 )
 from appliance.relay.loop import EventLoop, LoopTimer
-from appliance.relay.monitors.holds import hold_begun, taken
-from appliance.relay.monitors.host_mask import HostMask
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
@@ -48,6 +48,67 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
     from rosmop.run.fast_path import BatchOptions, FastLane
     from rosmop.run.outcomes import Outcome, Published
+
+
+# The hosts that get no message of a topic while a monitor withholds it.
+
+_MOST_KNOWN = 1000
+
+
+class HostMask:
+    """Hides a topic from hosts in the networks that `networks()` returns, at each delivery."""
+
+    def __init__(self, networks: Callable[[], tuple[str, ...]]) -> None:
+        self._networks = networks
+        self._known: dict[tuple[str, str], bool] = {}
+
+    def hides(self, host: str) -> bool:
+        """Return whether to hide the topic from this host; a host without an IP address counts as in every network."""
+        return any(self._contains(network, host) for network in self._networks())
+
+    def _contains(self, network: str, host: str) -> bool:
+        found = self._known.get((network, host))
+        if found is None:
+            try:
+                found = ip_address(host) in ip_network(network)
+            except ValueError:
+                found = True
+            if len(self._known) >= _MOST_KNOWN:
+                self._known.clear()
+            self._known[network, host] = found
+        return found
+
+
+# Let monitors hold their topics when specifications are loaded, and report those that hold to control.
+
+
+def hold_begun(monitors: MonitorSet, message: SpecificationsStated, switches: Mapping[str, bool]) -> None:
+    """Let monitors that began in their initial state hold their topics, if they moved or cannot be built.
+
+    A disabled monitor guarded nothing, so it does not hold its topics.
+    """
+    for monitor in monitors.monitors:
+        if monitor.name not in monitors.began:
+            continue
+        if monitor.name in message.moved and not monitor.held:
+            monitors.hold_lost(
+                monitor, "it moved to another relay process, and its state remained in the previous one"
+            )
+        if monitor.name in message.unbuilt and monitor.held_channels and not monitor.code.begins:
+            monitors.hold(monitor, f"its file has an error: {message.unbuilt[monitor.name]}")
+        if monitor.why_held and not switches.get(monitor.name, True):
+            monitors.resume(monitor.name)
+
+
+def taken(
+    message: SpecificationsStated, began: list[str], monitors: MonitorSet | None
+) -> SpecificationsTaken:
+    held = [] if monitors is None else [one for one in monitors.monitors if one.held]
+    because = {one.name: one.why_held for one in held if one.why_held}
+    return SpecificationsTaken(
+        message.revision, began, [one.name for one in held], message.statement, because
+    )
+
 
 MonitorOrder = MonitorSwitched | MonitorGiven | StopWanted | ValuesWanted
 """Control's orders and queries about monitors in force, beside new specifications."""

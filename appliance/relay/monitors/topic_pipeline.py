@@ -9,10 +9,9 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
-from appliance.relay.monitors.batch_progress import BatchProgress
 from appliance.relay.monitors.fast_path_counts import FastPathCounts
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import HEAD, ObservationPoint, ObservedMessage
+from appliance.relay.monitors.observation_points import HEAD, BatchProgress, ObservationPoint, ObservedMessage
 from appliance.relay.monitors.observations import SHOWN
 from appliance.relay.monitors.observer import dropped
 from appliance.relay.monitors.state_memory import NOT_KEPT

@@ -22,7 +22,7 @@ from pathlib import Path
 import appliance
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.privileges import libc_call
-from appliance.supervisor.sandbox.system_calls import system_call
+from appliance.supervisor.sandbox.landlock import system_call
 from appliance.supervisor.users import Account
 
 _PARTS = ("appliance", "roswire", "rosmop", "monitors")

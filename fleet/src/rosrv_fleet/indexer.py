@@ -1,7 +1,7 @@
 """Copy stored segments to the index. The store works without it, and the index catches up later.
 
 Robots take turns with one segment each, and large segments have their own turns (`LANES`). A segment that cannot be
-indexed is set aside, and `retention.py` lets it try again every hour.
+indexed is set aside, and `collector.py` lets it try again every hour.
 """
 
 import gzip

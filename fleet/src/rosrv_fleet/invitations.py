@@ -17,9 +17,8 @@ import msgspec
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.signing.bearer_secrets import hash_of, new_secret
-from rosrv_fleet.acts import recorded
 from rosrv_fleet.enrolment import EnrolmentError
-from rosrv_fleet.robots import changing
+from rosrv_fleet.robots import changing, recorded
 
 _TOKEN = re.compile("rosrv-join_[A-Za-z0-9_-]{43}")
 

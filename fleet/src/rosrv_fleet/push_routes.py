@@ -1,12 +1,15 @@
 """Accept segments from robots. An upload is bounded, verified, stored, and only then answered with a signed receipt."""
 
 import asyncio
+import gzip
 import math
-from collections.abc import AsyncIterator
+import time
+import zlib
+from collections.abc import AsyncIterator, Collection
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import IO, Annotated
+from typing import IO, Annotated, NamedTuple
 
 import msgspec
 import structlog
@@ -16,13 +19,45 @@ from starlette.requests import ClientDisconnect
 
 from appliance.base import clock
 from appliance.formats.receipts import SegmentReceipt
+from appliance.formats.segments import SegmentError, SegmentReader, SegmentSummary
 from appliance.signing.log_proof import checkpoint_hash
 from rosrv_fleet.access import certificate_of, robot_of
 from rosrv_fleet.collector import LONG_CHECKS, SHORT_CHECKS, Collector
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.quotas import OverQuotaError
-from rosrv_fleet.segment_check import SegmentVerdict, check_segment
 from rosrv_fleet.segment_store import NotStorableError, SegmentPlace, StoreFullError
+from rosrv_fleet.workers import OutOfTimeError, processor_time
+
+# Verify an upload within a limit of processor time. Runs in a worker.
+
+
+class SegmentVerdict(NamedTuple):
+    """The summary of a valid segment, or the reason why it is invalid. `late`: the time limit was too short.
+
+    `size` is the number of uncompressed bytes that were read, `seconds` the processor time.
+    """
+
+    summary: SegmentSummary | None
+    reason: str
+    late: bool
+    size: int
+    seconds: float
+
+
+def check_segment(upload: Path, keys: Collection[bytes], most_bytes: int, seconds: float) -> SegmentVerdict:
+    """Verify a segment with raw public keys, in at most `seconds` of processor time. Raise `OSError`."""
+    begun = time.process_time()
+    summary, reason, late = None, "", False
+    with gzip.open(upload) as file:
+        try:
+            with processor_time(seconds):
+                summary = SegmentReader(file, keys, most_bytes).summary()
+        except OutOfTimeError as error:
+            reason, late = str(error), True
+        except (SegmentError, EOFError, zlib.error, gzip.BadGzipFile) as error:
+            reason = str(error)
+        return SegmentVerdict(summary, reason, late, file.tell(), time.process_time() - begun)
+
 
 _SHORT_SECONDS = 0.25
 _NOT_THE_ROBOT = (400, 503)  # the connection ended, or the collector failed: no reason for a pause

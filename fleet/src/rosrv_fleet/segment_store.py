@@ -33,7 +33,7 @@ import zlib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, NamedTuple, TypeVar
 
 import msgspec
 
@@ -42,7 +42,24 @@ from appliance.base.age_clock import AgeClock
 from appliance.base.atomic_files import write_whole
 from appliance.formats.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
 from rosrv_fleet.robots import make_folder
-from rosrv_fleet.stored_files import read_stored
+
+# Read the small files of the data folder. A damaged one is an `OSError` with its path, like an unreadable one.
+
+T = TypeVar("T")
+
+
+class DamagedFileError(OSError):
+    """A file of the data folder has no valid content."""
+
+
+def read_stored(file: Path, type_: type[T]) -> T:
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=type_)
+    except ValueError as error:
+        raise DamagedFileError(
+            errno.EIO, f"damaged ({error}); restore it from a backup", str(file)
+        ) from error
+
 
 _BUCKET = 1000
 _DIGITS = 18

@@ -7,24 +7,149 @@ import asyncio
 import hashlib
 import socket
 import ssl
+from pathlib import Path
 from typing import Any
 
 import structlog
 import uvicorn
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from appliance.base.atomic_files import write_whole
 from appliance.base.log_output import keep_from_blocking
-from rosrv_fleet.access import IS_ROBOT, PEER_CERTIFICATE
+from appliance.signing.own_certificate import make_own_certificate
+from rosrv_fleet.access import IS_ROBOT, PEER_CERTIFICATE, token_of
 from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.connections import ClientConnections, listen
-from rosrv_fleet.door import Door
+from rosrv_fleet.config import FleetConfig
+from rosrv_fleet.connections import ClientConnections, listen, owner_of
 from rosrv_fleet.enrolment import RobotAppliance
 from rosrv_fleet.failures import failure_of
-from rosrv_fleet.host_names import CollectorNames
+from rosrv_fleet.host_names import WRONG_HOST, CollectorNames
 from rosrv_fleet.robots import Robots
 from rosrv_fleet.rollouts.service import BundleService
-from rosrv_fleet.server_certificate import names_of
+from rosrv_fleet.tokens import OperatorTokens
+
+# Make the collector's certificate, and read from it the address and the authority that invitations contain.
+
+_DAYS = 3650  # every robot pins it, and must join again after a change
+
+
+class ServerCertificateError(Exception):
+    """The collector's certificate is missing or unusable for robots. The message has the remedy."""
+
+
+def make_certificate(config: FleetConfig, address: str | None) -> bool:
+    """Make a key and a certificate, or return False if there is one. Raise `ServerCertificateError` or `OSError`."""
+    if config.certificate.exists():
+        named = _addresses(config.certificate)
+        if address is not None and address not in named:
+            raise ServerCertificateError(
+                f"{config.certificate} names {', '.join(named) or 'no address'}: to replace it, remove it and its key,"
+                " repeat this, restart the collector, and let every robot join again"
+            )
+        return False
+    try:
+        key, certificate = make_own_certificate("rosrv-fleet", _DAYS, address or "")
+    except ValueError:
+        raise ServerCertificateError(
+            f"{config.certificate} does not exist: give --address, an address at which robots reach this machine"
+        ) from None
+    write_whole(config.key, key, 0o600)
+    write_whole(config.certificate, certificate, 0o644)
+    return True
+
+
+def authority_of(certificate: Path) -> str:
+    """Return the last certificate of the file as PEM. Raise `ServerCertificateError` unless it is self-signed."""
+    last = x509.load_pem_x509_certificates(certificate.read_bytes())[-1]
+    if last.issuer != last.subject:
+        raise ServerCertificateError(
+            f"{certificate} does not end with its authority's certificate, which robots need: append it"
+        )
+    return last.public_bytes(Encoding.PEM).decode("ascii")
+
+
+def url_of(config: FleetConfig) -> str:
+    """Return the URL with the certificate's first address, or raise `ServerCertificateError` if it names none."""
+    addresses = _addresses(config.certificate)
+    if not addresses:
+        raise ServerCertificateError(
+            f"{config.certificate} names no IP address in its subjectAltName: make another one"
+        )
+    shown = f"[{addresses[0]}]" if ":" in addresses[0] else addresses[0]
+    return f"https://{shown}:{config.address[1]}"
+
+
+def names_of(certificate: Path) -> list[str]:
+    """Return the host names in the certificate; one may begin with `*.`."""
+    names = _alternative_names(certificate)
+    return [] if names is None else names.get_values_for_type(x509.DNSName)
+
+
+def _addresses(certificate: Path) -> list[str]:
+    names = _alternative_names(certificate)
+    return [] if names is None else [str(address) for address in names.get_values_for_type(x509.IPAddress)]
+
+
+def _alternative_names(certificate: Path) -> x509.SubjectAlternativeName | None:
+    first = x509.load_pem_x509_certificates(certificate.read_bytes())[0]
+    try:
+        return first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return None
+
+
+# Limit the requests of clients that are neither robots nor operators, by address, and check the name in them.
+#
+# The limit is checked before any route, so logins, wrong tokens and health checks count as well. Robots prove who
+# they
+# are by a certificate, which no browser sends, so they may use any name.
+
+
+class Door:
+    """An ASGI application that passes on the requests within the limits of `ClientConnections` to a name of its own."""
+
+    def __init__(
+        self, app: ASGIApp, table: ClientConnections, tokens: OperatorTokens, names: CollectorNames
+    ) -> None:
+        self._app, self._table, self._tokens, self._names = app, table, tokens, names
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer 429 above the limit, and 421 to another name. The address of a request with a valid token counts as
+        proven.
+        """
+        if scope["type"] == "http" and not scope.get("state", {}).get(IS_ROBOT):
+            request = Request(scope)
+            owner = owner_of(request.client.host if request.client else "127.0.0.1")
+            token, proven = token_of(request), self._table.is_proven(owner)
+            # Verifying a token costs as much as an answer, so an unproven address pays for it first.
+            paid = not proven and self._table.may_ask(owner)
+            operator = bool(token) and (proven or paid) and self._is_held(token)
+            if operator:
+                self._table.prove(owner)
+            elif not (paid or (proven and self._table.may_ask(owner))):
+                reason = {
+                    "detail": "this address sends too many requests without a valid token or certificate"
+                }
+                await JSONResponse(reason, 429, {"Retry-After": "1"})(scope, receive, send)
+                return
+            if not self._names.include(request.headers.getlist("host")):
+                await JSONResponse({"detail": WRONG_HOST}, 421)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+    def _is_held(self, token: str) -> bool:
+        """Return False if the tokens are unreadable: the route then reports the error."""
+        try:
+            return self._tokens.holder(token) is not None
+        except OSError:
+            return False
+
 
 _RELOAD_SECONDS = 1.0
 _CLOSE_SECONDS = 1.0

@@ -10,9 +10,8 @@ import msgspec
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.signing.bearer_secrets import hash_of, new_secret
-from rosrv_fleet.acts import recorded
-from rosrv_fleet.robots import changing
-from rosrv_fleet.stored_files import read_stored
+from rosrv_fleet.robots import changing, recorded
+from rosrv_fleet.segment_store import read_stored
 
 _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
 

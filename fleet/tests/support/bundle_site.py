@@ -12,9 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from rosrv_fleet.bundles.keys import KeyFolder, load_online_key
 from rosrv_fleet.bundles.publication import next_timestamp, read_publication
-from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository, KeyFolder, load_online_key
 
 from appliance.formats.terms import BundlePath, Ring, Terms
 from fleet.tests.support.fleet_certificates import FleetAuthority

@@ -22,7 +22,7 @@ from appliance.audit.log.signatures import read_public_key, write_public_key
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.configuration.config_sources import resolve
 from appliance.features.fleet.connection import robot_connection
-from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.segment_process import SegmentPusher
 from appliance.features.fleet.settings import Fleet
 from tests.support.audit import decision, settle
 from tests.support.certificates import Certificates, make_certificates

@@ -14,11 +14,10 @@ from pathlib import Path
 import psycopg
 import pytest
 from rosrv_fleet import indexer
-from rosrv_fleet.collector import make_collector
+from rosrv_fleet.collector import drop_partitions, make_collector
 from rosrv_fleet.config import load_config
 from rosrv_fleet.database import IndexDatabase, migrate
 from rosrv_fleet.indexer import index, make_partition
-from rosrv_fleet.retention import drop_partitions
 
 from fleet.tests.support.fleet_site import FleetRobot, FleetSite, running
 from fleet.tests.support.postgres import PostgresCluster, postgres

@@ -4,11 +4,10 @@ from datetime import date
 from pathlib import Path
 
 import pytest
-from rosrv_fleet import retention
-from rosrv_fleet.collector import Collector
+from rosrv_fleet import collector
+from rosrv_fleet.collector import Collector, Pruner
 from rosrv_fleet.config import RetentionConfig
 from rosrv_fleet.database import IndexDatabase
-from rosrv_fleet.retention import Pruner
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
 from appliance.base.clock import using, utc_now, wall
@@ -34,7 +33,7 @@ def test_damaged_logs_do_not_stop_the_retention(
         dropped.append(oldest)
         return []
 
-    monkeypatch.setattr(retention, "drop_partitions", drop)
+    monkeypatch.setattr(collector, "drop_partitions", drop)
     store, robots = SegmentStore(tmp_path, 0), enrolled_robots(tmp_path, "arm1")
     files = [store.path(SegmentPlace("arm1", log, number, "a" * 64)) for log in _DAMAGED for number in (1, 2)]
     for file in files:
@@ -77,7 +76,7 @@ def oldest_days(monkeypatch: pytest.MonkeyPatch) -> list[date]:
         days.append(oldest)
         return []
 
-    monkeypatch.setattr(retention, "drop_partitions", drop)
+    monkeypatch.setattr(collector, "drop_partitions", drop)
     return days
 
 

@@ -9,8 +9,8 @@ from rosrv_fleet import connections
 from rosrv_fleet.access import IS_ROBOT
 from rosrv_fleet.config import Limits
 from rosrv_fleet.connections import ClientConnections, CountedSocket
-from rosrv_fleet.door import Door
 from rosrv_fleet.host_names import CollectorNames
+from rosrv_fleet.server import Door
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 
 from tests.support.virtual_clock import let_time_pass

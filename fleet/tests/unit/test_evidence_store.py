@@ -3,7 +3,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from rosrv_fleet.evidence.store import EvidenceStore, StoredEvidence
-from rosrv_fleet.stored_files import DamagedFileError
+from rosrv_fleet.segment_store import DamagedFileError
 
 
 def test_a_damaged_description_hides_no_other_bundle(tmp_path: Path) -> None:

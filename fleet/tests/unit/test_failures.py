@@ -9,14 +9,14 @@ from typing import NoReturn
 import psycopg
 import pytest
 import structlog
-from rosrv_fleet import cli, indexer, retention
+from rosrv_fleet import cli, collector, indexer
+from rosrv_fleet.collector import Pruner
 from rosrv_fleet.config import FleetConfig, RetentionConfig
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.indexer import LANES, Indexer
 from rosrv_fleet.output import configure_log
-from rosrv_fleet.retention import Pruner
 from rosrv_fleet.rollouts import service
 from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.rollouts.store import RolloutStore
@@ -82,8 +82,8 @@ def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     work = Pruner(
         SegmentStore(tmp_path, 0), enrolled_robots(tmp_path, "arm1"), database, RetentionConfig(index_days=1)
     )
-    monkeypatch.setattr(retention, "_AGAIN_SECONDS", 0.0)
-    monkeypatch.setattr(retention, "drop_partitions", _defect(work.stop))
+    monkeypatch.setattr(collector, "_AGAIN_SECONDS", 0.0)
+    monkeypatch.setattr(collector, "drop_partitions", _defect(work.stop))
     work.run()
     assert work.trouble == f"retention: {_DEFECT}"
 

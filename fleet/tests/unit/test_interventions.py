@@ -2,7 +2,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from rosrv_fleet.interventions import CollectedLog, report_of
+from rosrv_fleet.index_commands import CollectedLog, report_of
 from rosrv_fleet.search_sql import logs_statement, records_statement
 
 from appliance.audit.log.columns import to_columns

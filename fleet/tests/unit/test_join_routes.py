@@ -1,6 +1,6 @@
 import pytest
 from fastapi import HTTPException
-from rosrv_fleet.join_routes import WrongTokens
+from rosrv_fleet.app import WrongTokens
 
 from tests.support.virtual_clock import let_time_pass
 

@@ -6,8 +6,8 @@ from rosrv_fleet.config import BundlesConfig
 from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.health import RobotState, health_of
 from rosrv_fleet.robots import Robots
-from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import RobotSeen
+from rosrv_fleet.rollouts.service import ConditionKind
 
 from appliance.base.clock import wall
 from fleet.tests.support.collectors import collector_in

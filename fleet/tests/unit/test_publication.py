@@ -1,9 +1,8 @@
 import datetime
 from pathlib import Path
 
-from rosrv_fleet.bundles.keys import load_online_key
 from rosrv_fleet.bundles.publication import next_timestamp, read_publication
-from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, load_online_key
 from tuf.api.metadata import Metadata, Timestamp
 
 from fleet.tests.support.bundle_site import BundleSite

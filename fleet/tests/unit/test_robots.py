@@ -15,12 +15,11 @@ import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet import robots as robots_module
-from rosrv_fleet.cli import app, token_app
+from rosrv_fleet.cli import app, robot_app, token_app
 from rosrv_fleet.enrolment import EnrolmentError, RobotGroup, require_own_signature
 from rosrv_fleet.health import health_of
 from rosrv_fleet.indexer import Indexer
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
-from rosrv_fleet.robot_commands import robot_app
 from rosrv_fleet.robots import Robots
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner

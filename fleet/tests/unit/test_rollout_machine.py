@@ -4,7 +4,6 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosrv_fleet.rollouts.conditions import conditions
 from rosrv_fleet.rollouts.machine import (
     BundleRollout,
     HealthGates,
@@ -19,6 +18,7 @@ from rosrv_fleet.rollouts.machine import (
     selected,
     stopped,
 )
+from rosrv_fleet.rollouts.service import conditions
 
 from appliance.formats.terms import Ring, Terms
 

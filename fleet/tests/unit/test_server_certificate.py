@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 from rosrv_fleet.config import FleetConfig
-from rosrv_fleet.server_certificate import ServerCertificateError, authority_of, make_certificate, url_of
+from rosrv_fleet.server import ServerCertificateError, authority_of, make_certificate, url_of
 
 from appliance.signing.own_certificate import make_own_certificate
 from tests.support.certificates import make_certificates

@@ -8,8 +8,7 @@ import pytest
 
 from lab.proofs.spin import INSERTION
 from rosmop.certify import formula_reader
-from rosmop.certify.check import AutomatonTables, Verdicts, certify
-from rosmop.certify.machines import StateMachineFollower
+from rosmop.certify.check import AutomatonTables, StateMachineFollower, Verdicts, certify
 from rosmop.tests.certify.test_certify import broken, properties, tables_of
 from tests.support.requirements import need_program
 

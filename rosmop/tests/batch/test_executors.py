@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rosmop.batch.executor import ATTEMPTS, ThisProcess, WorkerDeath, execute
-from rosmop.batch.process_pool import ProcessPool
+from rosmop.batch.runner import ProcessPool
 from rosmop.tests.batch.works import double, fragile
 
 JOBS = [(number, bytes([number]) * (number * 40_000)) for number in range(12)]

@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from rosmop.runtime import elementary
+from rosmop.runtime import numbers
 from rosmop.runtime.action_context import BUDGET
 from rosmop.tests.acting import load, message
 from rosmop.tests.examples import examples
@@ -164,7 +164,7 @@ def error(value: float, other: float) -> float:
 
 @pytest.mark.parametrize("name", ["sin", "cos", "atan2", "hypot"])
 def test_elementary_functions_are_exact_to_the_last_place(name: str) -> None:
-    ours, theirs = getattr(elementary, name), getattr(math, name)
+    ours, theirs = getattr(numbers, name), getattr(math, name)
     two = name in {"atan2", "hypot"}
     for x in SPECIAL:
         for y in SPECIAL if two else (0.0,):

@@ -3,7 +3,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rosmop.check.margins import MOST_NOTED
+from rosmop.check.expressions import MOST_NOTED
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Margin

@@ -2,7 +2,7 @@ import random
 
 import pytest
 
-from rosmop.learn.extremes import FEWEST_WINDOWS, upper
+from rosmop.learn.candidates import FEWEST_WINDOWS, upper
 
 
 def test_a_bound_holds_on_ten_times_as_many_windows() -> None:

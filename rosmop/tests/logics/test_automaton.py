@@ -3,7 +3,7 @@ from random import Random
 import pytest
 
 from rosmop.logics.automaton import Automaton, TooManyStatesError, explore, letter_classes, minimise
-from rosmop.logics.buchi import strong_components
+from rosmop.logics.ltl import strong_components
 from rosmop.tests.logics.driving import seeded
 
 

@@ -3,8 +3,8 @@ from itertools import accumulate, product
 
 import pytest
 
-from rosmop.logics.dot import to_dot
 from rosmop.logics.past_monitors import ClockedPastProperty
+from rosmop.logics.picture import to_dot
 from rosmop.logics.property_lint import TIME, PropertyFact, analyse, shortest_trace_to
 from rosmop.tests.logics.driving import compiled, play, seeded, told, traces
 from rosmop.tests.logics.temporal import draw

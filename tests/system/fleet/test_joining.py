@@ -19,7 +19,7 @@ from rosrv_fleet.invitations import Invitations
 
 from appliance.configuration.config_sources import resolve
 from appliance.features.fleet.connection import robot_connection
-from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.segment_process import SegmentPusher
 from appliance.features.fleet.settings import Fleet
 from appliance.formats.fleet_membership import JOIN_PATH
 from appliance.signing.own_certificate import make_own_certificate

@@ -18,7 +18,7 @@ from rosrv_fleet.rollouts.service import RolloutRefusedError
 
 from appliance.features.fleet.bundle_link import BundleHealth, BundleOffered, BundleStated, RefusedBundle
 from appliance.features.fleet.connection import robot_context
-from appliance.features.fleet.poller import Poller
+from appliance.features.fleet.process import Poller
 from appliance.formats.terms import BundlePath, Ring
 from fleet.tests.support.bundle_site import GROUP, SITE, bundle_files, everywhere
 from fleet.tests.support.postgres import PostgresCluster

@@ -8,8 +8,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
 from appliance.base import clock
-from appliance.ipsec.removals import RemovalJudge, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError
+from appliance.ipsec.signer import RemovalJudge, RemovalRefusedError, RetentionLimits
 from tests.support.engines import ByHand
 from tests.support.virtual_clock import VirtualClock
 

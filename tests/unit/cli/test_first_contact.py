@@ -2,9 +2,8 @@ import itertools
 
 import pytest
 
-from appliance.cli.first_contact import DENY, DRIVER, NODES, first_contact, next_commands
-from appliance.cli.help_panels import PANELS, in_order, panel_of
-from appliance.cli.main import all_verbs
+from appliance.cli.lazy import PANELS, in_order, panel_of
+from appliance.cli.main import DENY, DRIVER, NODES, all_verbs, first_contact, next_commands
 from appliance.cli.verb_table import Group
 from tests.support.rows import require_rows
 
@@ -63,6 +62,6 @@ def test_every_proposed_command_exists() -> None:
 def test_every_verb_has_its_panel_in_the_help() -> None:
     verbs = all_verbs()
     named = {name for names in PANELS.values() for name in names}
-    require_rows(verbs, named & verbs.keys(), "a panel of appliance/cli/help_panels.py")
+    require_rows(verbs, named & verbs.keys(), "a panel of appliance/cli/lazy.py")
     assert in_order(["purge", "up", "newest"]) == ["up", "purge", "newest"]
     assert panel_of("newest") == "Further commands"

@@ -6,7 +6,7 @@ import pytest
 pytestmark = pytest.mark.nightly
 
 PROGRAM = """
-from rosmop.tool.progress_bar import progress
+from rosmop.tool.batch_session import progress
 with progress("working", lambda: 10, shares_screen={shares}) as told:
     for done in range(11):
         told(done)

@@ -9,7 +9,7 @@ pytestmark = pytest.mark.nightly
 # are returned; otherwise the time limit of the test ends it.
 _FREED = """
 import asyncio
-from appliance.control.spare_memory import MUCH, resident, return_spare_memory
+from appliance.control.process import MUCH, resident, return_spare_memory
 
 async def main():
     before = resident()

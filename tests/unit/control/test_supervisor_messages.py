@@ -1,7 +1,7 @@
 """The records that control makes of the supervisor's reports."""
 
 from appliance.channel.messages import ProcessDied
-from appliance.control.supervisor_messages import record_death
+from appliance.control.process import record_death
 from tests.support.core import FakeTrail
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from distribution.sbom import ImageFiles
+from distribution.image import ImageFiles
 
 _TEXT = "usr/share/doc/{}/copyright"
 

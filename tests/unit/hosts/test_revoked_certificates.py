@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.base import clock
 from appliance.base.clock import using
-from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.hosts.appliances import RevokedCertificates
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase

@@ -5,9 +5,8 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ed25519
 
-from appliance.ipsec.authority_key import read_passphrase
+from appliance.ipsec.authority_key import SignerKeyError, read_passphrase
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE, CertificateAuthority
-from appliance.ipsec.key_files import SignerKeyError
 from appliance.ipsec.requests import make_key, signing_request
 
 

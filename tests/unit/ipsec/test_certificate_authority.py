@@ -11,15 +11,15 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
 from appliance.base.clock import using, utc_now, wall
+from appliance.ipsec.authority_key import SignerKeyError
 from appliance.ipsec.certificate_authority import (
     CERTIFICATE_FILE,
     KEY_FILE,
     LIST_FILE,
     LONGEST_REQUEST,
     CertificateAuthority,
+    RequestRefusedError,
 )
-from appliance.ipsec.key_files import SignerKeyError
-from appliance.ipsec.proof_of_possession import RequestRefusedError
 from tests.support.virtual_clock import VirtualClock
 
 

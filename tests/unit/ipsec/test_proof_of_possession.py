@@ -5,8 +5,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from appliance.ipsec.certificate_authority import CertificateAuthority
-from appliance.ipsec.proof_of_possession import RequestRefusedError
+from appliance.ipsec.certificate_authority import CertificateAuthority, RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 
 

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from appliance.base.age_clock import AgeClock
-from appliance.ipsec.removals import LARGEST_RECORD, RemovalJudge, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, read_checkpoint
+from appliance.ipsec.signer import LARGEST_RECORD, RemovalJudge, RemovalRefusedError, RetentionLimits
 from tests.support.aging import DAY, HISTORIES, KEPT, ages_of
 
 LOG = "a" * 32

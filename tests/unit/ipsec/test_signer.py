@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.audit.log.signatures import read_public_key
-from appliance.audit.proof.signer_memory import read_signer_memory
+from appliance.audit.proof.checkpoints import read_signer_memory
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search

@@ -16,8 +16,7 @@ from appliance.channel.admin import A, AdminAnswer, AdminRequest, TokenAdd, Toke
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
 from appliance.channel.operations import AnyRequest
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.control.rest.rest import RestLink
-from appliance.control.rest.rest_uses import RestUses
+from appliance.control.rest.rest import RestLink, RestUses
 from appliance.signing.request_signing import proof_of, reading_key, statement
 from tests.support.core import Core
 from tests.support.heard import Heard

@@ -14,7 +14,7 @@ from appliance.quotas.table import (
     QuotaRow,
 )
 from appliance.relay.monitors.time_budget import TimeBudget
-from distribution.quotas_page import all_rows, allowed
+from distribution.generated_pages import all_rows, allowed
 
 ROOT = Path(__file__).parents[3]
 WITHOUT_NUMBER = {RVMASTER_FAREWELLS.thing, LIMITED_TOPIC.thing}

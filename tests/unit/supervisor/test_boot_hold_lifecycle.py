@@ -14,10 +14,11 @@ from appliance.network.boot_hold import BootHold, HeldPorts, hold_rules
 from appliance.network.firewall.backend import FirewallError
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace
-from appliance.supervisor import boot_hold_lifecycle, supervisor
-from appliance.supervisor.boot_hold_lifecycle import HoldAround
+from appliance.supervisor import run as supervisor_run
+from appliance.supervisor import supervisor
 from appliance.supervisor.machine_work import NoMachineWork
 from appliance.supervisor.role import Facts
+from appliance.supervisor.run import HoldAround
 from tests.support.virtual_clock import VirtualClock
 
 
@@ -83,7 +84,7 @@ def test_the_service_holds_until_it_serves_and_at_its_end(
 def test_before_a_restart_other_machines_wait_while_a_graph_is_given_back(
     monkeypatch: pytest.MonkeyPatch, again: bool, calls: list[str]
 ) -> None:
-    monkeypatch.setattr(boot_hold_lifecycle, "starts_again", lambda: again)
+    monkeypatch.setattr(supervisor_run, "starts_again", lambda: again)
     hold = RecordedHold()
     run = around(hold)
     run.put_before_restart()
@@ -94,7 +95,7 @@ def test_before_a_restart_other_machines_wait_while_a_graph_is_given_back(
 def test_a_hold_before_a_restart_that_fails_does_not_stop_the_giving_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(boot_hold_lifecycle, "starts_again", lambda: True)
+    monkeypatch.setattr(supervisor_run, "starts_again", lambda: True)
     around(RecordedHold(broken=True)).put_before_restart()
     hold = RecordedHold()
     around(hold, "off").put_before_restart()

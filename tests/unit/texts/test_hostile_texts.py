@@ -28,7 +28,7 @@ from appliance.audit.log.repetition import storable
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base.metric import gauge
 from appliance.features.approvals.hook_link import CallWaits
-from appliance.features.approvals.hook_request import body_of
+from appliance.features.approvals.hook_process import body_of
 from appliance.features.audit_tools.csv_records import csv_lines
 from appliance.features.doors.client_frames import content, is_text
 from appliance.features.doors.foxglove import Foxglove, FoxgloveLimits

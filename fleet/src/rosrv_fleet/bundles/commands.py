@@ -19,9 +19,8 @@ from appliance.formats.bundle_archive import (
     is_bundle_file,
 )
 from appliance.formats.terms import BundlePath, Ring, Terms, TermsError, terms_of
-from rosrv_fleet.bundles.keys import KeyFileError, KeyFolder
 from rosrv_fleet.bundles.publication import PublicationError, read_publication
-from rosrv_fleet.bundles.repository import KEPT, BundleRepository, RepositoryError
+from rosrv_fleet.bundles.repository import KEPT, BundleRepository, KeyFileError, KeyFolder, RepositoryError
 from rosrv_fleet.output import say
 
 bundle = typer.Typer(help="Make, sign and publish bundles on the operator's machine.", no_args_is_help=True)

@@ -8,10 +8,9 @@ from psycopg import Error as DatabaseError
 from appliance.base.counted import counted
 from rosrv_fleet.console.frame import Column, Tone, alert, badge, link, moment, row, since, table, text
 from rosrv_fleet.enrolment import RobotGroup
-from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import OperatorAct
 from rosrv_fleet.rollouts.operator_routes import group_state
-from rosrv_fleet.rollouts.service import BundleService
+from rosrv_fleet.rollouts.service import BundleService, ConditionKind
 from rosrv_fleet.rollouts.store import StoredRollout
 
 Act = Literal["stop", "revert"]

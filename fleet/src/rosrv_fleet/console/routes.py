@@ -4,10 +4,11 @@ A change requires the role operator and the cookie, which browsers send only fro
 site is rejected.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import parse_qs
 
 from fastapi import APIRouter, HTTPException, Request
@@ -15,18 +16,351 @@ from fastapi import Path as PathParameter
 from fastapi.responses import RedirectResponse, Response
 from psycopg import Error as DatabaseError
 
+from appliance.audit.search.filter_options import filter_given
+from appliance.audit.search.query import FilterError
+from appliance.base.counted import counted
+from appliance.base.timestamps import TimestampError, parse_timestamp
 from rosrv_fleet.access import COOKIE
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.console.evidence_page import FILTERS as EVIDENCE_FILTERS
-from rosrv_fleet.console.evidence_page import evidence_page
-from rosrv_fleet.console.frame import HEADERS, alert, page
-from rosrv_fleet.console.robots_page import FILTERS, robots_page
+from rosrv_fleet.console.frame import (
+    HEADERS,
+    Column,
+    Tone,
+    ago,
+    alert,
+    badge,
+    choice,
+    field,
+    link,
+    local_time,
+    moment,
+    page,
+    row,
+    table,
+    text,
+)
 from rosrv_fleet.console.rollout_pages import Act, confirm_page, group_page, groups_page
-from rosrv_fleet.console.search_page import ASKED, search_page
 from rosrv_fleet.enrolment import RobotGroup
+from rosrv_fleet.evidence.store import StoredEvidence
+from rosrv_fleet.health import FleetHealth, RobotState, health_of
 from rosrv_fleet.request_body import read_body
-from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
+from rosrv_fleet.rollouts.service import BundleService, ConditionKind, RobotCondition, RolloutRefusedError
+from rosrv_fleet.search import (
+    FleetPage,
+    IndexDownError,
+    SearchTooLongError,
+    TooManySearchesError,
+    search_fleet,
+)
+from rosrv_fleet.search_routes import MOST_WAITING
+from rosrv_fleet.search_sql import FleetFilter
 from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
+
+# The page that searches the records of all robots.
+
+WORDS = ("robot", "host", "caller", "topic", "event", "rule", "text", "who", "since", "until")
+ASKED = (*WORDS, "decision", "cursor")
+_DECISIONS = (
+    ("", "any"),
+    ("deny", "denied"),
+    ("allow", "allowed"),
+    ("would_deny", "would be denied"),
+    ("ask", "waited for approval"),
+)
+_ROWS = 100
+_SEARCH_COLUMNS = tuple(
+    map(
+        Column,
+        ("Time", "Robot", "Decision", "Event", "Host", "Caller", "Resource", "Reason", "Evidence"),
+    )
+)
+
+
+def search_page(collector: Collector, viewer: str, asked: Mapping[str, str]) -> str:
+    result = _result(collector, viewer, asked) if any(asked.values()) else ""
+    return "<h1>Search</h1>" + _search_form(asked) + result
+
+
+def _search_form(asked: Mapping[str, str]) -> str:
+    fields = "".join(field(name, asked[name]) for name in WORDS)
+    return (
+        f'<form class="filter" action="/search" role="search" aria-label="Records">{fields}'
+        + choice("decision", "decision", _DECISIONS, asked["decision"])
+        + "<button>Search</button></form>"
+    )
+
+
+def _result(collector: Collector, viewer: str, asked: Mapping[str, str]) -> str:
+    words: dict[str, Any] = {name: asked[name] or None for name in WORDS if name != "robot"}
+    if asked["decision"] in dict(_DECISIONS) and asked["decision"]:
+        words[asked["decision"]] = True
+    try:
+        wanted = FleetFilter(asked["robot"] or None, filter_given(**words))
+        with collector.searches.turn(viewer) as database:
+            waiting = collector.store.waiting(MOST_WAITING)
+            found = search_fleet(database, wanted, asked["cursor"] or None, _ROWS, waiting)
+    except (FilterError, TimestampError, SearchTooLongError, IndexDownError, TooManySearchesError) as error:
+        return alert(str(error))
+    return _shown(found, asked, collector.evidence.all())
+
+
+def _shown(found: FleetPage, asked: Mapping[str, str], bundles: Sequence[StoredEvidence]) -> str:
+    more = ""
+    if found.cursor is not None:
+        more = f'<p class="pages">{link("/search", "Older records", **{**asked, "cursor": found.cursor})}</p>'
+    missing = ""
+    if found.waiting:
+        missing = alert(f"{found.waiting:,} stored segments are not indexed yet: this search misses them.")
+    rows = (_record(record, bundles) for record in found.records)
+    return missing + table("Records", _SEARCH_COLUMNS, rows, "No record matches.") + more
+
+
+def _record(record: dict[str, Any], bundles: Sequence[StoredEvidence]) -> str:
+    decision = str(record.get("decision") or "")
+    covering = next((one.id for one in bundles if one.has(record)), None)
+    words = (record["event"], record["host"], record["caller_id"], record["resource"], record["reason"])
+    return row(
+        _SEARCH_COLUMNS,
+        (
+            text(local_time(parse_timestamp(record["time"], 0), 3)),
+            text(record["robot"]),
+            badge("bad" if decision == "deny" else "plain", decision) if decision else "",
+            *(text(word or "") for word in words),
+            "" if covering is None else link("/evidence", covering[:12], id=covering),
+        ),
+    )
+
+
+# The page of the robots, problems first, with a filter and a hundred rows a page.
+
+ROWS = 100
+FLEET_FILTERS = ("name", "group", "state", "page")
+_ROBOT_COLUMNS = (
+    Column("Robot"),
+    Column("Group"),
+    Column("Log"),
+    Column("Segment", number=True),
+    Column("Arrived", number=True),
+    Column("Heard", number=True),
+    Column("Gaps", number=True),
+    Column("Forks", number=True),
+    Column("Bundle"),
+    Column("In force"),
+    Column("Reason"),
+)
+_TONES: dict[str, Tone] = {
+    "fork": "bad",
+    "gap": "bad",
+    "silent": "bad",
+    "unhealthy": "bad",
+    "certificate ends": "warn",
+    "never seen": "warn",
+    "behind": "warn",
+    "no segment yet": "warn",
+    "off": "plain",
+    "complete": "good",
+    "in force": "good",
+}
+_RENEWAL_SECONDS = 30 * 86_400.0
+_PROBLEMS = ("fork", "gap", "unhealthy", "silent", "certificate ends", "never seen", "behind")
+"""The words for problems, the worst first."""
+_SHOWN = (*_PROBLEMS, "off", "in force")
+
+
+class RobotRow(NamedTuple):
+    """A robot with the state of its log, its group and its bundle. `condition` is None if it can have no bundles."""
+
+    state: RobotState
+    group: str
+    condition: RobotCondition | None
+    in_force: str
+
+    @property
+    def log(self) -> list[str]:
+        found = (
+            ("fork", self.state.forks),
+            ("gap", self.state.gaps),
+            ("silent", self.state.silent),
+            ("certificate ends", self.state.certificate_seconds < _RENEWAL_SECONDS),
+            ("off", self.state.off),
+        )
+        wrong = [word for word, wrong in found if wrong]
+        return wrong or ["no segment yet" if self.state.number is None else "complete"]
+
+    @property
+    def words(self) -> set[str]:
+        return {*self.log, *(() if self.condition is None else (self.condition.kind.value,))}
+
+    @property
+    def rank(self) -> tuple[int, str]:
+        worst = min(
+            (_PROBLEMS.index(word) for word in self.words if word in _PROBLEMS), default=len(_PROBLEMS)
+        )
+        return worst, self.state.name
+
+
+def robot_rows(collector: Collector, health: FleetHealth) -> list[RobotRow]:
+    enrolled = collector.robots.known()
+    bundles = {} if collector.bundles is None else _bundles(collector.bundles)
+    return sorted(
+        (
+            RobotRow(state, enrolled[state.name].group, *bundles.get(state.name, (None, "")))
+            for state in health.robots
+        ),
+        key=lambda one: one.rank,
+    )
+
+
+def _bundles(service: BundleService) -> dict[str, tuple[RobotCondition, str]]:
+    return {
+        name: (condition, robots[name].in_force)
+        for group, robots in service.robots.items()
+        for name, condition in service.conditions(group).items()
+        if name in robots
+    }
+
+
+def robots_page(collector: Collector, asked: Mapping[str, str]) -> str:
+    health = health_of(collector)
+    rows = robot_rows(collector, health)
+    shown = [one for one in rows if _wanted(one, asked)]
+    troubles = [
+        health.trouble,
+        health.disk,
+        "" if collector.bundles is None else collector.bundles.publisher.trouble,
+    ]
+    return (
+        "<h1>Robots</h1>"
+        + "".join(alert(trouble) for trouble in troubles if trouble)
+        + _summary(rows, health)
+        + _filter(rows, asked)
+        + _page_of(shown, asked)
+    )
+
+
+def _wanted(one: RobotRow, asked: Mapping[str, str]) -> bool:
+    state = asked["state"]
+    return (
+        asked["name"].lower() in one.state.name
+        and asked["group"] in ("", one.group)
+        and (not state or state in one.words or (state == "problems" and one.rank[0] < len(_PROBLEMS)))
+    )
+
+
+def _summary(rows: Sequence[RobotRow], health: FleetHealth) -> str:
+    found = Counter(word for one in rows for word in one.words)
+    problems = sum(one.rank[0] < len(_PROBLEMS) for one in rows)
+    numbers = [("", "enrolled", len(rows)), ("problems", "with problems", problems)]
+    numbers += [(word, word, found[word]) for word in _SHOWN if found[word]]
+    items = "".join(
+        f"<li>{link('/', f'{count:,} {label}', state=state)}</li>" for state, label, count in numbers
+    )
+    waiting = f"<li>{counted(health.waiting, 'segment')} not yet searchable</li>" if health.waiting else ""
+    return f'<ul class="figures" aria-label="Numbers">{items}{waiting}</ul>'
+
+
+def _filter(rows: Sequence[RobotRow], asked: Mapping[str, str]) -> str:
+    groups = sorted({one.group for one in rows if one.group})
+    words = [("", "any"), ("problems", "any problem"), *((word, word) for word in _SHOWN)]
+    return (
+        '<form class="filter" action="/" role="search" aria-label="Robots">'
+        + field("name", asked["name"])
+        + choice("group", "group", [("", "any"), *((one, one) for one in groups)], asked["group"])
+        + choice("state", "state", words, asked["state"])
+        + "<button>Show</button></form>"
+    )
+
+
+def _page_of(shown: Sequence[RobotRow], asked: Mapping[str, str]) -> str:
+    last = max(0, (len(shown) - 1) // ROWS)
+    number = min(int(asked["page"]) if asked["page"].isdecimal() and len(asked["page"]) < 9 else 0, last)
+    part = shown[number * ROWS : (number + 1) * ROWS]
+    given = {name: asked[name] for name in ("name", "group", "state")}
+    steps = [
+        link("/", label, **given, page=str(other))
+        for label, other in (("Previous", number - 1), ("Next", number + 1))
+        if 0 <= other <= last
+    ]
+    first = number * ROWS + 1
+    place = f"{first:,} to {first + len(part) - 1:,} of {len(shown):,}"
+    pages = f'<nav class="pages" aria-label="Pages of robots"><span>{place}</span>{" ".join(steps)}</nav>'
+    empty = (
+        "No robot matches." if any(given.values()) else "No robot is enrolled: rosrv-fleet robot invite NAME"
+    )
+    return table("Robots", _ROBOT_COLUMNS, map(robot_row, part), empty) + (pages if last else "")
+
+
+def robot_row(one: RobotRow) -> str:
+    state, condition = one.state, one.condition
+    site, _, group = one.group.partition("/")
+    return row(
+        _ROBOT_COLUMNS,
+        (
+            link("/search", state.name, robot=state.name),
+            link(f"/rollouts/{site}/{group}", one.group) if group else '<span class="muted">none</span>',
+            " ".join(badge(_TONES[word], word) for word in one.log),
+            "" if state.number is None else f"{state.number:,}",
+            "never" if state.age_seconds is None else ago(state.age_seconds),
+            _heard(state),
+            f"{state.gaps:,}",
+            f"{state.forks:,}",
+            "" if condition is None else badge(_TONES.get(condition.kind, "plain"), condition.kind),
+            f'<span class="nowrap">{text(one.in_force)}</span>',
+            "" if condition is None or condition.kind is ConditionKind.NO_BUNDLE else text(condition.why),
+        ),
+    )
+
+
+def _heard(state: RobotState) -> str:
+    found = {
+        name: "never" if seconds is None else ago(seconds) for name, seconds in state.heard_seconds.items()
+    }
+    return "<br>".join(f"{text(name)} {when}" if len(found) > 1 else when for name, when in found.items())
+
+
+# The page that lists evidence bundles.
+
+BUNDLE_FILTERS = ("robot", "id")
+_BUNDLE_COLUMNS = (
+    Column("Robot"),
+    Column("From"),
+    Column("Until"),
+    Column("Recording"),
+    Column("Records", number=True),
+    Column("Bytes", number=True),
+    Column("Checkpoints"),
+    Column("Added"),
+    Column("Bundle"),
+)
+
+
+def evidence_page(collector: Collector, asked: Mapping[str, str], *, may_get: bool) -> str:
+    stored = collector.evidence.all(asked["robot"])
+    rows = (_bundle(one, may_get=may_get) for one in stored if asked["id"] in ("", one.id))
+    return (
+        '<h1>Evidence</h1><form class="filter" action="/evidence" role="search" aria-label="Evidence">'
+        + field("robot", asked["robot"])
+        + "<button>Show</button></form>"
+        + table("Evidence bundles", _BUNDLE_COLUMNS, rows, "None: rosrv-fleet evidence add FILE --robot NAME")
+    )
+
+
+def _bundle(one: StoredEvidence, *, may_get: bool) -> str:
+    name = one.id[:12]
+    return row(
+        _BUNDLE_COLUMNS,
+        (
+            link("/evidence", one.robot, robot=one.robot),
+            *(text(local_time(at)) for at in (one.since, one.until)),
+            text(one.recording),
+            f"{one.records:,}",
+            f"{one.bytes:,}",
+            f"{one.collected:,} of {one.checkpoints:,} are collected",
+            f"{moment(one.added / 10**9)} by {text(one.by)}",
+            link(f"/v1/evidence/{one.id}", name) if may_get else text(name),
+        ),
+    )
+
 
 _LONGEST_FORM = 4096
 _NO_BUNDLES = "This collector has no bundles: its configuration has no section `bundles` (docs/fleet.md)."
@@ -67,7 +401,9 @@ def console_router(collector: Collector) -> APIRouter:
 
     @router.get("/")
     def robots(request: Request) -> Response:
-        return shown(request, "Robots", lambda _holder: robots_page(collector, _asked(request, FILTERS)))
+        return shown(
+            request, "Robots", lambda _holder: robots_page(collector, _asked(request, BUNDLE_FILTERS))
+        )
 
     @router.get("/search")
     def search(request: Request) -> Response:
@@ -78,7 +414,7 @@ def console_router(collector: Collector) -> APIRouter:
     @router.get("/evidence")
     def evidence(request: Request) -> Response:
         def body(holder: OperatorToken) -> str:
-            asked = _asked(request, EVIDENCE_FILTERS)
+            asked = _asked(request, BUNDLE_FILTERS)
             return evidence_page(collector, asked, may_get=holder.may(FleetRole.OPERATOR))
 
         return shown(request, "Evidence", body)

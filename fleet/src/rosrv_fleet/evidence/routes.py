@@ -16,11 +16,11 @@ from starlette.requests import ClientDisconnect
 
 from appliance.base import clock
 from rosrv_fleet.access import holder_of, name_of
-from rosrv_fleet.acts import recorded
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.enrolment import EnrolmentError, Robot
 from rosrv_fleet.evidence.check import EvidenceError, check_evidence
 from rosrv_fleet.evidence.store import BUNDLE, StoredEvidence
+from rosrv_fleet.robots import recorded
 from rosrv_fleet.segment_store import StoreFullError
 from rosrv_fleet.tokens import FleetRole
 

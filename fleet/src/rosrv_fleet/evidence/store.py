@@ -15,10 +15,8 @@ import structlog
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import write_whole
-from rosrv_fleet.acts import recorded
-from rosrv_fleet.robots import make_folder
-from rosrv_fleet.segment_store import sync
-from rosrv_fleet.stored_files import DamagedFileError, read_stored
+from rosrv_fleet.robots import make_folder, recorded
+from rosrv_fleet.segment_store import DamagedFileError, read_stored, sync
 
 BUNDLE = "bundle.zip"
 _ABOUT = "about.json"

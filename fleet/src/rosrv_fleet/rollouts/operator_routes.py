@@ -12,9 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from appliance.formats.terms import BundlePath, TermsError
 from rosrv_fleet.enrolment import RobotGroup
-from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import HealthGates
-from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
+from rosrv_fleet.rollouts.service import BundleService, ConditionKind, RolloutRefusedError
 
 Authorize = Callable[[Request], str | Awaitable[str]]
 """Returns the name of the operator, or raises `HTTPException`."""

@@ -5,24 +5,163 @@ collector or the database was down counts neither as silence nor as health of ro
 """
 
 import asyncio
+import datetime
+import enum
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import structlog
+from tuf.api.metadata import Metadata
 
 from appliance.base import clock
 from appliance.formats.bundle_api import RobotReport
-from appliance.formats.terms import BundlePath, TermsError
+from appliance.formats.terms import BundlePath, Terms, TermsError
+from rosrv_fleet.bundles.publication import (
+    PublicationError,
+    PublishedBundles,
+    next_timestamp,
+    read_publication,
+)
+from rosrv_fleet.bundles.repository import KeyFileError, load_online_key
 from rosrv_fleet.enrolment import EnrolmentError, RobotGroup
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.rollouts import machine
-from rosrv_fleet.rollouts.conditions import RobotCondition, conditions
-from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, OperatorAct, RobotSeen
-from rosrv_fleet.rollouts.publisher import BundlePublisher
+from rosrv_fleet.rollouts.machine import (
+    BundleRollout,
+    HealthGates,
+    OperatorAct,
+    RobotSeen,
+    selected,
+    unhealthy,
+)
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
+
+# Determine whether each robot of a group has the bundle that it should have. No I/O.
+
+
+class ConditionKind(enum.StrEnum):
+    """The conditions of a robot, most severe first."""
+
+    UNHEALTHY = "unhealthy"
+    SILENT = "silent"
+    NEVER_SEEN = "never seen"
+    BEHIND = "behind"
+    IN_FORCE = "in force"
+    NO_BUNDLE = "no bundle"
+    OFF = "off"
+
+
+class RobotCondition(NamedTuple):
+    """A robot's condition, with the reason if it needs one."""
+
+    kind: ConditionKind
+    why: str = ""
+
+
+def conditions(
+    rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float, off: Collection[str] = ()
+) -> dict[str, RobotCondition]:
+    """Return the condition of each robot. `rollout` is the group's last one; `off` robots are switched off.
+
+    After a revert, reports about the reverted bundle no longer count.
+    """
+    sick = {} if rollout is None or rollout.state == "reverted" else unhealthy(rollout, robots, now)
+    silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
+    found = {}
+    for robot, seen in robots.items():
+        wanted = "" if rollout is None else selected(rollout, robot, seen)
+        if not seen.seen:
+            found[robot] = RobotCondition(ConditionKind.NEVER_SEEN, "it never reported")
+        elif now - seen.seen > silent and robot in off:
+            found[robot] = RobotCondition(ConditionKind.OFF, "it was shut down cleanly")
+        elif now - seen.seen > silent:
+            found[robot] = RobotCondition(ConditionKind.SILENT, f"no report for {now - seen.seen:.0f} s")
+        elif robot in sick:
+            found[robot] = RobotCondition(ConditionKind.UNHEALTHY, sick[robot])
+        elif wanted and seen.refused == wanted:
+            found[robot] = RobotCondition(ConditionKind.UNHEALTHY, f"refused: {seen.reason[:200]}")
+        elif wanted and seen.in_force != wanted:
+            found[robot] = RobotCondition(ConditionKind.BEHIND, seen.trouble[:200] or f"{wanted} is selected")
+        else:
+            found[robot] = _settled(seen)
+    return found
+
+
+def _settled(seen: RobotSeen) -> RobotCondition:
+    if not seen.in_force:
+        return RobotCondition(ConditionKind.NO_BUNDLE)
+    return RobotCondition(
+        ConditionKind.IN_FORCE, "changed by an operator on the robot" if seen.changed else ""
+    )
+
+
+# Publish the operator's signed bundles, with a timestamp that the collector renews.
+
+_Stamp = tuple[tuple[str, int, int], ...]
+
+
+class BundlePublisher:
+    """The publication in a folder, and its newest timestamp; `trouble` is the reason why robots take nothing new.
+
+    `key` is the file of the timestamp's key.
+    """
+
+    def __init__(self, folder: Path, key: Path, store: RolloutStore, clock: Callable[[], float]) -> None:
+        self.folder = folder
+        self._key = key
+        self._store = store
+        self._clock = clock
+        self._stamp: _Stamp | None = None
+        self.publication: PublishedBundles | None = None
+        self.timestamp: bytes | None = None
+        self.trouble = "the publication is not read yet"
+
+    @property
+    def bundles(self) -> Mapping[str, Terms]:
+        return {} if self.publication is None else self.publication.bundles
+
+    @property
+    def expires(self) -> float | None:
+        """Return when the first signed metadata expire, in seconds since the epoch."""
+        return None if self.publication is None else self.publication.expires.timestamp()
+
+    async def renew(self) -> None:
+        """Read the publication if it has changed, and renew the timestamp before it expires."""
+        try:
+            stamp = await asyncio.to_thread(_stamp, self.folder)
+            if stamp != self._stamp or self.publication is None:
+                self.publication = await asyncio.to_thread(read_publication, self.folder)
+                self._stamp = stamp
+            last = await asyncio.to_thread(self._store.timestamp)
+            now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
+            made = next_timestamp(self.publication, last, load_online_key(self._key), now)
+        except (PublicationError, KeyFileError, OSError) as error:
+            if self.trouble != str(error):
+                _log.error("bundles cannot be published", reason=str(error))
+            self.trouble = str(error)
+            return
+        if made is not None:
+            await asyncio.to_thread(
+                self._store.save_timestamp, Metadata.from_bytes(made).signed.version, made
+            )
+            last = await asyncio.to_thread(self._store.timestamp)
+        self.timestamp, self.trouble = last, ""
+        if self.publication.expires <= now:
+            self.trouble = (
+                f"the signed metadata expired at {self.publication.expires:%Y-%m-%d %H:%M} UTC, so robots take nothing:"
+                " rosrv-fleet bundle sign, then bundle publish"
+            )
+
+
+def _stamp(folder: Path) -> _Stamp:
+    found = (
+        (path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in (folder / "metadata").iterdir()
+    )
+    return tuple(sorted(found))
+
 
 _log = structlog.get_logger()
 _TICK_SECONDS = 1.0

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby.lease import WitnessRequest
+from appliance.features.standby.process import WitnessChannel
 from appliance.features.standby.witness.protocol import REQUEST, seal
-from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Lab
 from tests.support.features.standby.witness_site import (
     ADDRESSES,

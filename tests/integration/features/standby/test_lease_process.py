@@ -18,9 +18,7 @@ from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.features.standby import lease_link
 from appliance.features.standby.lease import ClaimPromise, PromiseRequest
 from appliance.features.standby.membership import Membership
-from appliance.features.standby.peer_link import PeerChannel
-from appliance.features.standby.process import LeaseProcess
-from appliance.features.standby.service_watch import OBSTACLE_SECONDS
+from appliance.features.standby.process import OBSTACLE_SECONDS, LeaseProcess, PeerChannel
 from appliance.features.standby.witness.lease_file import LeaseRecord
 from appliance.features.standby.witness.lease_rules import Witness
 from appliance.features.standby.witness.protocol import EXPIRY

@@ -12,7 +12,7 @@ import pytest
 
 from appliance.features.standby import feature
 from appliance.features.standby.lease import WitnessRequest
-from appliance.features.standby.witness_link import WitnessChannel
+from appliance.features.standby.process import WitnessChannel
 from examples.landshark.lab import Lab
 from tests.support.features.standby.witness_site import (
     ADDRESSES,

@@ -13,13 +13,13 @@ from websockets.protocol import State
 from websockets.typing import Origin, Subprotocol
 from websockets.uri import parse_uri
 
-from appliance.features.doors.assembled_door import assembled_door
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.process import assembled_door
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits

@@ -12,11 +12,11 @@ from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 
-from appliance.features.doors.assembled_door import assembled_door
 from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections, ServeClient
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.process import assembled_door
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits

@@ -23,14 +23,14 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from fastapi import APIRouter, HTTPException, Request
 from fastapi.routing import APIRoute
 from prometheus_client.core import Metric
+from rosrv_fleet import collector, indexer, push_routes
 from rosrv_fleet import collector as collector_module
-from rosrv_fleet import indexer, retention, segment_check
 from rosrv_fleet.access import PEER_CERTIFICATE
+from rosrv_fleet.app import RobotMetrics
 from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import FleetConfig, Limits, RetentionConfig
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.health import health_of
-from rosrv_fleet.health_routes import RobotMetrics
 from rosrv_fleet.indexer import LANES
 from rosrv_fleet.push_routes import push_router
 from rosrv_fleet.receipt_key import make_receipt_key
@@ -41,8 +41,8 @@ from appliance.audit.log.retention import Retention
 from appliance.audit.log.signatures import read_public_key
 from appliance.base import clock
 from appliance.features.fleet.connection import CollectorConnection, CollectorError, robot_context
-from appliance.features.fleet.segment_pusher import SegmentPusher
-from appliance.ipsec.removals import RemovalRefusedError, RetentionLimits
+from appliance.features.fleet.segment_process import SegmentPusher
+from appliance.ipsec.signer import RemovalRefusedError, RetentionLimits
 from appliance.signing.own_certificate import make_own_certificate
 from fleet.tests.support.collectors import InlineWorkers
 from tests.support.alert_rules import Alert, FleetAlerts
@@ -268,9 +268,9 @@ class FleetNight:
         )  # fmt: skip
         self.collector: RunningCollector | None = None
         for module, name, double in (
-            (collector_module, "Workers", InlineWorkers), (segment_check, "processor_time", nullcontext),
+            (collector_module, "Workers", InlineWorkers), (push_routes, "processor_time", nullcontext),
             (psycopg, "connect", self._connect), (indexer, "migrate", lambda _connection: []),
-            (indexer, "_index_one", self._index), (retention, "drop_partitions", self._drop),
+            (indexer, "_index_one", self._index), (collector, "drop_partitions", self._drop),
         ):  # fmt: skip
             monkeypatch.setattr(module, name, double)
         monkeypatch.setattr(os, "fsync", lambda _descriptor: None)  # no power cut is simulated

@@ -10,7 +10,7 @@ from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.base.clock import now, using
 from appliance.channel import messages
 from appliance.control.links.signer_requests import SignerRequests
-from appliance.features.standby.takeover_record import TakeoverRecorder
+from appliance.features.standby.service_begin import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import decision

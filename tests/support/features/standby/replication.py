@@ -16,10 +16,10 @@ from appliance.features.standby.link_certificates import (
     make_link_certificate,
 )
 from appliance.features.standby.replica import Replica
+from appliance.features.standby.replication import ReplicationListener, follow_at
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_sender import ReplicationSender
-from appliance.features.standby.replication_transport import ReplicationListener, follow_at
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.engines import InlineDatabase
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.features.standby.kit import PairPlan, make_kits
+from appliance.features.standby.first_join import PairPlan, make_kits
 from appliance.features.standby.membership import PORT, Membership, path_of, save_membership
 from appliance.features.standby.replica_sync import MARK
 from appliance.features.standby.witness.lease_file import LeaseFile, LeaseRecord

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby.lease import Operation, WitnessAnswer, WitnessRequest
+from appliance.features.standby.process import WitnessChannel
 from appliance.features.standby.witness.lease_file import LeaseFile
 from appliance.features.standby.witness.one_file import witness_program
-from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Host, Lab
 from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_program

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from appliance.features.standby.kit import WITNESS_PORT
+from appliance.features.standby.first_join import WITNESS_PORT
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import PORT, load_membership, path_of
 from appliance.features.standby.replication_frames import FromActive, ReplicationLink, SnapshotEnd, Stored

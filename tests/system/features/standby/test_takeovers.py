@@ -16,8 +16,8 @@ import pytest
 
 from appliance.channel import admin
 from appliance.features.standby import requests as standby_requests
-from appliance.features.standby.lease_watch import PAUSED
 from appliance.features.standby.membership import PORT
+from appliance.features.standby.pairing import PAUSED
 from appliance.features.standby.witness.protocol import EXPIRY
 from examples.landshark.lab import Host
 from tests.support.appliance import Appliance

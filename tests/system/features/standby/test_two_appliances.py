@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 
-from appliance.features.standby.lease_watch import PAUSED
-from appliance.features.standby.sealed_authority import keep_sealed, sealed_authority
+from appliance.features.standby.first_join import keep_sealed, sealed_authority
+from appliance.features.standby.pairing import PAUSED
 from appliance.network import interfaces
 from appliance.supervisor.users import account_of
 from examples.landshark.lab import INTERFACE, Host, Lab

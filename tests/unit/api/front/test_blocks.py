@@ -15,7 +15,7 @@ from appliance.base import clock
 from appliance.channel.messages.api import LongRequest
 from appliance.configuration.settings import ApiLimits
 from appliance.control.assembly.host_blocks import HostUses
-from appliance.control.rest.rest_uses import RestUses
+from appliance.control.rest.rest import RestUses
 from appliance.policy.model import address_of
 from tests.support.asgi import sent as sent_to
 from tests.support.virtual_clock import VirtualClock

@@ -4,7 +4,7 @@ import pytest
 
 from appliance.api.front.access import TokenAuthenticator
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.shown_tickets import ShownTickets
+from appliance.api.front.websockets import ShownTickets
 from appliance.base import clock
 from tests.support.virtual_clock import VirtualClock
 

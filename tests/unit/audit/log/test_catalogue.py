@@ -1,5 +1,5 @@
 from appliance.audit.log.events import EVENTS
-from distribution.audit_events_page import ELSEWHERE, uses
+from distribution.generated_pages import ELSEWHERE, uses
 
 
 def test_severities_and_fields_come_from_the_code() -> None:

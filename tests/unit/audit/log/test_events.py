@@ -1,7 +1,7 @@
 import pytest
 
 from appliance.audit.log.events import EVENTS, SEVERITIES
-from distribution.audit_events_page import uses, written, written_by
+from distribution.generated_pages import uses, written, written_by
 
 
 def test_every_recorded_event_is_registered() -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.audit.log.lock_holders import holders
-from appliance.audit.log.log import AuditLog
+from appliance.audit.log.log import AuditLog, holders
 from appliance.audit.log.log_database import open_for_reading
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand

@@ -3,7 +3,7 @@ from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.log.schema import json_schema
 from appliance.audit.proof.chain_proofs import ChainProof
-from distribution.audit_record_page import CHAIN
+from distribution.generated_pages import CHAIN
 
 
 def test_every_field_is_documented() -> None:

@@ -20,8 +20,8 @@ from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.proof import verification
 from appliance.audit.proof.chain_findings import FindingKind
+from appliance.audit.proof.checkpoints import SignerMemory, read_signer_memory
 from appliance.audit.proof.copies import signed_checkpoints
-from appliance.audit.proof.signer_memory import SignerMemory, read_signer_memory
 from appliance.audit.proof.verification import verify
 from appliance.base.owner_access import acting_as
 from appliance.signing.log_proof import genesis, parse_checkpoint

@@ -2,7 +2,7 @@ import pytest
 
 from appliance.channel.messages import TopicTraffic
 from appliance.control.assembly.monitor_states import published_now
-from appliance.control.operators.measurements import by_resource, carried_of, from_zero
+from appliance.control.operators.queries import by_resource, carried_of, from_zero
 from appliance.master.endpoints import traffic
 from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic
 from appliance.master.graph.registry import Kind, Registry

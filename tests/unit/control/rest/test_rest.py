@@ -25,8 +25,7 @@ from appliance.channel.messages.api import (
     TokenUsed,
 )
 from appliance.channel.operations import AnyRequest
-from appliance.control.rest.rest import RestLink
-from appliance.control.rest.rest_uses import RestUses
+from appliance.control.rest.rest import RestLink, RestUses
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.core import FakeTrail

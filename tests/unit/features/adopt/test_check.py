@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from appliance.base.shipped import SHIPPED
-from appliance.features.adopt import adopt_check, dead_release
+from appliance.features.adopt import adopt_check, release_verb
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import RobotMaster
@@ -160,8 +160,8 @@ def test_a_release_without_the_appliance_looks_for_the_master_on_its_port(
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text(json.dumps({"listen": listen}))
     asked: list[int] = []
-    monkeypatch.setattr(dead_release, "master_of", lambda _host, port: asked.append(port))
-    machine = dead_release.DeadMachine(tmp_path, AdoptRecord(), dead_release.port_of_master(tmp_path))
+    monkeypatch.setattr(release_verb, "master_of", lambda _host, port: asked.append(port))
+    machine = release_verb.DeadMachine(tmp_path, AdoptRecord(), release_verb.port_of_master(tmp_path))
     asyncio.run(machine("look"))
     assert asked == [int(listen[-5:])]
 

@@ -10,7 +10,7 @@ from appliance.channel.answers.status import Status
 from appliance.control.core import Alarms
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.handled_alarms import HandledAlarms
-from appliance.features.alarms.orders import AlarmOrders
+from appliance.features.alarms.control_part import AlarmOrders
 from appliance.features.alarms.requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from tests.support.answers import example
 from tests.support.core import Core

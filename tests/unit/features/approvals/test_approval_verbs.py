@@ -4,9 +4,9 @@ import msgspec
 import pytest
 
 from appliance.cli.connection.admin_client import NotRunningError
-from appliance.features.approvals import verbs, watch
+from appliance.features.approvals import verbs
 from appliance.features.approvals.requests import Approval, Approvals, RefuseCall
-from appliance.features.approvals.watch import changes
+from appliance.features.approvals.verbs import changes
 from tests.support.memory_call import call_of
 
 REST = ("10.0.0.7", "/agent", "call", "/log", "roscpp/SetLoggerLevel", "4bf5")
@@ -76,7 +76,7 @@ def test_the_watch_goes_on_while_the_appliance_restarts(
             case approvals:
                 return approvals
 
-    monkeypatch.setattr(watch, "_EVERY_SECONDS", 0)
+    monkeypatch.setattr(verbs, "_EVERY_SECONDS", 0)
     call_of_verb = call_of(answer, names=lambda host: f"agent ({host})")
     verbs.approve.function(call_of_verb, None, watch=True)
     out, err = capsys.readouterr()

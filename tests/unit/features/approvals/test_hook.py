@@ -11,10 +11,9 @@ from pydantic import TypeAdapter, ValidationError
 from appliance.base import clock
 from appliance.channel.channel import ChannelFullError
 from appliance.features.approvals.approval_table import ApprovalEntry, HeldCall
-from appliance.features.approvals.hook import UNSENT_SECONDS, WebHook
+from appliance.features.approvals.control_part import UNSENT_SECONDS, WebHook
 from appliance.features.approvals.hook_link import CallSent, CallWaits, HookLink
-from appliance.features.approvals.hook_process import HookSender
-from appliance.features.approvals.hook_request import body_of, request_of
+from appliance.features.approvals.hook_process import HookSender, body_of, request_of
 from appliance.features.approvals.settings import ApprovalHook
 from appliance.policy.model import Category, address_of
 from tests.support.memory_channel import memory_link

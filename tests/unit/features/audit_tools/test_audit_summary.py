@@ -10,7 +10,7 @@ from appliance.api.front.access import Bearer
 from appliance.api.front.routing import Routes
 from appliance.audit.search.denial_summary import DenialSummary
 from appliance.audit.search.query import Filter
-from appliance.features.audit_tools import audit_summary
+from appliance.features.audit_tools import routes
 from tests.unit.audit.conftest import key, make_log, notary, path
 
 pytestmark = pytest.mark.nightly
@@ -23,7 +23,7 @@ _VIEWER = Bearer("v", "v", "viewer", 1e12, "shown")
 
 def route(log: Path) -> Callable[..., Awaitable[DenialSummary]]:
     router = Routes()
-    audit_summary.add_summary(router, log)
+    routes.add_summary(router, log)
     [summary] = router.routes
     assert isinstance(summary, APIRoute)
     return summary.endpoint
@@ -43,7 +43,7 @@ def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.Monke
             running -= 1
         return DenialSummary(0, [], 0, 0, None)
 
-    monkeypatch.setattr(audit_summary, "summary_of_log", slow)
+    monkeypatch.setattr(routes, "summary_of_log", slow)
 
     async def both() -> None:
         ask = route(tmp_path)

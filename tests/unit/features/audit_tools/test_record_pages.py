@@ -1,7 +1,7 @@
 import pytest
 
 from appliance.audit.search.query import Filter
-from appliance.features.audit_tools.record_pages import page_of
+from appliance.features.audit_tools.routes import page_of
 from tests.support.audit import decision, settle
 from tests.unit.api.front.test_streams import bearer
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path

@@ -5,7 +5,7 @@ import pytest
 
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
-from appliance.features.audit_tools.record_table import print_entries
+from appliance.features.audit_tools.audit_verbs import print_entries
 
 _STYLE = re.compile(r"\x1b\[[\d;]*m")
 

@@ -18,7 +18,7 @@ from appliance.features.authority.requests import (
     GroupState,
 )
 from appliance.master.endpoints.host_signs import HostSigns
-from appliance.master.endpoints.rank_states import RankStates
+from appliance.master.endpoints.relay_control import RankStates
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy

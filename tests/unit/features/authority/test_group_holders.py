@@ -1,6 +1,6 @@
 from ipaddress import IPv4Address
 
-from appliance.features.authority.group_holders import MOST_WAITING, GroupHolders
+from appliance.features.authority.orders import MOST_WAITING, GroupHolders
 from appliance.policy.authority import Claim
 from appliance.policy.model import Address
 from appliance.policy.policy_compiler import compile_policy

@@ -10,7 +10,7 @@ from appliance.base import clock
 from appliance.channel.messages import OwnHeaderStated, OwnPublished, RankFreed, RankReported
 from appliance.control.errors import SenselessError, UnavailableError
 from appliance.features.authority.ranked_groups import STRING, RankedGroups
-from appliance.master.endpoints.rank_states import RankStates
+from appliance.master.endpoints.relay_control import RankStates
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy

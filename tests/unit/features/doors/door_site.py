@@ -13,8 +13,7 @@ from appliance.control.core import Links
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.doors import door_link
 from appliance.features.doors.door_processes import ROLE, DoorProcesses
-from appliance.features.doors.door_rows import DoorRow
-from appliance.features.doors.door_table import DoorTable
+from appliance.features.doors.door_table import DoorRow, DoorTable
 from appliance.features.doors.settings import Doors
 from appliance.policy.model import address_of
 from appliance.policy.policy_compiler import compile_policy

@@ -1,5 +1,4 @@
-from appliance.features.doors.door_tickets import TICKETS, DoorTickets
-from appliance.features.doors.door_visits import VISITS, DoorVisits
+from appliance.features.doors.door_visits import TICKETS, VISITS, DoorTickets, DoorVisits
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending, Endings

@@ -1,8 +1,8 @@
 from websockets.server import ServerProtocol
 
 from appliance.base import clock
-from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.door_link import MOST_SHOWN
+from appliance.features.doors.process import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.session import DoorSession
 from tests.support.idle import idle
 from tests.support.virtual_clock import VirtualClock

@@ -3,8 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.doors.door_tickets import DoorTickets
-from appliance.features.doors.door_visits import DoorVisits
+from appliance.features.doors.door_visits import DoorTickets, DoorVisits
 from appliance.features.doors.orders import DoorOrders
 from appliance.policy.model import address_of
 from tests.unit.features.doors.door_site import DoorSite

@@ -4,9 +4,8 @@ import pytest
 
 from appliance.base import clock
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.doors.door_rows import DoorTables, TicketRow
-from appliance.features.doors.door_table import DoorTable
-from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker, new_ticket
+from appliance.features.doors.door_table import DoorTable, DoorTables, TicketRow
+from appliance.features.doors.door_visits import DoorTickets, left_by_its_maker, new_ticket
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.store.state_file import EndRow, StateStore
 from tests.support.ends import ends_of

@@ -3,10 +3,10 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
-from appliance.control.operators.sessions import Session
+from appliance.control.operators.token_orders import Session
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_visits import DoorVisits
-from appliance.features.doors.own_doors import OwnDoors
+from appliance.features.doors.orders import OwnDoors
 from appliance.features.doors.settings import Doors
 from appliance.store.state_file import StateStore
 from tests.support.ends import ends_in

@@ -7,7 +7,7 @@ import pytest
 from appliance.channel.messages import OwnHeaderStated, OwnPublished
 from appliance.control.assembly.services import CallHolder
 from appliance.control.core import RelayOrders
-from appliance.features.doors.viewer_topics import ViewerTopics
+from appliance.features.doors.orders import ViewerTopics
 from tests.support.control_parts import ControlParts
 
 

@@ -15,7 +15,7 @@ from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.operations import AnyRequest
 from appliance.features.evidence.bundle import RecordingSelection, TimeSpan, export
-from appliance.features.evidence.orders import EvidenceOrders, NotSealedError
+from appliance.features.evidence.control_part import EvidenceOrders, NotSealedError
 from appliance.features.evidence.page import Names
 from appliance.features.evidence.requests import EvidenceExported, LogSealed
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all

@@ -657,7 +657,7 @@ def test_empty_and_too_large_time_spans_are_rejected(
 
 
 def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("appliance.features.evidence.orders.SEAL_SECONDS", 0.2)
+    monkeypatch.setattr("appliance.features.evidence.control_part.SEAL_SECONDS", 0.2)
     log = open_log(path, signer=lambda _number, _text, **_: None)
     running = Control(log)
     running.work()

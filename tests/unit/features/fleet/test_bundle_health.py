@@ -3,8 +3,8 @@ import ipaddress
 import pytest
 
 from appliance.audit.log.budget import Budget
+from appliance.features.fleet.bundle_gate import LostRights
 from appliance.features.fleet.bundle_health import RobotHealth, counted_denials
-from appliance.features.fleet.lost_rights import LostRights
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass

@@ -13,8 +13,8 @@ import pytest
 from appliance.features.fleet import connection
 from appliance.features.fleet.bundle_link import BundleOffered, BundleStated
 from appliance.features.fleet.connection import CollectorConnection, CollectorError, robot_connection
-from appliance.features.fleet.poller import Poller
-from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.process import Poller
+from appliance.features.fleet.segment_process import SegmentPusher
 from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.fleet_membership import Invitation
 from fleet.tests.support.bundle_site import GROUP, ROBOT, SITE

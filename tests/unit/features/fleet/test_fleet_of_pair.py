@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from appliance.features.fleet.fleet_of_pair import compare_fleets
+from appliance.features.fleet.control_part import compare_fleets
 from appliance.features.fleet.settings import Fleet
 from appliance.store.state_file import StateStore
 from tests.support.core import FakeTrail

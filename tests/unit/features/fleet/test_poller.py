@@ -6,7 +6,7 @@ from tuf.api.metadata import TargetFile
 
 from appliance.features.fleet.bundle_link import BundleOffered, BundleStated, RefusedBundle
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
-from appliance.features.fleet.poller import Poller
+from appliance.features.fleet.process import Poller
 from appliance.features.fleet.verified_bundles import (
     BundleRejectedError,
     BundleTooEarlyError,

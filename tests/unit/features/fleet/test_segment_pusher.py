@@ -13,9 +13,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.base.atomic_files import write_whole
 from appliance.base.clock import now, using
-from appliance.features.fleet import segment_pusher
+from appliance.features.fleet import segment_process
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
-from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.segment_process import SegmentPusher
 from appliance.formats.receipts import SegmentReceipt
 from appliance.signing.log_proof import checkpoint_hash
 from tests.support.audit import decision
@@ -148,7 +148,7 @@ def test_a_kill_between_receipt_and_position(
         write_whole(*given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(segment_pusher, "write_whole", killed)
+        patch.setattr(segment_process, "write_whole", killed)
         with pytest.raises(SystemExit):
             make().step()
     receipts.write_bytes(receipts.read_bytes()[:-40])  # and the disk kept a part of the line
@@ -172,7 +172,7 @@ def test_a_full_disk_is_reported_and_passes(
 
     pusher = make()
     with monkeypatch.context() as patch:
-        patch.setattr(segment_pusher, "write_whole", full)
+        patch.setattr(segment_process, "write_whole", full)
         assert pusher.step() > 0
     assert "No space left" in pusher.progress.trouble
     assert not (tmp_path / "state" / "segment.gz").exists()

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rosrv_fleet.bundles.keys import load_online_key
-from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, load_online_key
 from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata, MetaFile, Snapshot, TargetFile, Targets, Timestamp
 

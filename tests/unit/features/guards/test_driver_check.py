@@ -13,7 +13,7 @@ from appliance.channel.messages import MonitorEvent, MonitorsReported
 from appliance.cli.main import app
 from appliance.control.errors import SenselessError
 from appliance.features.guards import driver_outcomes as sentences
-from appliance.features.guards.driver_check import NAME, DriverChecks
+from appliance.features.guards.control_part import NAME, DriverChecks
 from appliance.features.guards.driver_outcomes import status_of
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted

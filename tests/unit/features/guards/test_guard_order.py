@@ -6,8 +6,8 @@ from itertools import product
 import pytest
 
 from appliance.features.guards.guard_order import PRECEDENCES
-from appliance.features.guards.message_types import GOAL
 from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.robot_graph import GOAL
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import fields, message

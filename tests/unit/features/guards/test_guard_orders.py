@@ -21,9 +21,9 @@ from appliance.features.guards import requests as guard_requests
 from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_facts import values_of
 from appliance.features.guards.guard_orders import GuardOrders
-from appliance.features.guards.message_types import GOAL
 from appliance.features.guards.presets import PRESETS, Guard, former_guard, text_of
 from appliance.features.guards.released import released
+from appliance.features.guards.robot_graph import GOAL
 from appliance.features.guards.upgrades import upgraded
 from appliance.features.guards.view import GUARDS_VIEW, ActingGuard, GuardsState
 from appliance.specifications.specification_files import MonitorsChangedError, SpecificationsRefusedError

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from appliance.features.guards.message_types import VELOCITIES
 from appliance.features.guards.presets import DRIVER_CHECK, PRESETS, Guard, Preset, text_of
+from appliance.features.guards.robot_graph import VELOCITIES
 from rosmop.check.sources import compiled_from
 from rosmop.fast.abi import SetPart
 from rosmop.run.engine import MonitorSet

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.guards.message_types import VALUED
 from appliance.features.guards.presets import PRESETS
+from appliance.features.guards.robot_graph import VALUED
 from rosmop.types.roles import types_of_roles
 
 DOCS = Path(__file__).parents[4] / "docs"

@@ -3,7 +3,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from appliance.channel.answers.graph_answers import Graph, Node, Topic
-from appliance.features.guards.placement import GuardedDriver, Placement
+from appliance.features.guards.guard_orders import GuardedDriver, Placement
 from appliance.features.guards.view import GUARDS_VIEW, BypassedGuard, GuardsState
 from tests.support.answers import example
 from tests.unit.features.guards.test_suggestions import ROBOTS, graph_of

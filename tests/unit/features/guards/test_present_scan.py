@@ -9,8 +9,8 @@ import typer
 
 from appliance.features.guards import suggest_verb
 from appliance.features.guards.guard_answers import Suggestion, Suggestions
-from appliance.features.guards.present_scan import SCAN, WITHOUT, Scans, permitted
 from appliance.features.guards.presets import PRESETS
+from appliance.features.guards.suggest_verb import SCAN, WITHOUT, Scans, permitted
 from rosmop.tests.acting import message
 from rosmop.tool.last_messages import last_messages
 from tests.support.bags import make_bag

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from appliance.features.guards.message_types import GOAL, VELOCITIES
 from appliance.features.guards.presets import PRESETS, Guard, below_the_standard, text_of
+from appliance.features.guards.robot_graph import GOAL, VELOCITIES
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import fields, message
 from rosmop.text import tree

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 import yaml
 
-from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import PRESETS, GuardError, text_of
 from appliance.features.guards.robot_graph import MOST_COMMANDS, TopicFacts
 from appliance.features.guards.suggestions import NOT_SUGGESTED, Advice, LoadedGuard, Proposal, advice
+from appliance.features.guards.upgrades import planned
 from rosmop.check.sources import compiled_from
 from tests.support.examples import sample
 from tests.support.features.guards.running_guard import DEFINITIONS

@@ -1,4 +1,4 @@
-from appliance.features.guards.message_types import VELOCITIES
+from appliance.features.guards.robot_graph import VELOCITIES
 from appliance.relay.velocity_zero import LAYOUTS
 
 

@@ -31,7 +31,6 @@ from appliance.features.guards.guard_answers import (
     Suggestion,
     Suggestions,
 )
-from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
     Guard,
@@ -51,7 +50,7 @@ from appliance.features.guards.requests import (
     GuardTry,
     GuardUpgrade,
 )
-from appliance.features.guards.upgrades import same
+from appliance.features.guards.upgrades import planned, same
 from rosmop.types.roles import ANY_TYPE
 from tests.support.answers import example
 from tests.support.memory_call import call_of

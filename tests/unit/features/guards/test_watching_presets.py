@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from appliance.features.guards.message_types import GOAL
 from appliance.features.guards.presets import PRESETS, Guard, loaded_values, text_of
+from appliance.features.guards.robot_graph import GOAL
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.types.roles import ANY_TYPE
 from tests.unit.features.guards.guarding import NODES, Guarded, legs_of, twist

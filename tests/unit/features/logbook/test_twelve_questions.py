@@ -11,7 +11,7 @@ from appliance.audit.log.record_format import LogEntry
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Token, Tokens
-from appliance.features.logbook import live_facts
+from appliance.features.logbook import report_verb
 from appliance.formats.machine_report import (
     MachineReport,
     Period,
@@ -161,8 +161,8 @@ def found() -> Page:
         until_utc="2026-05-04T00:00:00.000000000Z",
         made_utc="2026-05-04T08:00:00.000000000Z", version="0.5.0", verify="rosrv audit verify",
         interventions=read.interventions, switched_off=read.switched_off, blocks=read.blocks, software=read.software,
-        drivers=read.drivers, interfaces=list(live_facts.interfaces(STATUS, in_force, tokens, read)),
-        rights=list(live_facts.rights(policy, in_force, tokens, read)), live_reason="", gaps=read.gaps,
+        drivers=read.drivers, interfaces=list(report_verb.interfaces(STATUS, in_force, tokens, read)),
+        rights=list(report_verb.rights(policy, in_force, tokens, read)), live_reason="", gaps=read.gaps,
     )  # fmt: skip
     return Page(page(made))
 

@@ -2,8 +2,7 @@ import msgspec
 import pytest
 
 from appliance.channel.answers.monitor_answers import Monitors, Replacement, Tried
-from appliance.features.monitor_tools.monitor_judgement import Compiler
-from appliance.features.monitor_tools.monitor_models import Replaced
+from appliance.features.monitor_tools.monitor_judgement import Compiler, Replaced
 from tests.support.answers import example
 
 A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"

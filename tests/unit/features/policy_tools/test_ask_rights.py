@@ -5,7 +5,7 @@ from ipaddress import ip_address
 
 import pytest
 
-from appliance.features.policy_tools.ask_rights import Answer, AskedPolicy, RightKind, carry_out
+from appliance.features.policy_tools.learn_verb import Answer, AskedPolicy, RightKind, carry_out
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy

@@ -9,8 +9,7 @@ from appliance.audit.log.events import EVENTS
 from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.channel.answers.policy_answers import PolicyKnown, Why
 from appliance.channel.messages.relay_link import Violation
-from appliance.features.policy_tools.denials import DENIALS, asks_policy, is_denial
-from appliance.features.policy_tools.explanations import explained, granted
+from appliance.features.policy_tools.explanations import DENIALS, asks_policy, explained, granted, is_denial
 from appliance.features.policy_tools.grant import UngrantableError
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry
@@ -19,7 +18,7 @@ from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_settings import AT_ONCE
 from appliance.telemetry.audit_trail import rule_reference
-from distribution.audit_events_page import uses
+from distribution.generated_pages import uses
 from tests.support.core import FakeTrail
 from tests.support.idle import idle
 

@@ -13,7 +13,7 @@ import pytest
 
 from appliance.audit.log.record_format import LogEntry, without_contents
 from appliance.channel.messages import MonitorEvent
-from appliance.features.policy_tools.why import lines_of
+from appliance.features.policy_tools.explanations import lines_of
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords
 from rosmop.run.outcomes import moment

@@ -4,7 +4,7 @@ import pytest
 
 from appliance.channel.answers.graph_answers import Registration
 from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.features.policy_tools.policy_uses import policy_uses
+from appliance.features.policy_tools.routes import policy_uses
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.engines import open_log

@@ -1,6 +1,6 @@
 from appliance.audit.log.events import MONITOR_ACTIONS
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
-from appliance.features.policy_tools.why import lines_of
+from appliance.features.policy_tools.explanations import lines_of
 
 
 def test_a_verdict_is_explained() -> None:

@@ -8,8 +8,8 @@ from appliance.base.clock import using, wall_ns
 from appliance.features.recorder.excluded_topics import known_sums
 from appliance.features.recorder.recorder_link import RingTerms
 from appliance.features.recorder.recorder_ring import RecorderRing
+from appliance.features.recorder.recording import RingReader
 from appliance.features.recorder.ring import SMALLEST
-from appliance.features.recorder.ring_reader import RingReader
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.relay.connections.test_relayed_topic import HEADER, Story, batch
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.recorder import ring_reader
+from appliance.features.recorder import recording
+from appliance.features.recorder.recording import RingReader, StreamFrames
 from appliance.features.recorder.ring import (
     DATA,
     SMALLEST,
@@ -21,7 +22,6 @@ from appliance.features.recorder.ring import (
     rows,
     words_of,
 )
-from appliance.features.recorder.ring_reader import RingReader, StreamFrames
 
 EVER = 0, 1 << 63
 HEADER = {
@@ -134,7 +134,7 @@ def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: 
             break
         full += 1
     mixed = [(at, early[at] if early[at].sound else row) for at, row in rows(memory)]
-    monkeypatch.setattr(ring_reader, "rows", lambda _memory: mixed)
+    monkeypatch.setattr(recording, "rows", lambda _memory: mixed)
     found = list(RingReader(memory).read(*EVER))
     assert texts(found) == [bytes([number]) * 100 for number in range(1, full + 1)]
     assert not found[0].torn

@@ -1,6 +1,6 @@
 from appliance.base import clock
+from appliance.features.sso.control_part import ONLINE, SessionTable
 from appliance.features.sso.link import SessionKeys, SignedInPerson
-from appliance.features.sso.sessions import ONLINE, SessionTable
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending, Endings

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.features.sso.errors import SignOnRefusedError
-from appliance.features.sso.id_token import Expected, verify
+from appliance.features.sso.sign_on import Expected, verify
 from tests.unit.features.sso.scripted_provider import CLIENT, ISSUER, claims, ec, part, public, rsa, token
 
 NONCE = "n" * 43

@@ -4,7 +4,7 @@ import contextlib
 import pytest
 
 from appliance.api.front.problems import ProblemError
-from appliance.features.sso.places import MOST_AT_ONCE, MOST_WAITING, SignOnPlaces, SignOnRates
+from appliance.features.sso.routes import MOST_AT_ONCE, MOST_WAITING, SignOnPlaces, SignOnRates
 from tests.support.virtual_clock import let_time_pass
 
 pytestmark = pytest.mark.anyio

@@ -8,8 +8,8 @@ import pytest
 
 from appliance.base import clock
 from appliance.features.sso.errors import SignOnRefusedError
-from appliance.features.sso.id_token import Expected, verify
 from appliance.features.sso.identity import identity_of, name_of, subject_of
+from appliance.features.sso.sign_on import Expected, verify
 from tests.unit.features.sso.scripted_provider import CLIENT, ISSUER, claims, public, rsa, sso, token
 
 NONCE = "n" * 43

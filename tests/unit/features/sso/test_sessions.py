@@ -10,10 +10,9 @@ from appliance.control.errors import TokenRefusedError, UnavailableError, Unknow
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
 from appliance.features.sso import requests
+from appliance.features.sso.control_part import SessionTable, SsoOrders
 from appliance.features.sso.link import SessionKeys, SignedInPerson, SignOnConfirmed, SignOnFailed
-from appliance.features.sso.orders import SsoOrders
 from appliance.features.sso.quotas import SESSIONS
-from appliance.features.sso.sessions import SessionTable
 from appliance.signing.request_signing import keys_of, reading_key
 from appliance.store.state_file import StateStore
 from tests.support.core import Core

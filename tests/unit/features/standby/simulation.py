@@ -25,7 +25,7 @@ from functools import cache, partial
 from types import ModuleType
 from typing import Any
 
-from appliance.features.standby import lease, witness_link
+from appliance.features.standby import lease, process
 from appliance.features.standby.witness.firewall import LeaseFirewall
 from appliance.features.standby.witness.lease_file import LeaseRecord
 from appliance.features.standby.witness.one_file import witness_program
@@ -181,7 +181,7 @@ class SimulatedAppliance(Host):
         self.lease = self.history.product.lease.ApplianceLease(
             self.name, self.other, session, self.epoch, self.now
         )
-        self.channel = witness_link.WitnessChannel(self.name, KEYS[self.name], session)
+        self.channel = process.WitnessChannel(self.name, KEYS[self.name], session)
         self.stored = -1
         self.stored_epoch = 0
         self.pending: list[tuple[int, float]] = []  # length of the log with the entry, time

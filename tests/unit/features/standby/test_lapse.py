@@ -6,7 +6,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel.messages import LeaseEnded, LeaseHeld, Message, ServicePaused
-from appliance.features.standby.lease_watch import LeaseWatch
+from appliance.features.standby.pairing import LeaseWatch
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.supervisor import Supervisor

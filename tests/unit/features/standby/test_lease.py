@@ -14,9 +14,9 @@ from appliance.features.standby.lease import (
     WitnessAnswer,
     WitnessRequest,
 )
+from appliance.features.standby.process import WitnessChannel
 from appliance.features.standby.witness.lease_file import LeaseRecord
 from appliance.features.standby.witness.protocol import EXPIRY, HIGHEST
-from appliance.features.standby.witness_link import WitnessChannel
 from tests.unit.features.standby.witness.robot import FIRST, KEYS, PEERS, Robot
 
 BOTH, ALONE = frozenset("ab"), frozenset("a")

@@ -3,7 +3,7 @@ import asyncio
 import pytest
 
 from appliance.base import clock
-from appliance.features.standby.lease_watch import LeaseWatch
+from appliance.features.standby.pairing import LeaseWatch
 from appliance.supervisor.service_gate import RoleChanges
 from tests.support.virtual_clock import VirtualClock
 

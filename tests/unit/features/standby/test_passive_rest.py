@@ -19,9 +19,9 @@ from appliance.channel.messages.api import (
     TokensStated,
 )
 from appliance.control.operators.token_orders import TOKENS
-from appliance.features.standby import passive_rest
+from appliance.features.standby import passive
 from appliance.features.standby.orders import StandbyAdministration
-from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
+from appliance.features.standby.passive import PassiveRest, ReplicatedTokens
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.host_tables import HostBlockRow
@@ -132,7 +132,7 @@ def test_keys_and_tokens_are_of_the_same_time(tmp_path: Path, monkeypatch: pytes
                 database.execute("INSERT INTO ends VALUES (?, ?, ?, ?, ?, ?)", end)
         return TokenKeys(*columns)
 
-    monkeypatch.setattr(passive_rest, "TokenKeys", keys)
+    monkeypatch.setattr(passive, "TokenKeys", keys)
     seen = []
     for _ in range(2):
         assert tokens.read()

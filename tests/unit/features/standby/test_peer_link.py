@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.features.standby import peer_link
+from appliance.features.standby import process
 from appliance.features.standby.lease import ClaimPromise, PeerMessage, PromiseRequest, TakeOver
-from appliance.features.standby.peer_link import PeerChannel
+from appliance.features.standby.process import PeerChannel
 from appliance.features.standby.witness.protocol import HIGHEST, seal
 
 KEY = b"\xcc" * 32
@@ -61,7 +61,7 @@ def test_garbage_is_not_read(datagram: bytes) -> None:
 )
 def test_an_authentic_but_malformed_message_is_not_read(body: dict[str, object]) -> None:
     _, there = ends()
-    for purpose in peer_link.PURPOSES.values():
+    for purpose in process.PURPOSES.values():
         assert there.read(seal(purpose, "a", KEY, body)) is None
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.features.standby import replication_frames, replication_sender, replication_transport
+from appliance.features.standby import replication, replication_frames, replication_sender
 from appliance.features.standby.link_certificates import (
     CERTIFICATE,
     KEY,
@@ -381,7 +381,7 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
 async def test_connections_without_a_handshake_are_limited(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(replication_transport, "_HANDSHAKE_SECONDS", 0.5)
+    monkeypatch.setattr(replication, "_HANDSHAKE_SECONDS", 0.5)
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     idle = [socket.create_connection(("127.0.0.1", active.port)) for _ in range(40)]

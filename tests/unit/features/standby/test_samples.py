@@ -1,8 +1,8 @@
 import msgspec
 
 from appliance.features.standby.answers import StandbyState
-from appliance.features.standby.samples import samples_of
 from appliance.features.standby.summary import UNCHECKED
+from appliance.features.standby.view import samples_of
 from tests.support.answers import example
 
 

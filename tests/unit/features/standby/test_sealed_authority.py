@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.standby.sealed_authority import (
+from appliance.features.standby.first_join import (
     SealedAuthority,
     keep_sealed,
     sealed_authority,

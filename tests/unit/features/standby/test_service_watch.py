@@ -1,6 +1,6 @@
 import pytest
 
-from appliance.features.standby.service_watch import (
+from appliance.features.standby.process import (
     OBSTACLE_SECONDS,
     RESTART_SECONDS,
     SILENT_SECONDS,

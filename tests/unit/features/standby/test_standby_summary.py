@@ -6,9 +6,9 @@ import pytest
 
 from appliance.channel.alarms import open_alarms
 from appliance.features.standby.answers import StandbyState
-from appliance.features.standby.samples import samples_of
-from appliance.features.standby.standby_view import standby_view
+from appliance.features.standby.live_verbs import standby_view
 from appliance.features.standby.summary import UNCHECKED, standby_troubles, takeover_obstacles
+from appliance.features.standby.view import samples_of
 from tests.support.answers import example
 from tests.unit.channel.test_alarms import changed
 

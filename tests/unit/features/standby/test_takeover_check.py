@@ -15,8 +15,8 @@ from appliance.base.actors import DISK
 from appliance.channel import messages
 from appliance.configuration.settings import Audit, Settings
 from appliance.features.standby.membership import Membership
+from appliance.features.standby.passive import TakeoverCheck
 from appliance.features.standby.summary import UNCHECKED
-from appliance.features.standby.takeover_check import TakeoverCheck
 from appliance.specifications.checking import contents_at_start
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import CheckedSpecifications, Sources

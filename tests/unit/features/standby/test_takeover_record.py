@@ -226,9 +226,7 @@ def test_an_older_checkpoint_replaces_no_newer_one(tmp_path: Path, monkeypatch: 
         newer = a.replicated()
         assert older is not None
         assert newer is not None
-        monkeypatch.setattr(
-            "appliance.features.standby.takeover_record.newest_checkpoint", lambda _path: older
-        )
+        monkeypatch.setattr("appliance.features.standby.service_begin.newest_checkpoint", lambda _path: older)
         await a.hand_over(1)
         assert a.replicated() == newer
 

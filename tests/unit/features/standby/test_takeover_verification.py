@@ -14,7 +14,7 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.signatures import pinned_key_path, write_public_key
 from appliance.audit.proof.verification import verify
 from appliance.features.standby.membership import path_of, save_membership
-from appliance.features.standby.takeover_verification import (
+from appliance.features.standby.takeover_table import (
     PairVerification,
     TakeoverFindingKind,
     VerifiedLog,
@@ -234,7 +234,7 @@ def test_the_tail_reaches_beyond_an_unsealed_takeover(tmp_path: Path) -> None:
 def test_the_findings_are_limited(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     pair.forge_b(removing(2))
     assert len(verified(pair.a, pair.b).findings) > 1
-    monkeypatch.setattr("appliance.features.standby.takeover_verification._MOST_FINDINGS", 1)
+    monkeypatch.setattr("appliance.features.standby.takeover_table._MOST_FINDINGS", 1)
     assert len(verified(pair.a, pair.b).findings) == 1
 
 

@@ -6,13 +6,11 @@ import pytest
 from cryptography import x509
 
 from appliance.base.clock import using
-from appliance.features.standby import appliance_table
-from appliance.features.standby.appliance_table import ApplianceTable
+from appliance.features.standby import paired_role
+from appliance.features.standby.paired_role import ApplianceTable, SharedAuthority
 from appliance.features.standby.replication_frames import Introduction
-from appliance.features.standby.shared_authority import SharedAuthority
-from appliance.hosts.appliances import Appliances
+from appliance.hosts.appliances import Appliances, RevokedCertificates
 from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
-from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
@@ -122,10 +120,10 @@ async def test_a_certificate_is_renewed_long_before_its_end(
     authority, first, given = (
         SharedAuthority(near(tmp_path, "a"), store.hosts), table(store), introduction(),
     )  # fmt: skip
-    monkeypatch.setattr(appliance_table, "CERTIFICATE_DAYS", 59.0)
+    monkeypatch.setattr(paired_role, "CERTIFICATE_DAYS", 59.0)
     await first.introduce(given, authority)
     before = first.certificate(given.key)
-    monkeypatch.setattr(appliance_table, "CERTIFICATE_DAYS", 90.0)
+    monkeypatch.setattr(paired_role, "CERTIFICATE_DAYS", 90.0)
     await first.introduce(given, authority)
     assert first.certificate(given.key) not in (b"", before)
     with using(VirtualClock(wall=4e9)):
@@ -140,7 +138,7 @@ async def test_a_replaced_appliance_is_revoked(
     await first.introduce(stolen, authority)
     await first.introduce(replacement, authority)
     assert first.certificate(replacement.key) == b""
-    monkeypatch.setattr(appliance_table, "_REPLACED_SECONDS", 0.0)
+    monkeypatch.setattr(paired_role, "_REPLACED_SECONDS", 0.0)
     await first.introduce(replacement, authority)
     await first.introduce(further, authority)
     assert first.certificate(stolen.key) == first.certificate(replacement.key) == b""

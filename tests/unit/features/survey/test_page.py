@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from appliance.features.survey.draft import draft
-from appliance.features.survey.page import page, report
+from appliance.features.survey.verb import page, report
 from appliance.rpc.graph_inventory import NodeConnection, SurveyedService, SurveyedTopic, problems
 from tests.unit.features.survey.surveyed import BASE, NODES, TABLET, inventory, node
 

@@ -14,7 +14,7 @@ from appliance.audit.proof.copies import SYSLOG_ELEMENT, read_copies, signed_che
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import SearchPage, search
-from appliance.features.syslog.log_forwarder import (
+from appliance.features.syslog.process import (
     Chosen,
     ForwardingPosition,
     LogForwarder,
@@ -332,7 +332,7 @@ def test_records_removed_while_reading_are_counted(
         page = search(*arguments, **named)
         return SearchPage(page.entries[5:], page.cursor)
 
-    monkeypatch.setattr("appliance.features.syslog.log_forwarder.search", removing)
+    monkeypatch.setattr("appliance.features.syslog.process.search", removing)
     one.step()
     assert kept.sequences()[-1] > before
     assert one.progress.missed == 5
@@ -359,7 +359,7 @@ def test_a_full_disk_delays_no_record(make_log: MakeLog, kept: Kept, monkeypatch
     log = make_log()
     record(log, 600)
     one = forwarder(log.path, kept)
-    save = "appliance.features.syslog.log_forwarder.save_position"
+    save = "appliance.features.syslog.process.save_position"
 
     def no_space(*_arguments: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "position.json")

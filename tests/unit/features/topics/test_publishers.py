@@ -6,7 +6,7 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.log.repetition import HOST, KIND, new_state, summary
 from appliance.audit.search.query import Filter
-from appliance.features.topics.publishers import PastPublishers, publishers_at
+from appliance.features.topics.verbs import PastPublishers, publishers_at
 
 
 def entry(sequence: int, event: str, **fields: Any) -> LogEntry:

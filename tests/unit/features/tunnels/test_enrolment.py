@@ -27,7 +27,7 @@ from appliance.channel.messages import (
     TunnelsWanted,
 )
 from appliance.control.operators.clock_check import ClockCheck
-from appliance.features.tunnels.certification import Certification
+from appliance.features.tunnels.certification import Certification, RestAddress
 from appliance.features.tunnels.enrolment import HostEnrolment
 from appliance.features.tunnels.requests import (
     AuthorityWanted,
@@ -43,7 +43,6 @@ from appliance.features.tunnels.requests import (
     HostToken,
     RevocationsWanted,
 )
-from appliance.features.tunnels.rest_address import RestAddress
 from appliance.features.tunnels.tunnel_answers import (
     Endpoint,
     EnrolmentToken,
@@ -516,7 +515,7 @@ async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Benc
 
 
 async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appliance.hosts.revoked_certificates.ENTRIES_BYTES", 120)
+    monkeypatch.setattr("appliance.hosts.appliances.ENTRIES_BYTES", 120)
     for name in ("a", "b"):
         await bench.add(name)
     for _ in range(2):

@@ -5,7 +5,7 @@ import yaml
 
 from appliance.configuration.config_sources import read, resolve
 from appliance.configuration.settings import Settings
-from appliance.features.tunnels.rest_address import rest_address
+from appliance.features.tunnels.certification import rest_address
 from tests.unit.test_container_files import ROOT, environment
 
 NET = ["192.168.1.0/24"]

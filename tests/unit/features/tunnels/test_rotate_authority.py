@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from appliance.backup.contents import BackupError
-from appliance.features.tunnels.rotate_authority import rotate_authority
+from appliance.features.tunnels.authority_verb import rotate_authority
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.supervisor.service_gate import Pairing
 from appliance.supervisor.state_directory import StateDirectory
@@ -51,7 +51,7 @@ def test_it_needs_a_stopped_single_appliance_with_an_authority(state: Path, tmp_
 def test_one_of_two_appliances_keeps_its_authority(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pair = idle(Pairing)
     vars(pair).update(fixed_authority="end the pair first")
-    monkeypatch.setattr("appliance.features.tunnels.rotate_authority.pairing_in", lambda _state: pair)
+    monkeypatch.setattr("appliance.features.tunnels.authority_verb.pairing_in", lambda _state: pair)
     with pytest.raises(BackupError, match="end the pair first"):
         rotate_authority(state)
     assert (state / "signer" / "ca.key").exists()

@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.messages import ConnectionOpened
-from appliance.control.operators.overview import graph_of
+from appliance.control.operators.queries import graph_of
 from appliance.master.graph.registry import Kind
 from tests.support.control_parts import ControlParts
 

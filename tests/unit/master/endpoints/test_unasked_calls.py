@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from appliance.master.endpoints.unasked_calls import UnaskedCalls
+from appliance.master.endpoints.delivery import UnaskedCalls
 from appliance.master.graph.registry import Incarnation
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import Value

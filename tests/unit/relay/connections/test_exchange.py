@@ -2,7 +2,7 @@ import struct
 
 import pytest
 
-from appliance.relay.connections.exchange import ServiceExchange
+from appliance.relay.connections.service_client import ServiceExchange
 from roswire.errors import LimitExceededError, ProtocolError
 from roswire.tcpros import ServiceReply, encode_frame, encode_service_error, encode_service_reply
 

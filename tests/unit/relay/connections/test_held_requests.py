@@ -3,8 +3,8 @@ from typing import Any
 import pytest
 
 from appliance.channel.messages import HeldRequestDecided
-from appliance.relay.connections.exchange import ServiceExchange
-from appliance.relay.connections.held_requests import AWAY, HeldRequests
+from appliance.relay.connections.own_service import AWAY, HeldRequests
+from appliance.relay.connections.service_client import ServiceExchange
 from roswire.errors import ProtocolError
 from roswire.tcpros import ServiceReply, encode_frame, encode_service_error, encode_service_reply
 from tests.unit.relay.monitors.quiet import Timers

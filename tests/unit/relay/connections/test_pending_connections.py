@@ -1,6 +1,6 @@
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import RELAY_HEADERS
-from appliance.relay.connections.pending_connections import PendingConnections
+from appliance.relay.connections.incoming_connection import PendingConnections
 from appliance.relay.transport.memory import MemoryPool
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.relay.connections.send_queue import SendQueue
+from appliance.relay.connections.subscriber import SendQueue
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.transport.frames import LITTLE, Batch
 from tests.support.examples import examples

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from appliance.channel.messages import Message, MonitorRow
 from appliance.relay.loop import EventLoop
-from appliance.relay.monitors.batch_progress import BatchProgress
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.monitors.observation_points import BatchProgress, ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter

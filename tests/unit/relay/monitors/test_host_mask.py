@@ -1,6 +1,6 @@
 import pytest
 
-from appliance.relay.monitors.host_mask import HostMask
+from appliance.relay.monitors.interceptor import HostMask
 
 
 @pytest.mark.parametrize(
