@@ -112,7 +112,7 @@ HEALTHCHECK --interval=5s --timeout=5s --start-period=60s --retries=3 \
 ENTRYPOINT ["tini", "--"]
 CMD ["rosrv", "up"]
 ARG BASE
-ARG VERSION=0.4.1
+ARG VERSION=0.5.0.dev0
 ARG REVISION=""
 LABEL org.opencontainers.image.title="ROSRV appliance" \
       org.opencontainers.image.base.name="${BASE}" \
