@@ -805,7 +805,7 @@ end:
     /* = appliance/master/endpoints/relay_control.py RelayControl.attach
        = appliance/specifications/rollout.py Rollout.statement
        = appliance/master/endpoints/relay_control.py RelayControl._state_node
-       = appliance/control/supervisor_messages.py SupervisorMessages._relay_link
+       = appliance/control/process.py SupervisorMessages._relay_link
        = appliance/master/reconcile/subscribers.py Subscribers.remind_all */
     :: atomic {
         !up -> up = true; linked = true; lost = false;

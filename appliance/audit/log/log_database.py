@@ -143,6 +143,10 @@ def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connec
                 raise LogUnreadableError(
                     f"{path}: not an audit log, or one that was cut; see 'rosrv audit verify'"
                 )
+            if version == 1:
+                raise LogUnreadableError(
+                    f"{path}: written by version 0.1.0 of rosrv; start version 0.2.0 on it once"
+                )
             if version != LAYOUT_VERSION:
                 raise LogUnreadableError(
                     f"{path}: written by another version of rosrv (layout {version}): use that version"

@@ -38,7 +38,7 @@ MUTANTS = {
         WITNESS, "            self._change(before)\n            raise\n", "            self._change(before)\n", 1
     ),
     "R1: the fixed address is not translated": Mutant(WITNESS, "            translate.append(", "            str(", 0),
-    "R2: the holder answers alone at once": Mutant(LEASE, "(acknowledged or self.answers_alone)", "True", 8),
+    "R2: the holder answers alone at once": Mutant(LEASE, "self._other not in answer.in_sync", "True", 32),
     "R2: the holder answers alone until the standby is added": Mutant(
         LEASE, "                self.answers_alone = False\n", "", 29
     ),
