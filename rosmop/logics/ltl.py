@@ -20,7 +20,7 @@ from rosmop.logics.ptltl import SYNTAX as PTLTL
 
 # Translate linear temporal logic to generalised Büchi automata (Gastin, Oddoux, CAV 2001).
 #
-# A state of the automaton is an *obligation set*: nodes (``ltl_nodes``) that must all hold from here on.
+# A state of the automaton is an *obligation set*: nodes (below) that must all hold from here on.
 # Invariants:
 #
 # - A transition fulfils an until in two cases: the until is not an obligation after it, or the step could also have

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import itertools
 import json
-import pathlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -87,7 +86,7 @@ _STEP = 500
 
 
 def page_of(
-    path: pathlib.Path,
+    path: Path,
     wanted: Filter,
     cursor: str | None,
     limit: int,
@@ -381,7 +380,7 @@ async def _follow(
                     await services.stopping.wait()
 
 
-def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:
+def _exported(path: Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:
     if reads_contents(bearer):
         return _begun(evidence_line(*record, robot) for record in evidence(path, wanted))
     shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
@@ -389,7 +388,7 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) ->
     return _begun(_as_line(as_object(entry) | name) for entries in shown for entry in entries)
 
 
-def _as_csv(path: pathlib.Path, wanted: Filter, bearer: Bearer, _robot: str) -> Iterator[str]:
+def _as_csv(path: Path, wanted: Filter, bearer: Bearer, _robot: str) -> Iterator[str]:
     shown = (entry for found in export(path, wanted) for entry in readable([found], bearer, wanted.text))
     return _begun(itertools.chain([csv_head()], (line for _sequence, line in csv_lines(shown))))
 
