@@ -402,7 +402,7 @@ def console_router(collector: Collector) -> APIRouter:
     @router.get("/")
     def robots(request: Request) -> Response:
         return shown(
-            request, "Robots", lambda _holder: robots_page(collector, _asked(request, BUNDLE_FILTERS))
+            request, "Robots", lambda _holder: robots_page(collector, _asked(request, FLEET_FILTERS))
         )
 
     @router.get("/search")
