@@ -176,7 +176,7 @@ class MonitorsWanted(AdminRequest[monitor_answers.Monitors], frozen=True, tag="m
     "admin", "POST", "/v1/monitors", _LOADED, name="load_monitors", body=bodies.NewSpecifications, of=MONITORS,
     dry_run="loading specifications",
 )  # fmt: skip
-class MonitorLoad(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor load"):
+class MonitorLoad(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor load"):
     """Compile and load specifications; those in files of the same name are replaced, in one swap. For admins.
 
     A text with an error changes nothing: the answer (422) has every finding with its line and column.
@@ -194,26 +194,12 @@ class MonitorLoad(AdminRequest[monitor_answers.Replacement], frozen=True, tag="m
     given: dict[str, dict[str, bodies.GivenValue]] = {}
 
 
-@rest("operator", of=MONITORS)
-class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monitor try"):
-    """Compile specifications and report what loading them would do (see `MonitorLoad`); nothing changes."""
-
-    files: dict[str, str]
-    definitions: dict[str, str] = {}
-    signatures: dict[str, str] = {}
-    expected: str | None = None
-    force: bool = False
-    shadow: bool = False
-    hold: bool = False
-    given: dict[str, dict[str, bodies.GivenValue]] = {}
-
-
 @rest(
     "admin", "PUT", "/v1/monitors/{name}", _LOADED, name="replace_monitor", body=bodies.NewText,
     text="the specification", of=MONITORS, problems=_NO_MONITOR,
     dry_run="loading specifications",
 )  # fmt: skip
-class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor replace"):
+class MonitorReplace(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor replace"):
     """Load a new text in place of the file that defines this monitor (or of the file of this name). For admins;
     operators may only make a dry run.
     """
@@ -231,11 +217,18 @@ class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag
     hold: Hold = False
 
 
+@rest("operator", of=MONITORS)
+class MonitorTry(WaitingRequest[monitor_answers.Replaced], frozen=True, tag="monitor try"):
+    """Report what an order would do; nothing changes."""
+
+    order: MonitorLoad | MonitorReplace
+
+
 @rest(
     "operator", "POST", "/v1/monitors/reload", ("prune", *_LOADED), name="reload_monitors", of=MONITORS,
     admin_with={"prune": "removing files that the folder does not have"},
 )  # fmt: skip
-class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor reload"):
+class MonitorReload(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor reload"):
     """Load the files of the folder. Specifications that the folder lacks stay in force unless an admin sets `prune`."""
 
     expected: str | None = None
@@ -254,7 +247,7 @@ class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag=
     "admin", "DELETE", "/v1/monitors/{name}", _WITHIN, name="remove_monitor", of=MONITORS, problems=_NO_MONITOR,
 
 )  # fmt: skip
-class MonitorRemove(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor remove"):
+class MonitorRemove(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor remove"):
     """Remove the file of a monitor (or the file of this name); rejected if other files use its variables."""
 
     names: SomeMonitors
@@ -266,7 +259,7 @@ class MonitorRemove(AdminRequest[monitor_answers.Replacement], frozen=True, tag=
     "admin", "POST", "/v1/monitors/rollback", name="roll_back_monitors", body=bodies.Rollback, of=MONITORS,
 
 )  # fmt: skip
-class MonitorRollback(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor rollback"):
+class MonitorRollback(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor rollback"):
     """Bring a kept revision into force again, as a new one; monitors are enabled and disabled as they were."""
 
     revision: int | None = None  # None: the one before the present

@@ -11,7 +11,7 @@ from appliance.base.atomic_files import write_where_told
 from appliance.base.counted import counted
 from appliance.base.input_files import read_given_text
 from appliance.channel import admin
-from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replacement
+from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replaced, Replacement
 from appliance.cli.commit_confirm import say_deadline
 from appliance.cli.connection.target import Appliance
 from appliance.cli.output import moment
@@ -19,9 +19,9 @@ from rosmop.form.switch_words import with_file_switch
 from rosmop.tool.terminal import say
 
 
-def say_replaced(body: Replacement, enforce: str = "rosrv monitor enforce") -> None:
+def say_replaced(body: Replaced | Replacement, enforce: str = "rosrv monitor enforce") -> None:
     for warning in body.warnings:
-        say(warning, "yellow")
+        say(str(warning), "yellow")
     parts = [
         f"{word} {', '.join(files)}"
         for word, files in (("added", body.added), ("changed", body.changed), ("removed", body.removed))

@@ -20,6 +20,7 @@ from appliance.base import actors
 from appliance.base.atomic_files import NotLastingError, write_where_told
 from appliance.base.timestamps import local_minute
 from appliance.base.user_errors import with_remedy
+from appliance.channel.answers.monitor_answers import Replaced
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
 
@@ -75,7 +76,7 @@ def write_new(file: Path, text: str, *, verb: str) -> None:
 
 
 def say_json(fields: msgspec.Struct | Mapping[str, object] | tuple[object, ...]) -> None:
-    terminal.say_json(in_full(fields))
+    terminal.say_json(in_full(fields.in_lines() if isinstance(fields, Replaced) else fields))
 
 
 def say_diff(lines: Iterable[str]) -> None:

@@ -24,7 +24,7 @@ import msgspec
 from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
-from appliance.channel.answers.monitor_answers import Replacement, Switched
+from appliance.channel.answers.monitor_answers import Replaced, Switched, findings_of
 from appliance.specifications import in_force
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.change_records import off_in
@@ -250,7 +250,7 @@ class SpecificationManager:
 
     # --- orders ---
 
-    async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
+    async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replaced:
         """Load specifications.
 
         With `enable`, monitors are enabled even if the setting `enable` would disable them. With `confirm_within`, the
@@ -272,7 +272,8 @@ class SpecificationManager:
             check = partial(self.judge.beside_broken, self.now, self.judge.checks.order, loaded=files)
             return await self._change(Wanted(sources, shadow, enabled, topics, constants), check, order)
 
-    async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
+    async def attempt(self, asked: admin.MonitorTry, who: str) -> Replaced:
+        request = self._as_load(asked.order)
         if who in self._attempting:
             raise DryRunUnderWayError(
                 "your previous dry run is still running: wait for its answer, then try again"
@@ -297,11 +298,20 @@ class SpecificationManager:
         shadow = in_shadow(coming, request.files if request.shadow else ())
         warnings = self.judge.judged(self.now, coming, shadow, Consent(request.force, request.hold))
         files = following.difference(present)
-        return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
+        found = findings_of([*checked.warnings, *warnings])
+        return Replaced(
+            loaded=False, revision=revision, tag=tag, added=files[0], changed=files[1], removed=files[2],
+            warnings=found, monitors=[*checked.monitors],
+        )  # fmt: skip
 
-    async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
+    async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
+        return await self.load(self._as_load(request), who)
+
+    def _as_load(self, request: admin.MonitorLoad | admin.MonitorReplace) -> admin.MonitorLoad:
+        if isinstance(request, admin.MonitorLoad):
+            return request
         file = self.file_of(request.name)
-        load = admin.MonitorLoad(
+        return admin.MonitorLoad(
             {file: request.text},
             request.definitions,
             request.note,
@@ -312,9 +322,8 @@ class SpecificationManager:
             request.shadow,
             request.hold,
         )
-        return await self.load(load, who)
 
-    async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
+    async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:
         """Load the folder; files that are not in it stay in force, unless `prune` is set."""
         async with self.present.changing(request.expected):
             if self._folder.path is None:
@@ -333,7 +342,7 @@ class SpecificationManager:
             )
             return await self._change(Wanted(sources, shadow), self.judge.strictly, order)
 
-    async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
+    async def take_bundle(self, sources: Sources, who: str, note: str) -> Replaced:
         """Bring exactly these sources into force."""
         async with self.present.changing(None):
             sources = sources.with_topics(self.sources.topics)
@@ -349,7 +358,7 @@ class SpecificationManager:
         coming = replace(self.now, sources=sources, checked=await self.judge.strictly(sources))
         return self.judge.held(self.now, coming, in_shadow(coming), hold=False).conflicts
 
-    async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
+    async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
         """Remove files, or the files of monitors, if no other monitor is in them or uses their variables."""
         async with self.present.changing(request.expected):
             names, owners = request.names, self.checked.monitors
@@ -373,7 +382,7 @@ class SpecificationManager:
             check = partial(self.judge.beside_broken, self.now, self.judge.checks.order)
             return await self._change(Wanted(sources), check, ChangeOrder(who, note, within, author=keeper))
 
-    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
         """Bring a revision into force again: None is the previous revision, 0 no specifications.
 
         The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start.
@@ -559,7 +568,7 @@ class SpecificationManager:
             given = self.givens.states(self.checked, name)
             return answers.GivenSet(name, changed, given, self.revision, self.tag)
 
-    async def _change(self, wanted: Wanted, check: SourceCheck, order: ChangeOrder) -> Replacement:
+    async def _change(self, wanted: Wanted, check: SourceCheck, order: ChangeOrder) -> Replaced:
         try:
             return await self.present.change(wanted, check, order)
         finally:

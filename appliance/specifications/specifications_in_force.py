@@ -14,7 +14,6 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import msgspec
 import structlog
 
 from appliance.base import clock
@@ -22,7 +21,7 @@ from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.withdrawal import take_effect
 from appliance.channel import messages
 from appliance.channel.answers import monitor_answers as answers
-from appliance.channel.answers.monitor_answers import Replacement
+from appliance.channel.answers.monitor_answers import Replaced, findings_of
 from appliance.specifications import in_force
 from appliance.specifications.change_records import ChangeRecords
 from appliance.specifications.givens import Givens
@@ -226,7 +225,7 @@ class SpecificationsInForce(Revisions[MonitorRevisionRow]):
             self._rollout.tell(name, message)
         return moved
 
-    async def change(self, wanted: Wanted, check: SourceCheck, order: ChangeOrder) -> Replacement:
+    async def change(self, wanted: Wanted, check: SourceCheck, order: ChangeOrder) -> Replaced:
         """Make the next revision. Raises as `bring` does."""
         before, row_before, due = self.now, self.in_force, order.who == UNCONFIRMED
         try:
@@ -234,7 +233,8 @@ class SpecificationsInForce(Revisions[MonitorRevisionRow]):
             coming = in_force.loaded(before, wanted, checked, signed=bool(self._site_keys))
             cleared = in_force.cleared(coming.new)
             warnings = self._judge.judged(before, cleared.now, in_shadow(cleared.now), order.consent)
-            warnings += [dropped.text for dropped in cleared.dropped]
+            places = {name: owner.position for name, owner in checked.states.items()}
+            warnings += [f"{places[one.monitor]}: warning: {one.text}" for one in cleared.dropped]
             row = self._row(cleared.now, order)
             moved = await self.bring(
                 cleared.now, lambda: self._store_change(before, cleared.now, row, order), due=due
@@ -256,7 +256,8 @@ class SpecificationsInForce(Revisions[MonitorRevisionRow]):
         began = self._rollout.began(checked.monitors)  # also on relays that took them only now
         files = self.now.sources.difference(before.sources)
         done = self.replaced(before.number, files, moved, began, order.kept, loaded=order.loaded)
-        return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
+        done.warnings.extend(findings_of(warnings))
+        return done
 
     def replaced(
         self,
@@ -267,13 +268,14 @@ class SpecificationsInForce(Revisions[MonitorRevisionRow]):
         kept: Sequence[str] = (),
         *,
         loaded: Collection[str] = (),
-    ) -> Replacement:
-        checked, (added, changed, _removed) = self.now.checked, files
+    ) -> Replaced:
+        checked, (added, changed, removed) = self.now.checked, files
         touched = {*loaded, *added, *changed}
         states = {name: self.now.states[name] for name, file in checked.monitors.items() if file in touched}
-        return Replacement(
-            self.revision, self.tag, before, *files, [*checked.warnings], [*moved], [*began], [*kept],
-            self.confirm_by,
+        return Replaced(
+            loaded=True, revision=self.revision, tag=self.tag, replaced=before,
+            added=added, changed=changed, removed=removed, warnings=findings_of(checked.warnings),
+            monitors=[*checked.monitors], moved=[*moved], began=[*began], kept=[*kept], confirm_by=self.confirm_by,
             disabled=[name for name, state in states.items() if state is False],
             shadow=[name for name, state in states.items() if state == SHADOW],
             held={name: why for name, why in self._rollout.why_held.items() if name in states},

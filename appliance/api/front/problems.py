@@ -1,29 +1,18 @@
 """Errors as clients get them: problem details (RFC 9457)."""
 
 import http
-import re
 from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
 from starlette.responses import Response
 
-from appliance.channel.answers.field_docs import FromOne, Name, doc
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.monitor_answers import Finding, findings_of
 
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope for the reason of its answer
 _MOST_FINDINGS = 200
-_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
-
-
-class Finding(msgspec.Struct, frozen=True):
-    """One thing wrong with a text that was sent; `line` and `column` count from 1."""
-
-    file: Name
-    line: FromOne
-    column: FromOne
-    severity: Annotated[str, doc("error or warning")]
-    text: Annotated[str, doc("the error and what to do")]
 
 
 class BadInput(msgspec.Struct, frozen=True):
@@ -106,16 +95,6 @@ def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
 def defect(error: Exception) -> ProblemError:
     """Return the answer to a defect, which reveals only the type of the error."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")
-
-
-def findings_of(texts: list[str]) -> list[Finding]:
-    """Return the findings in control's texts about specifications, each with its place."""
-    return [
-        Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
-        for file, line, column, severity, text in (
-            found.groups() for found in map(_PLACE.fullmatch, texts) if found is not None
-        )
-    ]
 
 
 def refusal(error: str, findings: list[str]) -> ProblemError:

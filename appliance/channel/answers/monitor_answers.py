@@ -1,10 +1,13 @@
 """The monitors: their state and counters, and what a change of them did."""
 
+import re
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
 
 from appliance.channel.answers.field_docs import (
+    FromOne,
     Moment,
     Name,
     RevisionNote,
@@ -18,6 +21,7 @@ Tag = Annotated[
     str,
     doc("changes with every load, switch and resumption; in quotes it is the ETag, which If-Match takes"),
 ]
+_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
 RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 
 
@@ -151,16 +155,23 @@ class GivenSet(msgspec.Struct, frozen=True):
     tag: Tag
 
 
-class Tried(msgspec.Struct, frozen=True):
-    """The effect of a load on the revision in force; `warnings` are lines, `monitors` the resulting monitors."""
+class Finding(msgspec.Struct, frozen=True):
+    """One thing wrong with a text that was sent; `line` and `column` count from 1."""
 
-    revision: int
-    tag: str
-    added: list[str]
-    changed: list[str]
-    removed: list[str]
-    warnings: list[str]
-    monitors: list[str]
+    file: Name
+    line: FromOne
+    column: FromOne
+    severity: Annotated[str, doc("error or warning")]
+    text: Annotated[str, doc("the error and what to do")]
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}: {self.severity}: {self.text}"
+
+
+def findings_of(texts: Iterable[str]) -> list[Finding]:
+    """Return the findings in texts about specifications; those without a place are left out."""
+    found = (_PLACE.fullmatch(text) for text in texts)
+    return [Finding(one[1], int(one[2]), int(one[3]), one[4], one[5]) for one in found if one is not None]
 
 
 class Replacement(msgspec.Struct, frozen=True):
@@ -187,6 +198,41 @@ class Replacement(msgspec.Struct, frozen=True):
     held: Annotated[
         dict[str, str], doc("loaded monitors that hold their topics until they are resumed, and why")
     ] = {}
+
+
+class Replaced(msgspec.Struct, frozen=True, kw_only=True):
+    """The effect of a change or, if `loaded` is false, of its dry run; `replaced` is the previous revision."""
+
+    loaded: Annotated[bool, doc("false after a dry run: nothing was changed")]
+    revision: Annotated[int, doc("in force now")]
+    tag: Tag
+    replaced: Annotated[int | None, doc("previous revision")] = None
+    added: Annotated[list[str], doc("files that were not there before")]
+    changed: Annotated[list[str], doc("files whose text changed")]
+    removed: Annotated[list[str], doc("files that no longer exist")]
+    warnings: Annotated[list[Finding], doc("valid lines that may not be intended")]
+    monitors: Annotated[list[str], doc("the resulting monitors, in order")]
+    moved: Annotated[
+        list[str], doc("monitors in their initial state because they moved to another relay process")
+    ] = []
+    began: Annotated[
+        list[str],
+        doc("all monitors that are in their initial state because of this change, including new ones"),
+    ] = []
+    kept: Annotated[
+        list[str], doc("files that a reload left in force although the folder does not have them")
+    ] = []
+    confirm_by: RollbackDue = None
+    disabled: Annotated[list[str], doc("loaded monitors that do nothing until they are enabled")] = []
+    shadow: Annotated[list[str], doc("loaded monitors in shadow mode")] = []
+    held: Annotated[
+        dict[str, str], doc("loaded monitors that hold their topics until they are resumed, and why")
+    ] = {}
+
+    def in_lines(self) -> Replacement:
+        """Return the form that guards and the command line print."""
+        fields = {name: getattr(self, name) for name in Replacement.__struct_fields__}
+        return Replacement(**fields | {"warnings": [*map(str, self.warnings)]})
 
 
 class MonitorsConfirmed(msgspec.Struct, frozen=True):

@@ -45,9 +45,6 @@ def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
     body = rest.call(call.method, call.target, body=call.body, match=call.match)
     if operation.answer_field:
         body = {operation.answer_field: body}
-    match asked:
-        case admin.MonitorLoad() | admin.MonitorReload() | admin.MonitorRemove() | admin.MonitorRollback():
-            body["warnings"] = [_line(line) for line in body["warnings"]]
     try:
         return msgspec.convert(body, admin.answer_to(type(request)))
     except msgspec.ValidationError as error:
@@ -61,10 +58,6 @@ _MACHINE_ONLY = (
     " access"
 )
 _UNASKED = "this cannot be asked over REST; run it with --state"
-
-
-def _line(finding: dict[str, object]) -> str:
-    return "{file}:{line}:{column}: {severity}: {text}".format_map(finding)
 
 
 def _registrations(graph: Graph) -> Registrations:

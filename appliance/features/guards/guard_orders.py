@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
-import msgspec
-
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph
@@ -184,10 +182,6 @@ def _written(value: bool | int | float | str) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _with_warnings(loaded: Replacement, further: list[str]) -> Replacement:
-    return msgspec.structs.replace(loaded, warnings=[*loaded.warnings, *further]) if further else loaded
-
-
 class GuardOrders:
     """Answers requests about guards; `graph()` returns the present graph."""
 
@@ -325,7 +319,9 @@ class GuardOrders:
         )  # fmt: skip
         loaded = await self._monitors.load(order, who, enable=not request.shadow)
         self._record_loaded()
-        return _with_warnings(loaded, self.placement.sentences(request.topics["command"]))
+        done = loaded.in_lines()
+        done.warnings.extend(self.placement.sentences(request.topics["command"]))
+        return done
 
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         monitors, name = self._monitors, request.name
@@ -351,7 +347,7 @@ class GuardOrders:
         )  # fmt: skip
         loaded = await monitors.load(order, who)
         self._record_loaded()
-        return loaded
+        return loaded.in_lines()
 
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
         monitors, name = self._monitors, request.name or request.preset
@@ -393,8 +389,8 @@ class GuardOrders:
         warnings: list[str] = []
         try:
             if file:
-                load = admin.MonitorTry({file: text}, shadow=shadow, hold=request.hold)
-                warnings += (await self._monitors.attempt(load, who)).warnings
+                load = admin.MonitorLoad({file: text}, shadow=shadow, hold=request.hold)
+                warnings += map(str, (await self._monitors.attempt(admin.MonitorTry(load), who)).warnings)
             if request.enforce:
                 order = admin.MonitorShadow([request.name], False)
                 warnings += self._monitors.judge_shadow(order)

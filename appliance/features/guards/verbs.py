@@ -9,7 +9,7 @@ import typer
 
 from appliance.base.counted import counted
 from appliance.channel import admin
-from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replacement
+from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replaced, Replacement
 from appliance.channel.messages import GivenValue
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
@@ -466,7 +466,7 @@ def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
     return {name: value for name, value in values_of(row.given).items() if name in names}
 
 
-def _say_changed(appliance: Appliance, body: Replacement) -> None:
+def _say_changed(appliance: Appliance, body: Replaced | Replacement) -> None:
     if appliance.as_json:
         say_json(body)
     else:

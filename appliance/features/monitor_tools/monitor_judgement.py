@@ -4,9 +4,8 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from appliance.api.front.problems import Finding, findings_of
-from appliance.channel.answers.field_docs import FromOne, Name, RevisionNumber, RollbackDue, Sentence, doc
-from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Tag
+from appliance.channel.answers.field_docs import FromOne, Name, RevisionNumber, Sentence, doc
+from appliance.channel.answers.monitor_answers import Finding, Monitors, MonitorState, Tag
 from rosmop.check.sources import compiled_from
 from rosmop.logics.picture import dot_of, svg_of
 from rosmop.run.engine import MonitorSet
@@ -79,36 +78,6 @@ class History(msgspec.Struct, frozen=True):
     cursor: Annotated[str | None, doc("cursor of the next page, or null on the last page")]
 
 
-class Replaced(msgspec.Struct, frozen=True, kw_only=True):
-    """The effect of a change or, if `loaded` is false, of its dry run; `replaced` is the previous revision."""
-
-    loaded: Annotated[bool, doc("false after a dry run: nothing was changed")]
-    revision: Annotated[int, doc("in force now")]
-    tag: Tag
-    replaced: Annotated[int | None, doc("previous revision")] = None
-    added: Annotated[list[str], doc("files that were not there before")]
-    changed: Annotated[list[str], doc("files whose text changed")]
-    removed: Annotated[list[str], doc("files that no longer exist")]
-    warnings: Annotated[list[Finding], doc("valid lines that may not be intended")]
-    monitors: Annotated[list[str], doc("the resulting monitors, in order")]
-    moved: Annotated[
-        list[str], doc("monitors in their initial state because they moved to another relay process")
-    ] = []
-    began: Annotated[
-        list[str],
-        doc("all monitors that are in their initial state because of this change, including new ones"),
-    ] = []
-    kept: Annotated[
-        list[str], doc("files that a reload left in force although the folder does not have them")
-    ] = []
-    confirm_by: RollbackDue = None
-    disabled: Annotated[list[str], doc("loaded monitors that do nothing until they are enabled")] = []
-    shadow: Annotated[list[str], doc("loaded monitors in shadow mode")] = []
-    held: Annotated[
-        dict[str, str], doc("loaded monitors that hold their topics until they are resumed, and why")
-    ] = {}
-
-
 class Compiler:
     """Compiles specifications, and keeps the last result for repeated queries."""
 
@@ -150,12 +119,6 @@ class Compiler:
         """Return a monitor's picture, or None if no automaton is finite. Raises `KeyError`."""
         monitor = self._set(loaded).monitor(name)
         return svg_of([code.property for code in monitor.code.properties])
-
-    def warnings(self, file: str) -> list[Finding]:
-        assert self._last is not None  # noqa: S101  callers compile by `described` first
-        return findings_of(
-            [str(warning) for warning in self._last[1].warnings if warning.position.file == file]
-        )
 
 
 def _compiled(loaded: Monitors) -> MonitorSet:

@@ -3,13 +3,13 @@
 import asyncio
 from functools import cached_property
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Path, Query, Response
 from msgspec.structs import asdict
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.problems import ProblemError, findings_of
+from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask, reads_contents
 from appliance.api.front.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.front.services import Services
@@ -19,11 +19,8 @@ from appliance.audit.log.record_format import LogEntry, rfc3339, without_content
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.channel import admin
-from appliance.channel.answers.monitor_answers import (
-    Monitors,
-    MonitorState,
-)
-from appliance.features.monitor_tools.monitor_judgement import Described, Happened, History, Monitor, Replaced
+from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replaced, findings_of
+from appliance.features.monitor_tools.monitor_judgement import Described, Happened, History, Monitor
 
 if TYPE_CHECKING:
     from appliance.features.monitor_tools.monitor_judgement import Compiler
@@ -87,7 +84,7 @@ def routes(services: Services) -> Routes:
             text=(loaded.files or {})[state.file],
             alphabet=found.events,
             properties=found.properties,
-            warnings=looking.compiler.warnings(state.file),
+            warnings=[one for one in findings_of(loaded.warnings) if one.file == state.file],
             uses=found.uses,
             hold=found.hold,
         )
@@ -157,65 +154,8 @@ def _happened(entry: LogEntry) -> Happened:
     )
 
 
-async def _load(call: OperationCall[admin.MonitorLoad]) -> Tagged[Replaced]:
-    if not call.dry_run:
-        return await _change(call)
-    new = call.order
-    return await _try(
-        call,
-        admin.MonitorTry(
-            new.files,
-            new.definitions,
-            new.signatures,
-            new.expected,
-            new.force,
-            new.shadow,
-            new.hold,
-            new.given,
-        ),
-    )
+async def _load(call: OperationCall[admin.MonitorLoad | admin.MonitorReplace]) -> Tagged[Replaced]:
+    return tagged(await call.ask(admin.MonitorTry(call.order) if call.dry_run else call.order))
 
 
-async def _replace(call: OperationCall[admin.MonitorReplace]) -> Tagged[Replaced]:
-    if not call.dry_run:
-        return await _change(call)
-    new, file = call.order, await _file_of(call)
-    signatures = {**new.signatures, file: new.signature}
-    return await _try(
-        call,
-        admin.MonitorTry(
-            {file: new.text}, new.definitions, signatures, new.expected, new.force, new.shadow, new.hold
-        ),
-    )
-
-
-async def _change(call: OperationCall[Any]) -> Tagged[Replaced]:
-    done = await call.ask(call.order)
-    monitors = (await call.ask(admin.MonitorsWanted())).monitors
-    fields = asdict(done) | {"warnings": findings_of(done.warnings)}
-    return tagged(Replaced(**fields, loaded=True, monitors=[monitor.name for monitor in monitors]))
-
-
-async def _try(call: OperationCall[Any], order: admin.MonitorTry) -> Tagged[Replaced]:
-    done = await call.ask(order)
-    return tagged(Replaced(**asdict(done) | {"warnings": findings_of(done.warnings)}, loaded=False))
-
-
-async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
-    name, loaded = call.order.name, await call.ask(admin.MonitorsWanted(texts=True))
-    files = {monitor.name: monitor.file for monitor in loaded.monitors}
-    if name in (loaded.files or {}):
-        return name
-    if name not in files:
-        raise unknown_monitor(name, loaded)
-    return files[name]
-
-
-_ANSWERS = {
-    "load_monitors": Answer(_load),
-    "replace_monitor": Answer(_replace),
-    "reload_monitors": Answer(_change),
-    "remove_monitor": Answer(_change),
-    "remove_monitors": Answer(_change),
-    "roll_back_monitors": Answer(_change),
-}
+_ANSWERS = {"load_monitors": Answer(_load), "replace_monitor": Answer(_load)}

@@ -10,9 +10,10 @@ from typing import Any
 
 import msgspec
 
-from appliance.api.front.problems import Finding, ProblemError
+from appliance.api.front.problems import ProblemError
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph_answers import Registration
+from appliance.channel.answers.monitor_answers import Finding
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.features.policy_tools.diff import diff
 from appliance.features.policy_tools.policy_models import Change, Ended, Report

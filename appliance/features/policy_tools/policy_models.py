@@ -4,7 +4,6 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.api.front.problems import Finding
 from appliance.channel.answers.field_docs import (
     Address,
     FilePath,
@@ -15,6 +14,7 @@ from appliance.channel.answers.field_docs import (
     Sentence,
     doc,
 )
+from appliance.channel.answers.monitor_answers import Finding
 from appliance.channel.rest_bodies import Text
 from appliance.policy.model import Category
 

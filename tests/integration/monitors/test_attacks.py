@@ -13,7 +13,7 @@ from appliance.channel.admin import (
     MonitorSwitch,
     StatusWanted,
 )
-from appliance.channel.answers.monitor_answers import Replacement
+from appliance.channel.answers.monitor_answers import Replaced
 from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
@@ -50,7 +50,7 @@ def relays(appliance: Appliance) -> list[int]:
     return [row.pid for row in processes if row.role == "relay"]
 
 
-def load(appliance: Appliance, **files: str) -> Replacement:
+def load(appliance: Appliance, **files: str) -> Replaced:
     return appliance.ask(MonitorLoad({f"{name}.rv": text for name, text in files.items()}, {}))
 
 

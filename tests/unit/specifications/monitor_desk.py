@@ -29,7 +29,7 @@ from msgspec.structs import asdict
 
 from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin, messages
-from appliance.channel.answers.monitor_answers import Replacement
+from appliance.channel.answers.monitor_answers import Replaced
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.checking import check, contents, contents_at_start, contents_beside
 from appliance.specifications.live_topics import LiveType, Published
@@ -152,7 +152,7 @@ class Desk:
 class WaitingManager(SpecificationManager):
     desk: Desk
 
-    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
         if who != UNCONFIRMED:
             return await super().roll_back(request, who)
         await self.desk.limit_ends.wait()
@@ -193,7 +193,7 @@ class Taking:
 
 
 _ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
-    "load": ("load", admin.MonitorLoad, {}), "try": ("attempt", admin.MonitorTry, {}),
+    "load": ("load", admin.MonitorLoad, {}), "try": ("attempt", admin.MonitorLoad, {}),
     "reload": ("reload", admin.MonitorReload, {}), "remove": ("remove", admin.MonitorRemove, {}),
     "rollback": ("roll_back", admin.MonitorRollback, {}), "confirm": ("confirm", admin.MonitorConfirm, {}),
     "enable": ("switch", admin.MonitorSwitch, {"enabled": True}),
@@ -291,10 +291,14 @@ class Dialogue:
         elif plain:
             fields["names"] = plain
         try:
-            answer = await getattr(self.monitors, method)(msgspec.convert(fields, request, strict=False), who)
+            order = msgspec.convert(fields, request, strict=False)
+            answer = await getattr(self.monitors, method)(
+                admin.MonitorTry(order) if verb == "try" else order, who
+            )
         except (SpecificationsRefusedError, UnknownMonitorError, MonitorsChangedError) as refusal:
             return _refused(refusal)
         given = {key: value for key, value in asdict(answer).items() if value and key not in _VARYING}
+        given.pop("monitors" if verb != "try" else "", None)
         limit = ["to confirm"] if getattr(answer, "confirm_by", None) else []
         return [f"answer {_words(given)}".strip(), *limit]
 
@@ -313,7 +317,7 @@ class Dialogue:
         return f"now {one.tag} by {one.in_force.who or 'nobody'}: {' '.join(shown) or 'nothing'}{said}"
 
 
-_VARYING = {"confirm_by", "tag"}
+_VARYING = {"confirm_by", "tag", "loaded"}
 _STATES = {True: "on", False: "off", "shadow": "shadow"}
 _RECORDED = ("who", "monitor", "began", "held", "count", "lost")
 

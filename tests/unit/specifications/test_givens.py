@@ -90,10 +90,11 @@ async def test_a_load_sets_topics_and_constants_or_nothing(desk: Desk) -> None:
         {"cap": {"vMax": 9}}, {"cap": {"vMax": "/x"}}, {"gap": {"vMax": 1}}, {"gap": {"command": "/x"}},
     ]  # fmt: skip
     for values_given in wrong:
+        order = admin.MonitorLoad({"cap.rv": TEXT}, given=values_given)
         with pytest.raises(SpecificationsRefusedError):
-            await monitors.load(admin.MonitorLoad({"cap.rv": TEXT}, given=values_given), "eve")
+            await monitors.load(order, "eve")
         with pytest.raises(SpecificationsRefusedError):
-            await monitors.attempt(admin.MonitorTry({"cap.rv": TEXT}, given=values_given), "eve")
+            await monitors.attempt(admin.MonitorTry(order), "eve")
     await desk.store.settled()
     again = await desk.monitors()
     assert set(again.checked.topics["cap"]) == {values(again)["command"]} == {"/base/cmd"}
@@ -117,7 +118,7 @@ async def test_topics_of_the_folders_files_survive_a_reload_and_a_start(desk: De
 async def test_a_text_that_does_not_allow_a_value_gets_its_default(desk: Desk) -> None:
     monitors = await loaded(desk, vMax=1.5, n=4)
     done = await monitors.load(admin.MonitorLoad({"cap.rv": TEXT.replace("0..2", "0..1")}), "eve")
-    assert any("vMax=1.5 no longer applies" in one for one in done.warnings)
+    assert [(one.file, one.line) for one in done.warnings if "vMax=1.5 no longer applies" in one.text]
     (record,) = (fields for event, fields in desk.trail.heard if "no longer applies" in fields["reason"])
     assert (record["resource"], record["before"], record["values"]) == ("cap", {"vMax": 1.5}, {"vMax": 0.22})
     assert stated(monitors) == {"n": 4}

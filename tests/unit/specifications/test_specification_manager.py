@@ -185,7 +185,7 @@ async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
 
     desk.try_out = slow
     monitors = await desk.monitors()
-    shadowed = admin.MonitorTry({"b.rv": B})
+    shadowed = admin.MonitorTry(admin.MonitorLoad({"b.rv": B}))
     first = asyncio.ensure_future(monitors.attempt(shadowed, "eve"))
     await begun.wait()
     with pytest.raises(DryRunUnderWayError, match="your previous dry run is still running"):
@@ -193,7 +193,8 @@ async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
     other = asyncio.ensure_future(monitors.attempt(shadowed, "adam"))
     goes_on.set()
     assert [(await one).added for one in (first, other)] == [["b.rv"]] * 2
-    assert (await monitors.attempt(shadowed, "eve")).added == ["b.rv"]
+    again = await monitors.attempt(admin.MonitorTry(admin.MonitorReplace("a", B)), "eve")
+    assert (again.loaded, again.changed, again.monitors, monitors.names()) == (False, ["a.rv"], ["b"], ["a"])
 
 
 async def test_records_of_loads_have_the_hash_of_the_files_and_of_what_was_compiled(desk: Desk) -> None:
@@ -391,10 +392,10 @@ async def test_a_load_or_removal_of_others_leaves_a_broken_file_as_the_start_lef
         return [*monitors.checked.unbuilt], sorted(monitors.checked.left_out)
 
     assert idle() == (["code"], ["bytes.rv", "text.rv"])
-    tried = await monitors.attempt(admin.MonitorTry({"b.rv": B}), "eve")
-    loaded = await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    order = admin.MonitorLoad({"b.rv": B})
+    tried, loaded = await monitors.attempt(admin.MonitorTry(order), "eve"), await monitors.load(order, "eve")
     for answer in (tried, loaded, await monitors.remove(admin.MonitorRemove(["b"]), "eve")):
-        named = [line.partition(":")[0] for line in answer.warnings if "does nothing" in line]
+        named = [one.file for one in answer.warnings if "does nothing" in one.text]
         assert sorted(named) == ["bytes.rv", "code.rv", "text.rv"]
         assert idle() == (["code"], ["bytes.rv", "text.rv"])
     assert monitors.names() == ["a", "code"]

@@ -1,4 +1,5 @@
-from appliance.api.front.problems import findings_of, refusal
+from appliance.api.front.problems import refusal
+from appliance.channel.answers.monitor_answers import findings_of
 
 
 def test_findings_without_a_position_stay_in_the_detail() -> None:

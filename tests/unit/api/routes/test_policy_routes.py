@@ -142,8 +142,7 @@ def test_a_rejected_specification_has_its_place(world: RestWorld, method: str, t
     assert [(one["file"], one["severity"]) for one in problem["findings"]] == [("speed.rv", "error")]
 
 
-def test_a_dry_run_of_one_monitor_sends_its_whole_file(world: RestWorld) -> None:
-    answer = world.asked("PUT", "/v1/monitors/count?dry_run=1", "text")
-    assert answer.json()["loaded"] is False
-    assert [one.files for one in world.sent(admin.MonitorTry)] == [{"speed.rv": "text"}]
-    assert world.asked("PUT", "/v1/monitors/nobody?dry_run=1", "text").status_code == 404
+def test_a_dry_run_sends_the_order_and_carries_out_none(world: RestWorld) -> None:
+    world.asked("PUT", "/v1/monitors/count?dry_run=1", "text")
+    assert [one.order for one in world.sent(admin.MonitorTry)] == [admin.MonitorReplace("count", "text")]
+    assert world.sent(admin.MonitorReplace) == []

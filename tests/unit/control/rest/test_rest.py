@@ -9,7 +9,7 @@ import pytest
 from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, MonitorTry, PolicyLoad, StatusWanted, decode
+from appliance.channel.admin import AdminAnswer, MonitorLoad, MonitorTry, PolicyLoad, StatusWanted, decode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import (
@@ -138,7 +138,7 @@ async def test_requests_that_wait_block_no_other_requests(world: Everything, api
     world.only_slow = True
     world.go.clear()
     for number in range(20):
-        api.channel.send(RequestMade(number, MonitorTry({f"{number}.rv": ""}), TOKEN))
+        api.channel.send(RequestMade(number, MonitorTry(MonitorLoad({f"{number}.rv": ""})), TOKEN))
     api.channel.send(RequestMade(99, StatusWanted(), TOKEN))
     heard = (await api.until(6))[1:]
     assert [answer_of(one).trouble for one in heard if one.number != 99] == ["busy"] * 4
