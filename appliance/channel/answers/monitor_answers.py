@@ -21,7 +21,7 @@ Tag = Annotated[
     str,
     doc("changes with every load, switch and resumption; in quotes it is the ETag, which If-Match takes"),
 ]
-_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
+_PLACE = re.compile(r":([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): ")
 RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 
 
@@ -170,8 +170,10 @@ class Finding(msgspec.Struct, frozen=True):
 
 def findings_of(texts: Iterable[str]) -> list[Finding]:
     """Return the findings in texts about specifications; those without a place are left out."""
-    found = (_PLACE.fullmatch(text) for text in texts)
-    return [Finding(one[1], int(one[2]), int(one[3]), one[4], one[5]) for one in found if one is not None]
+    found = ((one, _PLACE.search(one)) for one in texts)
+    return [
+        Finding(one[: at.start()], int(at[1]), int(at[2]), at[3], one[at.end() :]) for one, at in found if at
+    ]
 
 
 class Replacement(msgspec.Struct, frozen=True):
