@@ -6,7 +6,7 @@ here. Functions raise `sqlite3.DatabaseError` for a damaged log.
 
 import sqlite3
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.log_database import COLUMNS
@@ -109,11 +109,6 @@ def records_of(connection: sqlite3.Connection, *events: str, after: int = 0, upt
     return map(EventRow._make, rows)
 
 
-def first_of(connection: sqlite3.Connection, event: str, after: int, upto: int) -> int | None:
-    query = "SELECT min(sequence) FROM record WHERE event = ? AND sequence > ? AND sequence <= ?"
-    return _place(connection, query, event, after, upto)
-
-
 def last_of(
     connection: sqlite3.Connection, event: str, before: int, revision: int | None = None
 ) -> int | None:
@@ -130,20 +125,18 @@ def policies_of(connection: sqlite3.Connection, first: int, last: int) -> list[i
     return [revision for (revision,) in connection.execute(query, (first, last))]
 
 
-def decision_between(
-    connection: sqlite3.Connection, after: int, upto: int, end: Literal["first", "last"]
-) -> tuple[int, int] | None:
-    """Return the place and time of the first or last decision that was made there.
+def outer_decisions(connection: sqlite3.Connection, after: int, upto: int) -> Iterator[EventRow]:
+    """Yield the first and the last decision that was made there; one twice if it is the only one.
 
     Retention writes old denials again, with their old time and `kept`; a quote inside a string is escaped.
     """
-    order = "ASC" if end == "first" else "DESC"
-    row: tuple[int, int] | None = connection.execute(
-        "SELECT sequence, time FROM record WHERE +event = 'decision' AND sequence > ? AND sequence <= ?"  # noqa: S608  a fixed word
-        f""" AND instr(CAST(detail AS TEXT), '"kept":') = 0 ORDER BY sequence {order} LIMIT 1""",
-        (after, upto),
-    ).fetchone()
-    return row
+    for order in ("ASC", "DESC"):
+        rows = connection.execute(
+            "SELECT sequence, time, event, detail FROM record WHERE +event = 'decision' AND sequence > ?"  # noqa: S608  a fixed word
+            f""" AND sequence <= ? AND instr(CAST(detail AS TEXT), '"kept":') = 0 ORDER BY sequence {order} LIMIT 1""",
+            (after, upto),
+        )
+        yield from map(EventRow._make, rows)
 
 
 def last_checkpoint(connection: sqlite3.Connection, upto: int) -> int:

@@ -2,22 +2,25 @@
 
 import enum
 import sqlite3
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from itertools import pairwise
+from itertools import groupby, islice, pairwise
+from operator import attrgetter
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import msgspec
 
 from appliance.audit.log.log_database import reading
+from appliance.audit.log.log_queries import EventRow, outer_decisions, record_hash, records_of
 from appliance.audit.log.record_format import printable, rfc3339
 from appliance.audit.proof.chain_findings import Verification
-from appliance.audit.proof.copies import KnownLog, SignedCheckpoint
+from appliance.audit.proof.copies import KnownLog
 from appliance.cli.audit.audit_errors import fail
 from appliance.cli.audit.verification_text import print_verification, write
 from appliance.features.standby.membership import MembershipError, load_membership, path_of
-from appliance.features.standby.takeovers import EpochOf, Handover, Takeover, TakeoverLog
+from appliance.features.standby.takeovers import TOOK_OVER, HandedOver, TookOver
 from appliance.signing.log_proof import ProofFault
 
 # Verify the takeovers between the verified logs of two appliances.
@@ -34,6 +37,11 @@ _SECOND = 1_000_000_000
 _TOLERANCE = 5 * _SECOND
 _DRIFT = 5_000  # clocks may differ by one part in this number
 _MOST_FINDINGS = 1000
+_DECISION, _HANDED_OVER, _STAYED = "decision", "handed over", "switchover failed"
+_CLOCK_SET = ("clock set back", "clock set forward")
+_EVENTS = (TOOK_OVER, _HANDED_OVER, _STAYED, *_CLOCK_SET)
+_SEQUENCE = attrgetter("sequence")
+_T = TypeVar("_T")
 Link = Literal["proven", "removed", "none", "wrong"]
 Overlap = Literal["excluded", "found", "unknown"]
 
@@ -103,204 +111,268 @@ class VerifiedLog(NamedTuple):
     result: Verification
 
 
-def verify_takeovers(first: VerifiedLog, second: VerifiedLog) -> PairVerification:
+def verify_takeovers(*logs: VerifiedLog, absent: str = "") -> PairVerification:
+    """Verify two logs; or one, which may not name the log that the appliance `absent` does not have."""
     findings: list[TakeoverFinding] = []
     proofs: list[TakeoverProof] = []
     with ExitStack() as stack:
-        connections = [stack.enter_context(reading(log.path, advice="")) for log in (first, second)]
+        connections = [stack.enter_context(reading(log.path, advice="")) for log in logs]
         try:
-            pair = _Pair(*(_opened(*two) for two in zip(connections, (first, second), strict=True)))
-            findings, proofs = pair.findings, pair.proofs
-            pair.run()
+            told = [_Log(connection, log.result) for connection, log in zip(connections, logs, strict=True)]
+            if absent:
+                findings += told[0].names_of(absent)
+            else:
+                _Walk(findings, proofs).along(*told)
         except sqlite3.DatabaseError as error:
             message = f"the records of takeovers cannot be read: {error}"
             findings.append(TakeoverFinding(TakeoverFindingKind.UNREADABLE, 0, message))
-    results = (first.result, second.result)
-    ok = not findings and all(result.ok for result in results)
-    return PairVerification(ok=ok, logs=results, takeovers=proofs, findings=findings[:_MOST_FINDINGS])
-
-
-def verify_alone(log: VerifiedLog, absent: str) -> PairVerification:
-    """Verify a log without the log of the other appliance: no record may name that log."""
-    kind = TakeoverFindingKind.LOG_MISSING
-    findings: list[TakeoverFinding] = []
-    with reading(log.path, advice="") as connection:
-        try:
-            found = _opened(connection, log)
-            for sequence, _time, took in found.takeovers:
-                named = took.checkpoint is not None or (took.previous and took.previous.appliance == absent)
-                if named:
-                    message = f"record {sequence} names the log of {absent}, which is missing"
-                    findings.append(TakeoverFinding(kind, took.epoch, message))
-            for sequence, _time, handed in found.handovers:
-                if found.stayed(sequence, found.end_of(sequence)) is None:
-                    message = f"record {sequence} hands over to {absent}, whose log is missing"
-                    findings.append(TakeoverFinding(kind, handed.epoch, message))
-        except sqlite3.DatabaseError as error:
-            message = f"the records of takeovers cannot be read: {error}"
-            findings.append(TakeoverFinding(TakeoverFindingKind.UNREADABLE, 0, message))
+    results = tuple(log.result for log in logs)
     return PairVerification(
-        ok=not findings and log.result.ok,
-        logs=(log.result,),
-        takeovers=[],
-        findings=findings[:_MOST_FINDINGS],
-        absent=absent,
-    )
+        ok=not findings and all(result.ok for result in results), logs=results, takeovers=proofs,
+        findings=findings[:_MOST_FINDINGS], absent=absent,
+    )  # fmt: skip
 
 
-def _opened(connection: sqlite3.Connection, log: VerifiedLog) -> TakeoverLog:
-    connection.execute("BEGIN")
-    return TakeoverLog(connection, log.result)
-
-
-class _Placed(NamedTuple):
-    takeover: Takeover
-    own: TakeoverLog
-    other: TakeoverLog
+class _Takeover(NamedTuple):
+    log: "_Log"
+    sequence: int
+    time: int
+    detail: TookOver
 
     @property
     def epoch(self) -> int:
-        return self.takeover.detail.epoch
+        return self.detail.epoch
 
 
-class _Pair:
-    def __init__(self, first: TakeoverLog, second: TakeoverLog) -> None:
-        self._sides = ((first, second), (second, first))
-        placed = [_Placed(one, own, other) for own, other in self._sides for one in own.takeovers]
-        self._placed = sorted(placed, key=lambda one: one.epoch)
-        self.findings: list[TakeoverFinding] = []
-        self.proofs: list[TakeoverProof] = []
+class _Log:
+    """The part of a verified log that the proof reads: `_EVENTS`, and the outer decisions between two of them."""
 
-    def run(self) -> None:
-        (first, second), _ = self._sides
+    other: "_Log"
+
+    def __init__(self, connection: sqlite3.Connection, result: Verification) -> None:
+        connection.execute("BEGIN")
+        self._connection, self.result = connection, result
+        first, key = result.removed + 1, result.key or "no key"
+        self.known = KnownLog(result.log, key, first, result.last, self._hash, self._checkpoint)
+        self._rows: list[EventRow] = []
+        after = 0
+        for row in records_of(connection, *_EVENTS, upto=result.last):
+            self._rows += [*outer_decisions(connection, after, row.sequence), row]
+            after = row.sequence
+        self._rows += outer_decisions(connection, after, result.last)
+        if not all(isinstance(value, int) for row in self._rows for value in row[:2]):
+            raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
+        self.unreadable: list[int] = []
+        self.takeovers = [_Takeover(self, *told) for told in self._decoded(TOOK_OVER, TookOver)]
+        self.handovers = list(self._decoded(_HANDED_OVER, HandedOver))
+        self.names = {one.detail.appliance for one in self.takeovers}
+        self.epochs = {one.epoch for one in self.takeovers}
+
+    def _decoded(self, event: str, kind: type[_T]) -> Iterator[tuple[int, int, _T]]:
+        for row in self._rows:
+            if row.event == event:
+                try:
+                    yield row.sequence, row.time, msgspec.json.decode(row.detail, type=kind)
+                except (ValueError, RecursionError, MemoryError):
+                    self.unreadable.append(row.sequence)
+
+    def _hash(self, sequence: int) -> bytes | None:
+        digest = record_hash(self._connection, sequence)
+        return digest if isinstance(digest, bytes) else None
+
+    def _checkpoint(self, number: int) -> bytes:
+        row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
+        return b"" if row is None else row[0]
+
+    def between(self, after: int, through: int, *events: str) -> Iterator[EventRow]:
+        for place in range(bisect_right(self._rows, after, key=_SEQUENCE), len(self._rows)):
+            if self._rows[place].sequence > through:
+                return
+            if self._rows[place].event in events:
+                yield self._rows[place]
+
+    def last_decision(self, after: int, through: int) -> EventRow | None:
+        return max(self.between(after, through, _DECISION), default=None)
+
+    def before(self, sequence: int) -> _Takeover | None:
+        place = bisect_left(self.takeovers, sequence, key=_SEQUENCE)
+        return self.takeovers[place - 1] if place else None
+
+    def end_of(self, sequence: int, epoch: int = -1) -> int:
+        later = islice(self.takeovers, bisect_right(self.takeovers, sequence, key=_SEQUENCE), None)
+        return next((one.sequence - 1 for one in later if one.epoch > epoch), self.result.last)
+
+    def stayed(self, sequence: int) -> int | None:
+        failed = next(self.between(sequence, self.end_of(sequence), _STAYED), None)
+        return None if failed is None else failed.sequence
+
+    def names_of(self, absent: str) -> Iterator[TakeoverFinding]:
+        kind = TakeoverFindingKind.LOG_MISSING
+        for one in self.takeovers:
+            previous = one.detail.previous
+            if one.detail.checkpoint is not None or (previous and previous.appliance == absent):
+                message = f"record {one.sequence} names the log of {absent}, which is missing"
+                yield TakeoverFinding(kind, one.epoch, message)
+        for sequence, _time, handed in self.handovers:
+            if self.stayed(sequence) is None:
+                message = f"record {sequence} hands over to {absent}, whose log is missing"
+                yield TakeoverFinding(kind, handed.epoch, message)
+
+
+class _Walk:
+    """A walk along the takeovers of two logs, in the order of their epochs."""
+
+    def __init__(self, findings: list[TakeoverFinding], proofs: list[TakeoverProof]) -> None:
+        self._findings, self._proofs = findings, proofs
+
+    def along(self, first: _Log, second: _Log) -> None:
+        first.other, second.other = second, first
         if first.result.log == second.result.log:
             message = f"both are log {first.result.log}: give the logs of the two appliances"
             self._find(TakeoverFindingKind.SAME_LOG, 0, message)
             return
-        for own, _ in self._sides:
-            self._check_one_log(own)
-        for one, following in pairwise(self._placed):
-            if one.epoch == following.epoch and one.own is not following.own:
+        for log in (first, second):
+            self._check_one_log(log)
+        placed = sorted(first.takeovers + second.takeovers, key=lambda one: one.epoch)
+        for one, following in pairwise(placed):
+            if one.epoch == following.epoch and one.log is not following.log:
                 message = f"both logs have a takeover of epoch {one.epoch}"
                 self._find(TakeoverFindingKind.EPOCH_ORDER, one.epoch, message)
-        overlaps = dict(self._overlaps())
-        for place, one in enumerate(self._placed):
+        turns = [list(turn) for _, turn in groupby(placed, key=lambda one: one.log is first)]
+        overlaps = {
+            active[0]: self._overlap(before[-1], active, back[0])
+            for before, active, back in zip(turns, turns[1:], turns[2:], strict=False)
+        }
+        for one in placed:
             self._check_names(one)
-            self._check_previous(one)
-            link = self._check_checkpoint(one)
-            self.proofs.append(_proof(one, link, overlaps.get(place, "unknown")))
+            self._proofs.append(self._proof(one, overlaps.get(one, "unknown")))
 
     def _find(self, kind: TakeoverFindingKind, epoch: int, message: str) -> None:
         name = f"epoch {epoch}: " if epoch else ""
-        self.findings.append(TakeoverFinding(kind, epoch, name + message))
+        self._findings.append(TakeoverFinding(kind, epoch, name + message))
 
-    # --- one log ----------------------------------------------------------------------------------------------
-
-    def _check_one_log(self, log: TakeoverLog) -> None:
-        for sequence in log.unreadable:
-            message = f"record {sequence} of log {log.result.log} does not have the detail of its event"
+    def _check_one_log(self, log: _Log) -> None:
+        name = log.result.log
+        for sequence in sorted(log.unreadable):
+            message = f"record {sequence} of log {name} does not have the detail of its event"
             self._find(TakeoverFindingKind.UNREADABLE, 0, message)
         for one, following in pairwise(log.takeovers):
-            epoch = following.detail.epoch
-            if epoch <= one.detail.epoch:
+            if following.epoch <= one.epoch:
                 message = (
-                    f"record {following.sequence} of log {log.result.log} comes after epoch {one.detail.epoch},"
+                    f"record {following.sequence} of log {name} comes after epoch {one.epoch},"
                     f" record {one.sequence}"
                 )
-                self._find(TakeoverFindingKind.EPOCH_ORDER, epoch, message)
-        for handover in log.handovers:
-            epoch, sequence = handover.detail.epoch, handover.sequence
+                self._find(TakeoverFindingKind.EPOCH_ORDER, following.epoch, message)
+        for sequence, time, handed in log.handovers:
             held = log.before(sequence)
-            if held is not None and (held.detail.epoch, held.detail.other) != (epoch, handover.detail.to):
+            if held is not None and (held.epoch, held.detail.other) != (handed.epoch, handed.to):
                 message = (
-                    f"record {sequence} of log {log.result.log} hands it over to {handover.detail.to}, but the"
-                    f" appliance took over in epoch {held.detail.epoch} from {held.detail.other}"
+                    f"record {sequence} of log {name} hands it over to {handed.to}, but the"
+                    f" appliance took over in epoch {held.epoch} from {held.detail.other}"
                 )
-                self._find(TakeoverFindingKind.EPOCH_ORDER, epoch, message)
-            self._check_silence(log, handover)
+                self._find(TakeoverFindingKind.EPOCH_ORDER, handed.epoch, message)
+            late = log.last_decision(sequence, log.stayed(sequence) or log.end_of(sequence))
+            if late is None or any(log.between(sequence, late.sequence, *_CLOCK_SET)):
+                continue
+            if late.time - time > _TOLERANCE:
+                message = (
+                    f"{handed.appliance} handed over in record {sequence} of log {name}, and"
+                    f" decided again in record {late.sequence} before it took over"
+                )
+                self._find(TakeoverFindingKind.OVERLAP, handed.epoch, message)
 
-    def _check_silence(self, log: TakeoverLog, handover: Handover) -> None:
-        end = log.end_of(handover.sequence)
-        late = log.last_decision(handover.sequence, log.stayed(handover.sequence, end) or end)
-        if late is None or log.clock_was_set(handover.sequence, late.sequence):
-            return
-        if late.time - handover.time > _TOLERANCE:
+    def _check_names(self, one: _Takeover) -> None:
+        detail, other = one.detail, one.log.other
+        if detail.appliance in other.names or (other.names and detail.other not in other.names):
             message = (
-                f"{handover.detail.appliance} handed over in record {handover.sequence} of log {log.result.log}, and"
-                f" decided again in record {late.sequence} before it took over"
-            )
-            self._find(TakeoverFindingKind.OVERLAP, handover.detail.epoch, message)
-
-    # --- the links between the logs ---------------------------------------------------------------------------
-
-    def _check_names(self, one: _Placed) -> None:
-        name, named = one.takeover.detail.appliance, one.takeover.detail.other
-        if name in one.other.names or (one.other.names and named not in one.other.names):
-            message = (
-                f"{name} took over from {named}, but the other log is of {', '.join(sorted(one.other.names))}"
+                f"{detail.appliance} took over from {detail.other}, but the other log is of"
+                f" {', '.join(sorted(other.names))}"
             )
             self._find(TakeoverFindingKind.WRONG_NAME, one.epoch, message)
-
-    def _check_previous(self, one: _Placed) -> None:
-        previous = one.takeover.detail.previous
+        previous = detail.previous
         if previous is None:
             return
+        log = one.log if previous.appliance == detail.appliance else other
         if previous.epoch >= one.epoch:
             message = f"it names epoch {previous.epoch} as the one before it"
             self._find(TakeoverFindingKind.EPOCH_ORDER, one.epoch, message)
-            return
-        log = one.own if previous.appliance == one.takeover.detail.appliance else one.other
-        if not _has(log, previous):
+        elif previous.epoch not in log.epochs and not (
+            log.result.removed and previous.epoch < min(log.epochs, default=previous.epoch + 1)
+        ):
             message = (
                 f"{previous.appliance} took over in this epoch, as the takeover of epoch {one.epoch} names it; log"
                 f" {log.result.log} does not have the record: it was removed, or the copy is older"
             )
             self._find(TakeoverFindingKind.TAKEOVER_MISSING, previous.epoch, message)
 
-    def _check_checkpoint(self, one: _Placed) -> Link:
-        named = one.takeover.detail.checkpoint
+    def _link(self, one: _Takeover) -> Link:
+        named, other = one.detail.checkpoint, one.log.other
         if named is None:
             return "none"
-        wrong = _wrong_checkpoint(named, one.other)
-        if wrong is None and (contradiction := _later_epoch(one, named)) is not None:
-            wrong = TakeoverFindingKind.EPOCH_ORDER, contradiction
-        if wrong is not None:
-            kind, message = wrong
-            self._find(kind, one.epoch, f"{one.takeover.detail.appliance} took over and named {message}")
-            return "wrong"
-        return "removed" if named.sequence <= one.other.result.removed else "proven"
+        sealed, fault = other.before(named.sequence + 1), named.fault_in(other.known)
+        if fault is not None:
+            kind, words = _WRONG[fault]
+        elif sealed is not None and sealed.epoch > one.epoch:
+            kind, words = TakeoverFindingKind.EPOCH_ORDER, _LATER_EPOCH
+        else:
+            return "removed" if named.sequence <= other.result.removed else "proven"
+        words = words.format(named=named, log=other.known, sealed=sealed)
+        message = f"{one.detail.appliance} took over and named checkpoint {named.number}{words}"
+        self._find(kind, one.epoch, message)
+        return "wrong"
 
-    # --- overlapping epochs -----------------------------------------------------------------------------------
+    def _proof(self, one: _Takeover, overlap: Overlap) -> TakeoverProof:
+        detail, other, link = one.detail, one.log.other, self._link(one)
+        through = tail = signed = 0
+        if link in ("proven", "removed") and detail.checkpoint is not None:
+            through = detail.checkpoint.sequence
+            end = other.end_of(through, one.epoch)
+            tail, signed = end - through, max(0, min(end, other.result.signed_through) - through)
+        return TakeoverProof(
+            epoch=one.epoch, appliance=detail.appliance, other=detail.other, log=one.log.result.log,
+            sequence=one.sequence, time=one.time, link=link, through=through, tail=tail, tail_signed=signed,
+            overlap=overlap,
+        )  # fmt: skip
 
-    def _overlaps(self) -> Iterator[tuple[int, Overlap]]:
-        switches = [
-            place for place, two in enumerate(pairwise(self._placed), 1) if two[0].own is not two[1].own
-        ]
-        for place, end in pairwise(switches):
-            one, active, back = self._placed[place - 1], self._placed[place:end], self._placed[end]
-            overlap = _overlap(one, active, back)
-            if overlap is None:
+    def _overlap(self, before: _Takeover, active: list[_Takeover], back: _Takeover) -> Overlap:
+        """Compare the silence of one appliance with the epochs of the other.
+
+        `before` and `back` are takeovers of the first appliance, `active` those of the other between them. `active`
+        ends with the last decision of each epoch; the silence is the time from the last decision before to `back`.
+        """
+        silent, busy = before.log, active[0].log
+        last = silent.last_decision(before.sequence, back.sequence)
+        resumed = next(silent.between(back.sequence, silent.result.last, _DECISION), None)
+        heard = resumed.sequence if resumed else silent.result.last
+        if last is None or any(silent.between(last.sequence, heard, *_CLOCK_SET)):
+            return "unknown"
+        duration = 0
+        for one in active:
+            decided = busy.last_decision(one.sequence, busy.end_of(one.sequence))
+            if decided is None:
                 continue
-            if overlap > 0:
-                first = active[0]
-                message = (
-                    f"{one.takeover.detail.appliance} decided for at least {overlap / _SECOND:.0f} s after"
-                    f" {first.takeover.detail.appliance} had taken over, or one of their clocks was set while the"
-                    " machine was off"
-                )
-                self._find(TakeoverFindingKind.OVERLAP, first.epoch, message)
-            yield place, "found" if overlap > 0 else "excluded"
-
-
-def _has(log: TakeoverLog, previous: EpochOf) -> bool:
-    if previous.epoch in log.epochs:
-        return True
-    return log.result.removed > 0 and (log.first_epoch is None or previous.epoch < log.first_epoch)
+            if any(busy.between(one.sequence, decided.sequence, *_CLOCK_SET)):
+                return "unknown"
+            duration += max(0, decided.time - one.time)
+        if not duration:
+            return "unknown"
+        overlap = duration - (back.time - last.time) - _TOLERANCE - duration // _DRIFT
+        if overlap <= 0:
+            return "excluded"
+        message = (
+            f"{before.detail.appliance} decided for at least {overlap / _SECOND:.0f} s after"
+            f" {active[0].detail.appliance} had taken over, or one of their clocks was set while the machine was off"
+        )
+        self._find(TakeoverFindingKind.OVERLAP, active[0].epoch, message)
+        return "found"
 
 
 _REWRITTEN = (
     TakeoverFindingKind.REWRITTEN,
     "; record {named.sequence} of the other log is not the one that it sealed: the records up to there were rewritten",
+)
+_LATER_EPOCH = (
+    ", which seals the takeover of epoch {sealed.detail.epoch}, record {sealed.sequence} of the other log"
 )
 _WRONG = {
     ProofFault.LOG: (
@@ -320,79 +392,12 @@ _WRONG = {
 }
 
 
-def _wrong_checkpoint(named: SignedCheckpoint, log: TakeoverLog) -> tuple[TakeoverFindingKind, str] | None:
-    """Return the fault of a named checkpoint; None if it is right, or if its records were removed."""
-    first, last, key = log.result.removed + 1, log.result.last, log.result.key or "no key"
-    known = KnownLog(log.result.log, key, first, last, log.hash_at, log.checkpoint_text)
-    fault = named.fault_in(known)
-    if fault is None:
-        return None
-    kind, words = _WRONG[fault]
-    return kind, f"checkpoint {named.number}{words.format(named=named, log=known)}"
-
-
-def _later_epoch(one: _Placed, named: SignedCheckpoint) -> str | None:
-    sealed = one.other.before(named.sequence + 1)
-    if sealed is None or sealed.detail.epoch <= one.epoch:
-        return None
-    return (
-        f"checkpoint {named.number}, which seals the takeover of epoch {sealed.detail.epoch}, record"
-        f" {sealed.sequence} of the other log"
-    )
-
-
-def _proof(
-    one: _Placed,
-    link: Link,
-    overlap: Overlap,
-) -> TakeoverProof:
-    detail, other = one.takeover.detail, one.other
-    through = tail = signed = 0
-    if link in ("proven", "removed") and detail.checkpoint is not None:
-        through = detail.checkpoint.sequence
-        end = other.end_of(through, one.epoch)
-        tail, signed = end - through, max(0, min(end, other.result.signed_through) - through)
-    return TakeoverProof(
-        epoch=one.epoch, appliance=detail.appliance, other=detail.other, log=one.own.result.log,
-        sequence=one.takeover.sequence, time=one.takeover.time, link=link, through=through, tail=tail,
-        tail_signed=signed, overlap=overlap,
-    )  # fmt: skip
-
-
-def _overlap(before: _Placed, active: list[_Placed], back: _Placed) -> int | None:
-    """Return the nanoseconds by which one appliance's silence is too short for the other's epochs, or None.
-
-    `before` and `back` are takeovers of the first appliance, `active` those of the other between them. `active` ends
-    with the last decision of each epoch; the silence is the time from the last decision before to `back`.
-    """
-    silent, busy = before.own, active[0].own
-    last = silent.last_decision(before.takeover.sequence, back.takeover.sequence)
-    if last is None:
-        return None
-    resumed = silent.first_decision(back.takeover.sequence, silent.result.last)
-    if silent.clock_was_set(last.sequence, resumed.sequence if resumed else silent.result.last):
-        return None
-    duration = 0
-    for one in active:
-        begin, end = one.takeover.sequence, busy.end_of(one.takeover.sequence)
-        decided = busy.last_decision(begin, end)
-        if decided is None:
-            continue
-        if busy.clock_was_set(begin, decided.sequence):
-            return None
-        duration += max(0, decided.time - one.takeover.time)
-    if not duration:
-        return None
-    missing = duration - (back.takeover.time - last.time)
-    return max(0, missing - _TOLERANCE - duration // _DRIFT)
-
-
 def verification(
     own: Path, verified: Verification, other: Path, state: Path, verify: Callable[[], Verification]
 ) -> tuple[PairVerification, Callable[[PairVerification], None]]:
     first, missing = VerifiedLog(own, verified), _absent(other, state)
-    pair = verify_alone(first, missing) if missing else verify_takeovers(first, VerifiedLog(other, verify()))
-    return pair, print_pair
+    logs = (first,) if missing else (first, VerifiedLog(other, verify()))
+    return verify_takeovers(*logs, absent=missing), print_pair
 
 
 def _absent(log: Path, state: Path) -> str:

@@ -18,7 +18,6 @@ from appliance.features.standby.takeover_table import (
     PairVerification,
     TakeoverFindingKind,
     VerifiedLog,
-    verify_alone,
     verify_takeovers,
 )
 from appliance.signing.log_proof import parse_checkpoint
@@ -124,7 +123,7 @@ def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) 
 
     fresh = build(tmp_path / "fresh", first_hour)
     for log, findings in ((fresh.a, []), (pair.a, [(Kind.LOG_MISSING, 4)])):
-        result = verify_alone(VerifiedLog(log, verify(log)), "b")
+        result = verify_takeovers(VerifiedLog(log, verify(log)), absent="b")
         assert [(one.kind, one.epoch) for one in result.findings] == findings
         assert result.ok is not bool(findings)
     states = fresh.a.parents[1], fresh.b.parents[1]
@@ -252,10 +251,21 @@ def test_logs_without_a_takeover_have_no_link(tmp_path: Path) -> None:
 # --- tampering ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("change", ["decision = 'deny'", "time = time - 1", "host = '10.0.0.99'"])
-def test_a_rewritten_log(pair: Pair, change: str) -> None:
-    pair.forge_b(f"UPDATE record SET {change} WHERE sequence = 5")
-    assert found(pair) == [(Kind.REWRITTEN, 4)]
+@pytest.mark.parametrize(
+    ("change", "findings"),
+    [
+        ("UPDATE record SET decision = 'deny' WHERE sequence = 5", [(Kind.REWRITTEN, 4)]),
+        ("UPDATE record SET time = time - 1 WHERE sequence = 5", [(Kind.REWRITTEN, 4)]),
+        ("UPDATE record SET host = '10.0.0.99' WHERE sequence = 5", [(Kind.REWRITTEN, 4)]),
+        (setting("previous", """json('{"epoch": 3, "appliance": "b"}')""", 5), [(Kind.TAKEOVER_MISSING, 3)]),
+        (setting("previous.epoch", "5", 5), [(Kind.EPOCH_ORDER, 5)]),
+        (setting("checkpoint.signature", "'" + "00" * 64 + "'", 5), [(Kind.SIGNATURE_WRONG, 5)]),
+        (setting("checkpoint.hash", "'" + "00" * 32 + "'", 5), [(Kind.SIGNATURE_WRONG, 5)]),
+    ],
+)
+def test_a_forged_log(pair: Pair, change: str, findings: list[Any]) -> None:
+    pair.forge_b(change)
+    assert found(pair) == findings
 
 
 def test_a_removed_decision(pair: Pair) -> None:
@@ -285,11 +295,6 @@ def test_a_removed_takeover(pair: Pair) -> None:
     assert (Kind.TAKEOVER_MISSING, 2) in found(pair)
 
 
-def test_a_removed_unsealed_takeover(pair: Pair) -> None:
-    pair.forge_b(setting("previous", 'json(\'{"epoch": 3, "appliance": "b"}\')', 5))
-    assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
-
-
 def test_a_log_of_another_pair(pair: Pair, tmp_path: Path) -> None:
     stranger = build(tmp_path / "stranger", four_takeovers)
     kinds = found(pair._replace(b=stranger.b))
@@ -306,16 +311,6 @@ def test_a_log_signed_with_another_key(pair: Pair) -> None:
     write_anew(pair.b, key, pair.b.parent / "signer", "UPDATE record SET reason = reason")
     write_public_key(pinned_key_path(pair.b), key.public_key().public_bytes_raw())
     assert found(pair) == [(Kind.WRONG_KEY, 4)]
-
-
-def test_a_forged_signature_in_a_takeover(pair: Pair) -> None:
-    pair.forge_b(setting("checkpoint.signature", "'" + "00" * 64 + "'", 5))
-    assert found(pair) == [(Kind.SIGNATURE_WRONG, 5)]
-
-
-def test_a_forged_checkpoint_in_a_takeover(pair: Pair) -> None:
-    pair.forge_b(setting("checkpoint.hash", "'" + "00" * 32 + "'", 5))
-    assert found(pair) == [(Kind.SIGNATURE_WRONG, 5)]
 
 
 def test_a_different_checkpoint_with_the_same_hash(pair: Pair) -> None:
@@ -355,11 +350,6 @@ def test_epochs_that_do_not_increase_in_a_log(pair: Pair, epoch: int) -> None:
         one.message for one in verified(pair.a, pair.b).findings if "comes after epoch 2" in one.message
     )
     assert message.startswith(f"epoch {epoch}: record ")
-
-
-def test_a_previous_takeover_from_the_future(pair: Pair) -> None:
-    pair.forge_b(setting("previous.epoch", "5", 5))
-    assert found(pair) == [(Kind.EPOCH_ORDER, 5)]
 
 
 @pytest.mark.parametrize(("field", "name"), [("other", "c"), ("appliance", "a")])
