@@ -18,10 +18,10 @@ from typing import Annotated, NamedTuple, Protocol
 
 import msgspec
 
-from appliance.audit.log.columns import StoredColumns, from_columns, packed, to_columns
+from appliance.audit.log.columns import StoredColumns, packed, to_columns
 from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.log.log_queries import chained_rows, number_of_records
-from appliance.audit.log.record_format import LogEntry, entry_of
+from appliance.audit.log.record_format import entry_of, stored_entry
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.checkpoints import last_removal
 from appliance.audit.proof.copies import SignedCheckpoint, select_signed
@@ -159,7 +159,7 @@ def _header(connection: sqlite3.Connection, number: int) -> SegmentHeader | None
 def _line(columns: StoredColumns, previous: bytes, digest: bytes, end: SignedCheckpoint) -> bytes:
     ends = end if columns.sequence == end.sequence else None
     proof = ChainProof(previous=previous.hex(), hash=digest.hex(), then=[], checkpoint=ends)
-    return evidence_line(LogEntry(columns.sequence, from_columns(columns)), proof).encode("ascii") + b"\n"
+    return evidence_line(stored_entry(columns), proof).encode("ascii") + b"\n"
 
 
 class SegmentReader:

@@ -9,16 +9,14 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec.structs import asdict
 
+from appliance.audit.log.columns import StoredColumns, from_columns
 from appliance.audit.log.record import SCHEMA_VERSION, AuditRecord, RuleReference
 from appliance.base.timestamps import parse_timestamp
 
 _SECOND = 1_000_000_000
 _GIVES_UP = ("unregister", "unsubscribe")
 _NOT_THE_RECORDS = ("schema", "sequence", "chain")
-_OF_THE_RECORD = (
-    "event", "severity", "decision", "host", "caller_id", "category", "resource", "rule", "revision", "reason",
-    "duration_us", "detail",
-)  # fmt: skip
+_OF_THE_RECORD = AuditRecord.__struct_fields__[2:-2]  # without id and time, and what is not stored
 
 
 _CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why", "binding")
@@ -31,6 +29,10 @@ class LogEntry(NamedTuple):
 
     sequence: int
     record: AuditRecord
+
+
+def stored_entry(columns: StoredColumns) -> LogEntry:
+    return LogEntry(columns.sequence, from_columns(columns))
 
 
 def rfc3339(time: int) -> str:

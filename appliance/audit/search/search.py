@@ -11,11 +11,11 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from appliance.audit.log.columns import StoredColumns, from_columns
+from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.ids import ID_LENGTH
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, open_for_reading, reading
 from appliance.audit.log.log_queries import record_extent
-from appliance.audit.log.record_format import LogEntry
+from appliance.audit.log.record_format import LogEntry, stored_entry
 from appliance.audit.search.equality import FOLDED, equal_key
 from appliance.audit.search.query import (
     IN_NETWORKS,
@@ -341,6 +341,4 @@ def _rows(
     connection: sqlite3.Connection, tail: str, values: tuple[object, ...], table: str = "record"
 ) -> Iterator[LogEntry]:
     rows = connection.execute(f"SELECT {COLUMNS} FROM {table} {tail}", values)  # noqa: S608  fixed names
-    for row in rows:
-        columns = StoredColumns(*row)
-        yield LogEntry(columns.sequence, from_columns(columns))
+    return map(stored_entry, map(StoredColumns._make, rows))

@@ -51,18 +51,6 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NOTABLE = (Severity.NOTICE, Severity.WARNING, Severity.ALARM)
 
 
-class _Said(msgspec.Struct):
-    id: str
-    event: str
-    severity: Severity
-    decision: str | None = None
-    host: str | None = None
-    caller_id: str | None = None
-    resource: str | None = None
-    reason: str = ""
-    detail: dict[str, Any] = {}
-
-
 class _Columns:
     def __init__(self, since: int, until: int, number: int) -> None:
         self.since, self.until, self.number = since, until, number
@@ -186,29 +174,25 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
     return list(flows.values())
 
 
-def _counted_later(log: Path, recording: Recording) -> list[tuple[_Said | AuditRecord, int]]:
+def _counted_later(log: Path, recording: Recording) -> list[AuditRecord]:
     ended = recording.ended
     written = Filter(since=ended + 1, until=ended + int((FoldSettings().seconds + 1) * _SECOND))
     found = (entry.record for entry in islice(export(log, written), _MOST_LATER))
-    return [(one, one.time) for one in found if _is_before(one.detail.get("first_time"), ended)]
+    return [one for one in found if _is_before(one.detail.get("first_time"), ended)]
 
 
 def _is_before(time: object, end: int) -> bool:
     return isinstance(time, int) and time <= end
 
 
-def _events(
-    records: Iterable[tuple[_Said | AuditRecord, int]],
-) -> Iterator[tuple[RecordedEvent, int, int]]:
+def _events(records: Iterable[AuditRecord]) -> Iterator[tuple[RecordedEvent, int, int]]:
     """Yield the events of records, each of which may count several between a first and a last time."""
-    for said, time in records:
+    for said in records:
         kind = _kind(said)
         if kind is None:
             continue
-        times, first, last = (
-            times_of(said.event, said.detail),
-            *map(said.detail.get, ("first_time", "last_time")),
-        )
+        time, times = said.time, times_of(said.event, said.detail)
+        first, last = map(said.detail.get, ("first_time", "last_time"))
         spread = times > 1 and isinstance(first, int) and isinstance(last, int)
         event = RecordedEvent(
             time=time,
@@ -226,7 +210,7 @@ def _events(
         yield event, *((first, last) if spread else (time, time))
 
 
-def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:
+def _records(reader: BagReader, since: int = 0) -> Iterator[AuditRecord]:
     numbers = {
         number
         for number, header in reader.connections.items()
@@ -234,10 +218,11 @@ def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:
     }
     for place, _number in reader.messages(numbers, since):
         _size, body = reader.body(place, _LONGEST_RECORD)
-        yield msgspec.json.decode(body[4:], type=_Said), place.time
+        said = msgspec.json.decode(body[4:], type=dict[str, Any])
+        yield msgspec.convert(said | {"time": place.time}, AuditRecord)
 
 
-def _kind(said: _Said | AuditRecord) -> EventKind | None:
+def _kind(said: AuditRecord) -> EventKind | None:
     kinds = kinds_of(said.event, said.decision, said.severity)
     if kinds:
         return kinds[0]  # type: ignore[return-value]  # a record's kinds of trigger are kinds of event
@@ -310,7 +295,7 @@ def _place_of_record(
     A monitor's record has the time of its message. Messages that were received together also have the same time, so
     their first bytes are compared as well.
     """
-    said, time = next((found for found in _records(reader) if found[0].id == record), (None, 0))
+    said = next((found for found in _records(reader) if found.id == record), None)
     if said is None:
         times = [trigger.time for trigger in recording.triggers if trigger.record == record]
         if not times:
@@ -318,7 +303,7 @@ def _place_of_record(
         return times[0]
     happened = said.detail.get("happened")
     if not isinstance(happened, str):
-        return time
+        return said.time
     time = (datetime.fromisoformat(happened) - _EPOCH) // timedelta(microseconds=1) * 1000
     own = {number for number in wanted if _is_sender(reader.connections[number], said)}
     start = bytes.fromhex(str(said.detail.get("before", "")))
@@ -331,7 +316,7 @@ def _place_of_record(
     return time if chosen is None else chosen
 
 
-def _is_sender(header: Mapping[str, str], said: _Said) -> bool:
+def _is_sender(header: Mapping[str, str], said: AuditRecord) -> bool:
     sender = _sender(header)
     return (header["topic"], sender.host, sender.node) == (
         said.resource,

@@ -13,8 +13,8 @@ import typer
 from psycopg_pool import PoolTimeout
 
 from appliance import __version__
-from appliance.audit.log.columns import StoredColumns, from_columns
-from appliance.audit.log.record_format import LogEntry, printable, rfc3339
+from appliance.audit.log.columns import StoredColumns
+from appliance.audit.log.record_format import LogEntry, printable, rfc3339, stored_entry
 from appliance.audit.search.filter_options import FILTER, Since, Until
 from appliance.base import clock
 from appliance.base.counted import counted
@@ -118,9 +118,8 @@ def report_of(
 
 def _history(robot: str, rows: Iterable[Row]) -> Iterator[NamedEntry]:
     logs: dict[str, list[LogEntry]] = {}
-    for _robot, log, *columns, detail in rows:
-        stored = StoredColumns._make((*columns, detail.encode()))
-        logs.setdefault(log, []).append(LogEntry(stored.sequence, from_columns(stored)))
+    for _robot, log, *columns in rows:
+        logs.setdefault(log, []).append(stored_entry(StoredColumns._make(columns)))
     return (NamedEntry(robot, entry) for _log, entry in merged(logs))
 
 

@@ -10,8 +10,8 @@ import msgspec
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from appliance.audit.log.columns import StoredColumns, from_columns
-from appliance.audit.log.record_format import LogEntry, as_object
+from appliance.audit.log.columns import StoredColumns
+from appliance.audit.log.record_format import as_object, stored_entry
 from appliance.audit.search.query import FilterError
 from appliance.base.counted import counted
 from rosrv_fleet.database import IndexDatabase
@@ -105,6 +105,5 @@ def _rows(
 
 
 def _record(row: tuple[Any, ...]) -> dict[str, Any]:
-    robot, log, *columns, detail = row
-    stored = StoredColumns._make((*columns, detail.encode()))
-    return {"robot": robot, "log": log} | as_object(LogEntry(stored.sequence, from_columns(stored)))
+    robot, log, *columns = row
+    return {"robot": robot, "log": log} | as_object(stored_entry(StoredColumns._make(columns)))

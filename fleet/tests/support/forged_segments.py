@@ -6,9 +6,9 @@ import secrets
 import time
 from typing import Any, NamedTuple
 
-from appliance.audit.log.columns import StoredColumns, from_columns, record_hash, to_columns
+from appliance.audit.log.columns import StoredColumns, record_hash, to_columns
 from appliance.audit.log.record import AuditRecord
-from appliance.audit.log.record_format import LogEntry
+from appliance.audit.log.record_format import stored_entry
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.formats.segments import RecordPlace, SegmentHeader, SegmentSummary
@@ -39,7 +39,7 @@ def _chain(log: str, start: int, records: int, fields: tuple[tuple[str, Any], ..
 
 def _line(columns: StoredColumns, before: bytes, digest: bytes, end: SignedCheckpoint | None) -> bytes:
     proof = ChainProof(previous=before.hex(), hash=digest.hex(), then=[], checkpoint=end)
-    return evidence_line(LogEntry(columns.sequence, from_columns(columns)), proof).encode() + b"\n"
+    return evidence_line(stored_entry(columns), proof).encode() + b"\n"
 
 
 def forged(
