@@ -539,8 +539,8 @@ class MonitorsReported(Message):
     lost: int = 0
 
 
-class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
-    """A monitor's counters since it was loaded, or the relay started.
+class MonitorRow(msgspec.Struct, array_like=True):
+    """A monitor's counters since it was loaded, or the relay started. The relay counts in rows of its own.
 
     In shadow mode, drops and changes are those that it would have made, and `missed` counts messages that it would
     have received if it were in force. `withholds`: it withholds a topic from hosts now. `awaits`: the nodes without
@@ -548,15 +548,13 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     """
 
     name: str
-    file: str
-    enabled: bool
-    held: bool
-    failing: bool
-    events: int
-    verdicts: int
-    drops: int
-    changes: int
-    faults: int
+    file: str = ""
+    failing: bool = False
+    events: int = 0
+    verdicts: int = 0
+    drops: int = 0
+    changes: int = 0
+    faults: int = 0
     shadow: bool = False
     missed: int = 0
     slices: int = 0

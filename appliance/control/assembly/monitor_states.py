@@ -56,7 +56,7 @@ def states_of(monitors: SpecificationManager) -> list[answers.MonitorState]:
 
 def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
     checked = monitors.checked
-    row = monitors.rollout.rows.get(name) or MonitorRow(name, "", False, False, False, 0, 0, 0, 0, 0)
+    row = monitors.rollout.rows.get(name) or MonitorRow(name)
     return answers.MonitorState(
         name=name,
         file=checked.monitors[name],

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from msgspec.structs import replace
+
 from appliance.base.varying_numbers import without_numbers
 from appliance.channel.messages import MonitorRow
 from appliance.relay.monitors.fast_path_counts import FastPathCounts
@@ -35,15 +37,6 @@ _LINE_NS = 10_000_000_000
 _MOST_STOPPING = 1000
 _PUBLISHERS = 8
 """The most publishers that the report of a stop names."""
-
-
-@dataclass(slots=True)
-class _Counters:
-    events: int = 0
-    verdicts: int = 0
-    drops: int = 0
-    changes: int = 0
-    missed: int = 0
 
 
 @dataclass
@@ -79,7 +72,7 @@ class Observer:
         self._observations = observations
         self._publish = publish
         self._prefix = prefix
-        self._counters: dict[str, _Counters] = {}
+        self._counters: dict[str, MonitorRow] = {}
         self._happened: dict[tuple[str, ...], int] = {}
         self._again: dict[tuple[tuple[str, ...], ObservationPoint, bool], int] = {}
         self._stopping: dict[tuple[tuple[str, ...], ObservationPoint], bool] = {}
@@ -93,9 +86,7 @@ class Observer:
     def keep(self, names: list[str], began: list[str], time: int) -> None:
         self._sum_up(time)
         self._lines = {name: line for name, line in self._lines.items() if name in names}
-        self._counters = {
-            name: _Counters() if name in began else self._counters.get(name, _Counters()) for name in names
-        }
+        self._counters = {name: MonitorRow(name) if name in began else self._counter(name) for name in names}
 
     def shows(self, point: ObservationPoint) -> bool:
         return point not in self._second.shown
@@ -404,23 +395,16 @@ class Observer:
     def rows(self, monitors: MonitorSet, time: int) -> list[MonitorRow]:
         self._sum_up(time)
         return [
-            MonitorRow(
-                monitor.name,
-                monitor.code.file,
-                monitor.enabled,
-                monitor.held,
-                monitor.failing,
-                (counters := self._counter(monitor.name)).events,
-                counters.verdicts,
-                counters.drops,
-                counters.changes,
-                monitor.faults,
-                bool(self._prefix),
-                counters.missed,
-                monitor.slices.live if monitor.slices is not None else 0,
-                monitor.slices.limit if monitor.slices is not None else 0,
-                not self._prefix and monitors.withholds(monitor),
-                monitor.awaits,
+            replace(
+                self._counter(monitor.name),
+                file=monitor.code.file,
+                failing=monitor.failing,
+                faults=monitor.faults,
+                shadow=bool(self._prefix),
+                slices=monitor.slices.live if monitor.slices is not None else 0,
+                slice_limit=monitor.slices.limit if monitor.slices is not None else 0,
+                withholds=not self._prefix and monitors.withholds(monitor),
+                awaits=monitor.awaits,
             )
             for monitor in (monitors.shadowed if self._prefix else monitors.monitors)
         ]
@@ -462,8 +446,8 @@ class Observer:
         point = self.senders.point(source)
         return {} if point is None else {"node": point.caller_id, "host": point.host, "on": point.resource}
 
-    def _counter(self, monitor: str) -> _Counters:
-        return self._counters.setdefault(monitor, _Counters())
+    def _counter(self, monitor: str) -> MonitorRow:
+        return self._counters.setdefault(monitor, MonitorRow(monitor))
 
 
 def dropped(body: memoryview, now: int, reason: str) -> Outcome:

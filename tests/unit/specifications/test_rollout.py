@@ -242,7 +242,7 @@ async def test_held_monitors_and_rows_of_both(fleet: Fleet) -> None:
     rollout = fleet.rollout
 
     def row(name: str, events: int) -> messages.MonitorRow:
-        return messages.MonitorRow(name, f"{name}.rv", True, False, False, events, 0, 0, 0, 0)
+        return messages.MonitorRow(name, f"{name}.rv", events=events)
 
     rollout.received(messages.SpecificationsTaken(1, ["a"], ["a"]), 0)
     rollout.received(messages.SpecificationsTaken(1, ["b"], ["b"]), 1)

@@ -95,10 +95,6 @@ def act(monitors: SpecificationManager, kind: str = "change", second: int = 0) -
     monitors.received(MonitorsReported([event]))
 
 
-def counted(**changes: Any) -> MonitorRow:
-    return MonitorRow("fence", "fence.rv", True, False, False, 0, 0, 0, 0, 0, **changes)
-
-
 def given(monitors: SpecificationManager) -> dict[str, object]:
     return {state.name: state.value for state in monitors.givens.states(monitors.checked, "fence")}
 
@@ -160,7 +156,7 @@ async def test_a_guard_has_its_last_stop(monitors: SpecificationManager, orders:
 async def test_a_guard_is_withholding_while_its_relay_says_so(
     monitors: SpecificationManager, orders: GuardOrders
 ) -> None:
-    monitors.received(MonitorsCounted([counted(withholds=True)]))
+    monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv", withholds=True)]))
     assert (await row(orders)).state == "withholding"
 
 
@@ -196,7 +192,7 @@ async def test_each_change_of_a_guard_is_recorded_with_its_digest(monitors: Spec
 async def test_a_guard_names_the_nodes_that_it_awaits(
     monitors: SpecificationManager, orders: GuardOrders
 ) -> None:
-    monitors.received(MonitorsCounted([counted(awaits="/lidar on /scan")]))
+    monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv", awaits="/lidar on /scan")]))
     assert (await row(orders)).awaits == "/lidar on /scan"
 
 
