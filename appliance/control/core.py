@@ -15,6 +15,7 @@ from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Graph
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.answers.status import ProcessInfo, Status
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.link import Link
 from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import Settings
@@ -34,7 +35,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
 from appliance.control.operators.request_method import RequestMethod
-from appliance.control.operators.token_orders import Session, Sessions
+from appliance.control.operators.token_orders import Sessions
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.policy.judgement import PolicyContext
@@ -272,7 +273,7 @@ class Bearers:
     changed: Callable[[], None]
     sessions: Provided[Sessions]
 
-    def people(self) -> list[Session]:
+    def people(self) -> list[SignedOn]:
         """Return the sessions of people."""
         sessions = self.sessions()
         found = [] if sessions is None else [sessions.of(row.id) for row in sessions.rows()]

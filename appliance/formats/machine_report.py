@@ -12,6 +12,7 @@ from typing import NamedTuple
 import msgspec
 
 from appliance.audit.log.record_format import LogEntry, rfc3339
+from appliance.audit.proof.chain_findings import VerificationResult
 from appliance.formats.interventions import GAPS, Intervention, Interventions, ReadRow
 
 _SECOND = 1_000_000_000
@@ -47,20 +48,6 @@ class MachineInterface(msgspec.Struct, frozen=True, kw_only=True):
     where: str
     commands: str
     protection: str
-
-
-class VerificationResult(msgspec.Struct, frozen=True, kw_only=True):
-    """The last stored result of `rosrv audit verify`, which is not part of the report's own work.
-
-    `through` is the sequence of the last record that it read, of the log `log`.
-    """
-
-    time_utc: str
-    complete: bool
-    records: int
-    text: str
-    log: str = ""
-    through: int = 0
 
 
 class ReportedLog(msgspec.Struct, frozen=True, kw_only=True):

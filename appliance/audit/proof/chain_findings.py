@@ -103,3 +103,17 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     other_logs: Annotated[
         list[OtherLog], msgspec.Meta(description="ids of other logs that the copies belong to")
     ] = []
+
+
+class VerificationResult(msgspec.Struct, frozen=True, kw_only=True):
+    """The last stored result of `rosrv audit verify`, which is not part of the report's own work.
+
+    `through` is the sequence of the last record that it read, of the log `log`.
+    """
+
+    time_utc: str
+    complete: bool
+    records: int
+    text: str
+    log: str = ""
+    through: int = 0

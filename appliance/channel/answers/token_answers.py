@@ -64,3 +64,15 @@ class Challenge(msgspec.Struct, frozen=True):
 
     challenge: Annotated[str, doc("the text under which the next order is signed")]
     seconds: Annotated[float, doc("seconds for which it is valid, for one order")]
+
+
+class SignedOn(msgspec.Struct, frozen=True):
+    """A session of a person; `mail` is empty unless the provider has verified it."""
+
+    id: Annotated[str, doc("id of the session")]
+    name: Annotated[str, doc("name of the person in the audit log")]
+    subject: Annotated[str, doc("permanent identifier of the person at the provider (`sub`)")]
+    mail: Annotated[str, doc("verified e-mail address, or empty without one")]
+    role: Annotated[TokenRole, doc("role, which decides its rights")]
+    groups: Annotated[list[str], doc("groups of doors")]
+    expires: Moment

@@ -9,23 +9,12 @@ from pathlib import Path
 import msgspec
 
 from appliance.audit.log.record_format import rfc3339
-from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.chain_findings import Verification, VerificationResult
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 
 _NAME = "verified.json"
 _MODE = 0o640
-
-
-class LastVerification(msgspec.Struct, frozen=True, kw_only=True):
-    """A result with its date; `complete` if nothing was wrong with the log up to the sequence `through`."""
-
-    time_utc: str
-    complete: bool
-    records: int
-    text: str
-    log: str = ""
-    through: int = 0
 
 
 def keep_verification(log: Path, result: Verification, seconds: float) -> None:
@@ -34,7 +23,7 @@ def keep_verification(log: Path, result: Verification, seconds: float) -> None:
         f"records {result.first} to {result.last}, signed through {result.signed_through}, in {seconds:.0f} s"
     ]
     parts += [finding.message for finding in result.findings[:3]]
-    kept = LastVerification(
+    kept = VerificationResult(
         time_utc=rfc3339(clock.wall_ns()), complete=result.ok, records=result.records, text="; ".join(parts),
         log=result.log, through=result.last,
     )  # fmt: skip
@@ -43,9 +32,9 @@ def keep_verification(log: Path, result: Verification, seconds: float) -> None:
         write_whole(log.parent / _NAME, msgspec.json.encode(kept), _MODE, (owner.st_uid, owner.st_gid))
 
 
-def last_verification(log: Path) -> LastVerification | None:
+def last_verification(log: Path) -> VerificationResult | None:
     """Return the stored result, or null without a readable one."""
     try:
-        return msgspec.json.decode((log.parent / _NAME).read_bytes(), type=LastVerification)
+        return msgspec.json.decode((log.parent / _NAME).read_bytes(), type=VerificationResult)
     except (OSError, ValueError):
         return None

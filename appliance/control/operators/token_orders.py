@@ -6,12 +6,12 @@ never replaces the token with its id.
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol, cast
+from typing import Protocol, cast
 
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
-from appliance.channel.answers.token_answers import TokenRole
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import TokenRefusedError
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
@@ -25,29 +25,13 @@ from appliance.telemetry.audit_trail import AuditTrail
 # A session is a token that a person's browser made for itself, so roles, quotas, orders and records treat both alike.
 
 
-class Session(NamedTuple):
-    """A person who is signed in.
-
-    `subject` is the provider's permanent identifier, and `mail` empty unless it is verified. `groups` select the
-    person's door.
-    """
-
-    id: str
-    name: str
-    subject: str
-    mail: str
-    role: TokenRole
-    groups: tuple[str, ...]
-    expires: float
-
-
 class Sessions(Protocol):
     """The sessions of this control process; they end with it."""
 
     def rows(self) -> list[TokenRow]:
         """Return the usable sessions as rows of tokens."""
 
-    def of(self, session_id: str) -> Session | None:
+    def of(self, session_id: str) -> SignedOn | None:
         """Return the session, or None if it has ended."""
 
 

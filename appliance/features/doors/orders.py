@@ -10,11 +10,11 @@ import structlog
 
 from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.limit_answers import LimitUse
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.messages import OwnHeaderStated, OwnPublished
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.core import Core, RelayOrders
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
-from appliance.control.operators.token_orders import Session
 from appliance.features.doors import requests as door_requests
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import DoorProcesses
@@ -72,7 +72,7 @@ class CallerDoor(NamedTuple):
 class OwnDoors:
     """The doors of all callers; `people()` returns the sessions of people."""
 
-    def __init__(self, table: DoorTable, people: Callable[[], Iterable[Session]]) -> None:
+    def __init__(self, table: DoorTable, people: Callable[[], Iterable[SignedOn]]) -> None:
         self._table = table
         self._people = people
 

@@ -35,7 +35,6 @@ from appliance.formats.machine_report import (
     Period,
     Reading,
     ReportedLog,
-    VerificationResult,
     read_records,
 )
 from appliance.formats.report_words import page, report_lines
@@ -271,13 +270,8 @@ def _reported(name: str, log: Log) -> ReportedLog:
     return ReportedLog(
         name=name, id=at_hand.present() if at_hand is not None else "",
         begins_utc=rfc3339(first[0].record.time) if first else "",
-        last=log.last(), verification=_verification(at_hand) if at_hand is not None else None,
+        last=log.last(), verification=last_verification(at_hand.path) if at_hand is not None else None,
     )  # fmt: skip
-
-
-def _verification(log: FileLog) -> VerificationResult | None:
-    stored = last_verification(log.path)
-    return None if stored is None else msgspec.convert(msgspec.to_builtins(stored), VerificationResult)
 
 
 def _end_of(file: Path) -> int:

@@ -238,17 +238,6 @@ _LENGTH = struct.Struct("<I")
 _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
 
-class TopicCount(msgspec.Struct):
-    """The count of one topic and type."""
-
-    topic: str
-    type: str
-    md5sum: str
-    messages: int = 0
-    bytes: int = 0
-    missed: int = 0
-
-
 class Progress(msgspec.Struct):
     """The progress of a recording; times are nanoseconds since the epoch."""
 
@@ -266,7 +255,7 @@ class Progress(msgspec.Struct):
     """For each ring, the number of each stream's next message."""
     not_there: list[tuple[int, int]] = []
     """For each ring, the losses before the recording."""
-    topics: list[TopicCount] = []
+    topics: list[RecordedTopic] = []
     torn: list[str] = []
     unconnected: int = 0
     """The number of messages left out because headers exceed `_MOST_HEADERS`."""
@@ -338,7 +327,7 @@ class RecordingInProgress:
         connection = self._connection(header)
         row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
         if row is None:
-            row = self._topics[kind] = TopicCount(*kind)
+            row = self._topics[kind] = RecordedTopic(*kind, 0, 0, 0)
             progress.topics.append(row)
         waiting: list[BagMessage] = []
         size = 0
@@ -396,7 +385,7 @@ class RecordingInProgress:
             began=progress.began,
             ended=progress.ends,
             triggers=progress.triggers,
-            topics=[RecordedTopic(**msgspec.structs.asdict(row)) for row in progress.topics],
+            topics=list(progress.topics),
             policy=revisions.policy,
             monitors=revisions.monitors,
             size=bag.stat().st_size,

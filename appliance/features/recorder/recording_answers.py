@@ -33,7 +33,7 @@ class Trigger(msgspec.Struct, frozen=True):
     ] = ""
 
 
-class RecordedTopic(msgspec.Struct, frozen=True):
+class RecordedTopic(msgspec.Struct):
     """The part of a recording with one topic of one type."""
 
     topic: Name

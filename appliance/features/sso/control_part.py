@@ -5,12 +5,12 @@ from typing import NamedTuple, TypeVar
 
 from appliance.base import clock
 from appliance.channel import messages
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.control.core import ControlPart, Core
 from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
-from appliance.control.operators.token_orders import Session
 from appliance.features.sso import requests
 from appliance.features.sso.feature import ROLE
 from appliance.features.sso.identity import name_of
@@ -45,7 +45,7 @@ _MOST, _MOST_OF_PERSON = SESSIONS.bounds.whole, SESSIONS.bounds.host
 
 
 class _Kept(NamedTuple):
-    session: Session
+    session: SignedOn
     row: TokenRow
 
 
@@ -61,13 +61,13 @@ class SessionTable:
     def rows(self) -> list[TokenRow]:
         return [kept.row for kept in self._usable()]
 
-    def sessions(self) -> list[Session]:
+    def sessions(self) -> list[SignedOn]:
         return [kept.session for kept in self._usable()]
 
-    def of(self, session_id: str) -> Session | None:
+    def of(self, session_id: str) -> SignedOn | None:
         return next((one for one in self.sessions() if one.id == session_id), None)
 
-    def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[Session, list[Session]]:
+    def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[SignedOn, list[SignedOn]]:
         name, now = f"{_PREFIX}{identity.name}", clock.wall()
         present = self.sessions()
         if any(one.id == keys.id for one in present):
@@ -76,7 +76,7 @@ class SessionTable:
             raise TokenRefusedError(
                 f"another person is signed in as {name}: choose a claim for sso.name_claim that identifies people"
             )
-        rights = identity.role, identity.doors
+        rights = identity.role, list(identity.doors)
         own = [one for one in present if one.subject == identity.subject]
         ended = [one for one in own if (one.role, one.groups) != rights]
         staying = [one for one in own if one not in ended]
@@ -84,9 +84,7 @@ class SessionTable:
         if len(present) - len(ended) >= _MOST:
             raise TokenRefusedError(f"{_MOST} people's sessions are open: end some (rosrv sso end NAME)")
         self._drop(*(one.id for one in ended))
-        session = Session(
-            keys.id, name, identity.subject, identity.mail, identity.role, identity.doors, identity.ends
-        )
+        session = SignedOn(keys.id, name, identity.subject, identity.mail, *rights, identity.ends)
         # No hash: a session has only keys, and its token is never sent.
         row = TokenRow(
             keys.id,
@@ -103,14 +101,14 @@ class SessionTable:
         self._kept[keys.id] = _Kept(session, row)
         return session, ended
 
-    def end(self, session_id: str, who: str) -> Session:
+    def end(self, session_id: str, who: str) -> SignedOn:
         found = self.of(session_id)
         if found is None or found.name != who:
             raise UnknownThingError("this is not a session of yours")
         self._drop(session_id)
         return found
 
-    def end_all(self, name: str) -> list[Session]:
+    def end_all(self, name: str) -> list[SignedOn]:
         spellings = {name, *(f"{_PREFIX}{one}" for one in (name, name_of(name)))}
         ended = [one for one in self.sessions() if one.name in spellings]
         if not ended:
@@ -155,7 +153,7 @@ class SsoOrders:
         )
         return requests.SignOnPlace(begun.url, begun.state)
 
-    async def complete(self, request: requests.SignOnComplete) -> requests.SignedOn:
+    async def complete(self, request: requests.SignOnComplete) -> SignedOn:
         try:
             found = await self._ask(
                 lambda number: SignOnReturned(number, request.state, request.code, request.issuer),
@@ -180,31 +178,31 @@ class SsoOrders:
             subject=session.subject,
             mail=session.mail,
             role=session.role,
-            groups=list(session.groups),
+            groups=session.groups,
             id=session.id,
             expires=session.expires,
             began_at=found.address,
         )
         self._changed()
-        return _shown(session)
+        return session
 
     async def listed(self, _request: requests.SessionsWanted) -> requests.SignedOnList:
-        return requests.SignedOnList([_shown(one) for one in self.sessions.sessions()])
+        return requests.SignedOnList(self.sessions.sessions())
 
-    async def sign_out(self, request: requests.SignOut, who: str) -> requests.SignedOn:
+    async def sign_out(self, request: requests.SignOut, who: str) -> SignedOn:
         session = self.sessions.end(request.session, who)
         self._ended(session, who, "signed out")
         self._changed()
-        return _shown(session)
+        return session
 
     async def end(self, request: requests.SessionsEnd, who: str) -> requests.SignedOnList:
         ended = self.sessions.end_all(request.name)
         for one in ended:
             self._ended(one, who, f"was signed out by {who}")
         self._changed()
-        return requests.SignedOnList([_shown(one) for one in ended])
+        return requests.SignedOnList(ended)
 
-    def _ended(self, session: Session, who: str, how: str) -> None:
+    def _ended(self, session: SignedOn, who: str, how: str) -> None:
         self._trail.happened(
             "signed off",
             f"{session.name} {how}",
@@ -213,7 +211,7 @@ class SsoOrders:
             name=session.name,
             subject=session.subject,
             role=session.role,
-            groups=list(session.groups),
+            groups=session.groups,
             id=session.id,
         )
 
@@ -241,18 +239,6 @@ class SsoOrders:
             self.link.answered(message.number, message)
         else:
             self.link.close()
-
-
-def _shown(session: Session) -> requests.SignedOn:
-    return requests.SignedOn(
-        session.id,
-        session.name,
-        session.subject,
-        session.mail,
-        session.role,
-        list(session.groups),
-        session.expires,
-    )
 
 
 _LONGEST = 1 << 16

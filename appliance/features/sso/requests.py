@@ -5,8 +5,8 @@ from typing import Annotated
 import msgspec
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
-from appliance.channel.answers.field_docs import Moment, doc
-from appliance.channel.answers.token_answers import TokenRole
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.rest_operation import parameter, rest
 from appliance.features.sso.link import SessionKeys
 
@@ -19,18 +19,6 @@ class SignOnPlace(msgspec.Struct, frozen=True):
 
     url: Annotated[str, doc("address at the provider, to which the browser goes")]
     state: Annotated[str, doc("value with which the browser returns")]
-
-
-class SignedOn(msgspec.Struct, frozen=True):
-    """A session of a person; `mail` is empty unless the provider has verified it."""
-
-    id: Annotated[str, doc("id of the session")]
-    name: Annotated[str, doc("name of the person in the audit log")]
-    subject: Annotated[str, doc("permanent identifier of the person at the provider (`sub`)")]
-    mail: Annotated[str, doc("verified e-mail address, or empty without one")]
-    role: Annotated[TokenRole, doc("role, which decides its rights")]
-    groups: Annotated[list[str], doc("groups of doors")]
-    expires: Moment
 
 
 class SignedOnList(msgspec.Struct, frozen=True):

@@ -22,9 +22,10 @@ from appliance.api.front.services import Services
 from appliance.api.front.streams import peer_of
 from appliance.base import clock
 from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.sso.link import SessionKeys
-from appliance.features.sso.requests import SignedOn, SignOnBegin, SignOnComplete, SignOnPlace
+from appliance.features.sso.requests import SignOnBegin, SignOnComplete, SignOnPlace
 
 # Limit the sign-ons of each address, and those that run at once.
 #

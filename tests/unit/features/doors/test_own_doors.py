@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
-from appliance.control.operators.token_orders import Session
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.orders import OwnDoors
@@ -14,8 +14,8 @@ from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
 
-def person(name: str, *groups: str) -> Session:
-    return Session(name, f"sso:{name}", f"subject of {name}", "", "operator", groups, 0.0)
+def person(name: str, *groups: str) -> SignedOn:
+    return SignedOn(name, f"sso:{name}", f"subject of {name}", "", "operator", [*groups], 0.0)
 
 
 PEOPLE = [person("bob", "Floor 1", "hall", "floor"), person("alice", "hall"), person("agent-1")]

@@ -9,6 +9,7 @@ import pytest
 from appliance.audit.log.events import EVENTS
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, rfc3339
+from appliance.audit.proof.chain_findings import VerificationResult
 from appliance.features.logbook.log_source import origin_of
 from appliance.formats.interventions import (
     CHANGES,
@@ -29,7 +30,6 @@ from appliance.formats.machine_report import (
     Period,
     Reading,
     ReportedLog,
-    VerificationResult,
     merged,
     read_records,
 )

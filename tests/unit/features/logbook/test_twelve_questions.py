@@ -8,6 +8,7 @@ import pytest
 
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
+from appliance.audit.proof.chain_findings import VerificationResult
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Token, Tokens
@@ -16,7 +17,6 @@ from appliance.formats.machine_report import (
     MachineReport,
     Period,
     ReportedLog,
-    VerificationResult,
     merged,
     read_records,
 )

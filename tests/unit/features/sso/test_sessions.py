@@ -5,6 +5,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel.admin import PolicyReload, StatusWanted, TokenAdd
+from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.messages.api import RequestMade
 from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.token_orders import TokenOrders
@@ -59,7 +60,7 @@ class World:
             raise self.answer
         return self.answer
 
-    async def sign_on(self, number: int, person: SignedInPerson | None = None) -> requests.SignedOn:
+    async def sign_on(self, number: int, person: SignedInPerson | None = None) -> SignedOn:
         self.answer = SignOnConfirmed(1, person or _person(), _keys(number), "10.0.0.9")
         return await self.sso.complete(requests.SignOnComplete("s", "c", "", "10.0.0.9"))
 
@@ -73,16 +74,15 @@ def world(tmp_path: Path) -> World:
 
 
 async def test_a_session_has_the_rights_of_its_role_and_is_recorded(world: World) -> None:
-    await world.sign_on(1, _person(doors=("floor",)))
+    session = await world.sign_on(1, _person(doors=("floor",)))
     shown = reading_key(_token(1))
     assert await world.checks.asker(RequestMade(1, StatusWanted(), shown)) == "sso:alice"
     with pytest.raises(UnprovenError, match="an order without its HTTP request"):
         await world.checks.asker(RequestMade(2, PolicyReload(), shown))
     with pytest.raises(UnprovenError, match="this is for admins; the token sso:alice has the role operator"):
         await world.checks.asker(RequestMade(3, requests.SessionsWanted(), shown))
-    session = world.sso.sessions.of(f"{1:012x}")
-    assert session is not None
-    assert (session.name, session.role, session.groups) == ("sso:alice", "operator", ("floor",))
+    assert world.sso.sessions.of(f"{1:012x}") == session
+    assert (session.name, session.role, session.groups) == ("sso:alice", "operator", ["floor"])
     detail, *_more = [row for row in world.trail.rows if row["event"] == "signed on"]
     assert (detail["event"], detail["who"], detail["subject"], detail["host"]) == (
         "signed on",
