@@ -9,7 +9,7 @@ import os
 import socket
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -200,23 +200,12 @@ class _Change:
     reason: str = ""
 
 
-@dataclass(slots=True)
-class _Totals:
-    received: int = 0
-    sent: int = 0
-    dropped: int = 0
-    received_bytes: int = 0
-    sent_bytes: int = 0
-    refusals: int = 0
-
-    def add(self, client: CountedClient) -> None:
-        session = client.session
-        self.received += session.received
-        self.sent += session.sent
-        self.dropped += client.dropped
-        self.received_bytes += session.received_bytes
-        self.sent_bytes += session.sent_bytes
-        self.refusals += session.refusals
+def _counts_of(client: CountedClient) -> Counter[str]:
+    session = client.session
+    return Counter(
+        received=session.received, sent=session.sent, dropped=client.dropped, refusals=session.refusals,
+        received_bytes=session.received_bytes, sent_bytes=session.sent_bytes,
+    )  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -251,7 +240,7 @@ class DoorProcess:
         self._tickets: Counter[str] = Counter()  # connections that control passed on, until they end
         self._shown: list[door_link.ClientShown] = []
         self._changes: dict[tuple[str, str], _Change] = {}
-        self._totals = _Totals()
+        self._totals = Counter[str]()
         self._counted = door_link.DoorCounted()
         self._tasks = OwnedTasks()
 
@@ -384,7 +373,7 @@ class DoorProcess:
         self._started.set()
 
     def _skip(self) -> None:
-        self._totals.dropped += 1
+        self._totals["dropped"] += 1
 
     def _shut_down(self, reason: str) -> None:
         self._failure = f"the master ended the node of the door: {reason}"
@@ -453,7 +442,7 @@ class DoorProcess:
             await session.run()
         finally:
             self._clients.discard(client)
-            self._totals.add(client)
+            self._totals.update(_counts_of(client))
             (self._ended if session.began else self._refused)(peer, ticket, session.end)
 
     # --- reports ---
@@ -511,11 +500,9 @@ class DoorProcess:
             client.sample()
 
     def _counts(self) -> door_link.DoorCounted:
-        totals = replace(self._totals)
-        for client in self._clients:
-            totals.add(client)
+        totals = sum(map(_counts_of, self._clients), self._totals)
         refused = self._connections.refused if self._connections is not None else 0
-        return door_link.DoorCounted(connections=len(self._clients), refused=refused, **asdict(totals))
+        return door_link.DoorCounted(connections=len(self._clients), refused=refused, **totals)
 
 
 def _protocol(
