@@ -6,7 +6,8 @@ from types import MappingProxyType
 
 import msgspec
 
-from appliance.channel.messages import Contents, GivenDeclared, PartNames, StateOwner
+from appliance.channel.answers.monitor_answers import GivenState
+from appliance.channel.messages import Contents, PartNames, StateOwner
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -105,15 +106,15 @@ def contents(
     )
 
 
-def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
+def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenState]:
     code = monitors.monitor(name).code
     for given in code.givens:
         kind = "bool" if given.bounds is None else "int" if isinstance(given.default, int) else "double"
-        yield GivenDeclared(
-            given.name, kind, given.default, given.default, given.unit, *(given.bounds or (None, None))
+        yield GivenState(
+            given.name, kind, given.default, given.unit, given.default, *(given.bounds or (None, None))
         )
     for topic in code.given_topics:
-        yield GivenDeclared(topic.name, "topic", topic.topic, topic.default)
+        yield GivenState(topic.name, "topic", topic.topic, "", topic.default)
 
 
 def contents_at_start(

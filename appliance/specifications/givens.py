@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from appliance.channel.answers.monitor_answers import GivenState
-from appliance.channel.messages import GivenDeclared, GivenValue
+from appliance.channel.messages import GivenValue
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 
 Given = Mapping[str, Mapping[str, GivenValue]]
@@ -68,16 +70,11 @@ class Givens:
 
     def states(self, checked: CheckedSpecifications, monitor: str) -> list[GivenState]:
         said = self.said.get(monitor, {})
-        return [
-            GivenState(
-                one.name, one.kind, said.get(one.name, one.value), one.unit, one.default, one.least, one.most
-            )
-            for one in checked.givens.get(monitor, ())
-        ]
+        return [replace(one, value=said.get(one.name, one.value)) for one in checked.givens.get(monitor, ())]
 
 
 def parsed(
-    declared: tuple[GivenDeclared, ...], monitor: str, values: Mapping[str, GivenValue]
+    declared: tuple[GivenState, ...], monitor: str, values: Mapping[str, GivenValue]
 ) -> dict[str, GivenValue]:
     """Return the values to set. Raises `SpecificationsRefusedError` with all errors."""
     known = {one.name: one for one in declared}
@@ -129,7 +126,7 @@ def require_topics(topics: Mapping[str, Mapping[str, str]], checked: CheckedSpec
         raise SpecificationsRefusedError(findings)
 
 
-def _value(declared: GivenDeclared, value: GivenValue) -> GivenValue | None:
+def _value(declared: GivenState, value: GivenValue) -> GivenValue | None:
     if declared.kind == "bool":
         words = {"true": True, "false": False}
         found = words.get(value) if isinstance(value, str) else value
@@ -152,11 +149,11 @@ def _value(declared: GivenDeclared, value: GivenValue) -> GivenValue | None:
     return number if least is not None and most is not None and least <= number <= most else None
 
 
-def _holds(declared: GivenDeclared, values: Mapping[str, GivenValue]) -> bool:
+def _holds(declared: GivenState, values: Mapping[str, GivenValue]) -> bool:
     return declared.kind != _TOPIC and _value(declared, values[declared.name]) is not None
 
 
-def _allowed(declared: GivenDeclared) -> str:
+def _allowed(declared: GivenState) -> str:
     unit = f" {declared.unit}" if declared.unit else ""
     if declared.kind == "bool":
         return "is not true or false"

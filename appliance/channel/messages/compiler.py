@@ -4,6 +4,7 @@ from typing import Literal
 
 import msgspec
 
+from appliance.channel.answers.monitor_answers import GivenState
 from appliance.channel.messages.message import Message
 
 
@@ -19,21 +20,6 @@ GivenValue = bool | int | float | str
 """The value of a given constant, or a string with the name of a given topic."""
 
 
-class GivenDeclared(msgspec.Struct, frozen=True):
-    """A constant (`kind` is `int`, `double` or `bool`) or a `topic` that is given to a monitor.
-
-    `value` is the value in the compiled text, which for a topic may differ from the default.
-    """
-
-    name: str
-    kind: str
-    value: GivenValue
-    default: GivenValue
-    unit: str = ""
-    least: int | float | None = None
-    most: int | float | None = None
-
-
 class Contents(msgspec.Struct, frozen=True):
     """The contents of valid specifications: monitors (name to file), and what they use.
 
@@ -44,7 +30,8 @@ class Contents(msgspec.Struct, frozen=True):
 
     `unbuilt` has the monitors of files with errors. They do nothing; the relay holds their topics. `left_out` has the
     files whose topics are not known; nothing holds their topics. `switches` has the words `on`, `shadow` and `off` of
-    monitors whose files have one.
+    monitors whose files have one. `givens` has the values in the compiled texts; that of a topic may differ from its
+    default.
     """
 
     monitors: dict[str, str] = {}
@@ -62,7 +49,7 @@ class Contents(msgspec.Struct, frozen=True):
     unbuilt: dict[str, str] = {}
     states: dict[str, StateOwner] = {}
     left_out: dict[str, str] = {}
-    givens: dict[str, tuple[GivenDeclared, ...]] = {}
+    givens: dict[str, tuple[GivenState, ...]] = {}
     switches: dict[str, Literal["on", "shadow", "off"]] = {}
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.messages import GivenDeclared
+from appliance.channel.answers.monitor_answers import GivenState
 from appliance.specifications.givens import Givens
 from appliance.specifications.in_force import InForce, Wanted, cleared, given, loaded, switched
 from appliance.specifications.specification_files import (
@@ -14,7 +14,7 @@ from appliance.specifications.specification_files import (
 )
 from appliance.specifications.switches import SHADOW, Switches
 
-SPEED = GivenDeclared("speed", "double", 1.0, 1.0, "m/s", 0.0, 2.0)
+SPEED = GivenState("speed", "double", 1.0, "m/s", 1.0, 0.0, 2.0)
 
 
 def checked(*names: str, sharing: tuple[tuple[str, ...], ...] = ()) -> CheckedSpecifications:
@@ -98,7 +98,7 @@ def test_nothing_is_kept_about_what_is_not_in_force() -> None:
 
 
 def test_a_site_that_signs_lets_no_load_replace_a_topic() -> None:
-    topic = GivenDeclared("t", "topic", "/x", "/x")
+    topic = GivenState("t", "topic", "/x", "", "/x")
     contents = CheckedSpecifications(monitors={"a": "a.rv"}, givens={"a": (topic,)})
     wanted = Wanted(sources("a"), topics={"a": {"t": "/y"}})
     with pytest.raises(SpecificationsRefusedError, match="the site signs"):
