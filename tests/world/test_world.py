@@ -5,7 +5,7 @@ from tests.world.mutants import MUTANTS, NOT_SEEN, PAIR_MUTANTS, first_broken
 from tests.world.pair import PairWorld
 from tests.world.world import World, run
 
-_AT_GATE, _PAIRS_AT_GATE = 50, 5
+_AT_GATE, _PAIRS_AT_GATE = 25, 5
 _AT_NIGHT, _PAIRS_AT_NIGHT = 1500, 250
 _IN_ONE_CASE = 5
 
