@@ -45,7 +45,7 @@ class Client:
         return requested(self._app, "GET", path, headers=headers)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def client() -> Client:
     return Client(Settings())
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from rosmop.tests.acting import message
-from rosmop.tests.examples import examples
+from rosmop.tests.examples import examples, sample
 from tests.unit.features.guards.guarding import (
     Guarded,
     legs_of,
@@ -147,7 +147,7 @@ def test_a_fast_base_does_not_drive_across_a_thin_part_outside(
 ) -> None:
     """A line that no base may cross is a thin notch of the polygon, beside the places that the guard looks at."""
     polygon = f"0,0 20,0 20,8 {20 + thick},8 {20 + thick},0 40,0 40,10 0,10"
-    for begin in (5.0, 11.3, 19.0):
+    for begin in sample((5.0, 11.3, 19.0)):
         guard, x, v = Guarded("fence", margin=margin, ahead=ahead, polygon=polygon), begin, 0.0
         for at in range(0, 8000, 10):
             if at % 100 == 0:
