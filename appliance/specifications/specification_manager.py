@@ -207,7 +207,7 @@ class SpecificationManager:
         return list(self.checked.monitors)
 
     def lasting(self, name: str) -> Word:
-        """Return the switch of a monitor without one that ends automatically, as its file says it."""
+        """Return the switch that a monitor's file gives it, without a switch that ends automatically."""
         return word_of(self.returns.lasting(name, self.switches.states[name]))
 
     def afresh(self, name: str) -> Word | None:

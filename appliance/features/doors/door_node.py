@@ -557,7 +557,7 @@ class DoorNode:
         return present if own is None else [*present, own.type.key]
 
     async def _prefer_robot(self, heard: HeardTopic[_Subscriber], header: Mapping[str, str]) -> None:
-        """Let the type of this header count if its publisher, unlike the one that counts, is on the robot's machine."""
+        """Take this header's type if its publisher, but not that of the present type, is on the robot's machine."""
         counts = heard.header
         if counts is None or self._types.defines(self._types.key(counts)):
             return
