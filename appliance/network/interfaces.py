@@ -14,11 +14,9 @@ from typing import Any, Protocol, TypeVar
 
 from appliance.network.namespaces import Namespace, NetworkError
 
-# Load the library for netlink when a network is first changed: it has 200 modules, and most verbs change none.
 
-
-def loaded() -> ModuleType:
-    import pyroute2  # noqa: PLC0415  see the head
+def netlink_library() -> ModuleType:
+    import pyroute2  # noqa: PLC0415  200 modules, and most verbs change no network
 
     module: ModuleType = pyroute2
     return module
@@ -269,7 +267,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Netlink], T]) -> T:
-    pyroute2 = loaded()
+    pyroute2 = netlink_library()
 
     def inside() -> T:
         with pyroute2.IPRoute() as route:

@@ -61,9 +61,9 @@ from appliance.network.public_address import PublicAddress, outward_address
 _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
-def forget(namespace: Namespace, ports: Iterable[int]) -> int:
+def forget_tracked(namespace: Namespace, ports: Iterable[int]) -> int:
     """Delete the entries of the namespace's own addresses; return their number. Raises `NetworkError`."""
-    pyroute2 = interfaces.loaded()
+    pyroute2 = interfaces.netlink_library()
     own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
     try:
         return namespace.run(
@@ -74,7 +74,7 @@ def forget(namespace: Namespace, ports: Iterable[int]) -> int:
 
 
 def _forget(family: int, port: int, own: set[str]) -> int:
-    pyroute2 = interfaces.loaded()
+    pyroute2 = interfaces.netlink_library()
     tuples = pyroute2.netlink.nfnetlink.nfctsocket.NFCTAttrTuple
     wanted = tuples(family=family, proto=socket.IPPROTO_UDP, dport=port)
     deleted = 0
@@ -397,7 +397,7 @@ class Isolation:
             vendor_masters.leave_alone(self._host, self.settings.left_alone())
 
     def _forget_tunnels(self) -> None:
-        forget(self._host, [port.first for port in _TUNNELS])
+        forget_tracked(self._host, [port.first for port in _TUNNELS])
 
     def _build(self) -> None:
         settings, inside = self.settings, self.namespace
