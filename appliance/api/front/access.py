@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import cast
 
 from appliance.api.front.problems import ProblemError, too_many
+from appliance.api.front.rates import Buckets, peer_key
 from appliance.base import clock
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
@@ -26,67 +27,6 @@ from appliance.quotas.pool import QuotaClass
 from appliance.signing.bearer_secrets import is_hash_of
 from appliance.signing.request_signing import reading_id
 from appliance.store.access_tokens import is_secret, parse_token
-
-# Limit the rate of each peer with token buckets. No I/O; the time is a parameter.
-#
-# A new bucket replaces the least recently used one, so a flood from many addresses gains at most one burst for each.
-# An
-# IPv6 peer counts by its /64 network, because one host can use all addresses of that network.
-
-_V6_PREFIX = 64
-
-
-def peer_key(host: str) -> str:
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return host
-    if address.version == 4 or address.is_loopback:
-        return host
-    if address.ipv4_mapped is not None:
-        return str(address.ipv4_mapped)
-    return str(ipaddress.ip_network((address, _V6_PREFIX), strict=False))
-
-
-class Buckets:
-    """Token buckets that permit `burst` requests at once and `per_second` on average."""
-
-    def __init__(self, per_second: float, burst: float, *, peers: int = 4096) -> None:
-        self._per_second = per_second
-        self._burst = burst
-        self._peers = peers
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    def take(self, host: str, now: float) -> float:
-        left = self._left(host, now)
-        if left < 1:
-            self._keep(host, left, now)
-            return (1 - left) / self._per_second
-        self._keep(host, left - 1, now)
-        return 0.0
-
-    def give_back(self, host: str, now: float) -> None:
-        self._keep(host, min(self._burst, self._left(host, now) + 1), now)
-
-    def wait(self, host: str, now: float) -> float:
-        """Return the seconds until `take` succeeds, without taking a token."""
-        left = self._left(host, now)
-        return 0.0 if left >= 1 else (1 - left) / self._per_second
-
-    def touched(self, host: str, now: float) -> bool:
-        return self._left(host, now) < self._burst
-
-    def _left(self, host: str, now: float) -> float:
-        left, then = self._buckets.get(peer_key(host), (self._burst, now))
-        return min(self._burst, left + max(0.0, now - then) * self._per_second)
-
-    def _keep(self, host: str, left: float, now: float) -> None:
-        key = peer_key(host)
-        self._buckets[key] = (left, now)
-        self._buckets.move_to_end(key)
-        if len(self._buckets) > self._peers:
-            self._buckets.popitem(last=False)
-
 
 USE_SECONDS = 60.0
 _KNOWN_SECONDS = 900.0

@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.config import Config
 from uvicorn.server import ServerState
 
-from appliance.api.front.access import peer_key
+from appliance.api.front.rates import peer_key
 from appliance.api.front.websockets import PREFIX, WebSocketHandover, WebSocketPassage
 from appliance.configuration.settings import ApiLimits
 from appliance.policy.model import Address

@@ -20,9 +20,10 @@ import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from appliance.api.front.access import Bearer, Buckets, TokenAuthenticator
+from appliance.api.front.access import Bearer, TokenAuthenticator
 from appliance.api.front.journal import Journal
 from appliance.api.front.problems import REASON, ProblemError, defect, too_many
+from appliance.api.front.rates import Buckets
 from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest, LongRequest
 from appliance.channel.operations import OPERATIONS

@@ -17,7 +17,7 @@ import structlog
 import uvloop
 from msgspec import Raw
 
-from appliance.api.front.access import peer_key
+from appliance.api.front.rates import peer_key
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel

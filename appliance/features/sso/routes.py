@@ -14,8 +14,8 @@ from typing import Annotated
 import msgspec
 from fastapi import Request
 
-from appliance.api.front.access import Buckets, peer_key
 from appliance.api.front.problems import ProblemError, too_many
+from appliance.api.front.rates import Buckets, peer_key
 from appliance.api.front.route_roles import answered
 from appliance.api.front.routing import Responses, Routes, body
 from appliance.api.front.services import Services

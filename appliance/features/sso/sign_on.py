@@ -22,7 +22,7 @@ from joserfc.errors import ClaimError, JoseError
 from joserfc.jwk import ECKey, RSAKey
 from joserfc.jws import JWSRegistry
 
-from appliance.api.front.access import peer_key
+from appliance.api.front.rates import peer_key
 from appliance.base import clock
 from appliance.features.sso.errors import ProviderError, SignOnRefusedError
 from appliance.features.sso.identity import identity_of

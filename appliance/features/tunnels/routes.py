@@ -15,8 +15,8 @@ from fastapi import Header, Request, Response
 from msgspec import convert
 from msgspec.structs import asdict
 
-from appliance.api.front.access import Buckets
 from appliance.api.front.problems import ProblemError, too_many
+from appliance.api.front.rates import Buckets
 from appliance.api.front.route_roles import answered
 from appliance.api.front.routing import Responses, Routes, answer, body, content, file
 from appliance.api.front.services import Services

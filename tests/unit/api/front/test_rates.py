@@ -2,7 +2,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from appliance.api.front.access import Buckets, peer_key
+from appliance.api.front.rates import Buckets, peer_key
 
 
 def test_a_burst_is_followed_by_the_rate() -> None:
