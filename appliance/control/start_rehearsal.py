@@ -32,9 +32,8 @@ from appliance.specifications.specification_files import SpecificationFolder
 from appliance.specifications.specification_revisions import Check, specifications_at_start
 from appliance.specifications.switches import SWITCHES, Switches
 from appliance.store.changes import Change, Value
-from appliance.store.ends import require_0_4
 from appliance.store.state_file import MonitorRevisionRow, StateStore
-from appliance.store.writer_thread import Database, StoreError
+from appliance.store.writer_thread import Database, StoreError, require_0_4
 
 _ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)
 

@@ -19,7 +19,7 @@ import asyncio
 import contextlib
 import math
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,13 +30,10 @@ from appliance.base import clock
 from appliance.base.age_clock import AgeClock
 from appliance.base.shipped import before_program
 from appliance.store.state_file import EndRow, StateStore
-from appliance.store.writer_thread import StoreError
+from appliance.store.writer_thread import StoreError, require_0_4
 
 _READING = "reading of the clocks"
 _MARK = "ends"  # this setting exists in each state that a version from 0.4 on has opened
-_BEFORE_0_4 = """
-    SELECT EXISTS (SELECT 1 FROM policy_revision) AND NOT EXISTS (SELECT 1 FROM setting WHERE name = 'ends')
-"""
 _SECOND = 1_000_000_000
 _NOTE_SECONDS = 30.0
 _PAIRED_NOTE_SECONDS = 1.0  # at each look, unless many come together
@@ -59,14 +56,6 @@ class EndKind:
     """Whether it survives a restart of control."""
     dated: bool = False
     """Whether its date ends it too: a credential."""
-
-
-def require_0_4(query: Callable[[str], Iterable[tuple[object, ...]]]) -> None:
-    """Raise `StoreError` for the state of a version before 0.4, whose ends are not in the table."""
-    if list(query(_BEFORE_0_4)) != [(0,)]:
-        raise StoreError(
-            "the state was made by a version before 0.4: install 0.4.1, start it once, then install this version"
-        )
 
 
 class _Reading(msgspec.Struct, frozen=True):

@@ -15,7 +15,7 @@ import secrets
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,6 +59,9 @@ _NOTE_NUMBER = (
     "INSERT INTO journal VALUES (1, 0, ?, ?)"
     " ON CONFLICT (id) DO UPDATE SET history = excluded.history, number = excluded.number"
 )
+_BEFORE_0_4 = """
+    SELECT EXISTS (SELECT 1 FROM policy_revision) AND NOT EXISTS (SELECT 1 FROM setting WHERE name = 'ends')
+"""
 
 
 class _Queued(NamedTuple):
@@ -83,6 +86,14 @@ class _Gathered(threading.local):
 
 class StoreError(Exception):
     """The state cannot be read or written."""
+
+
+def require_0_4(query: Callable[[str], Iterable[tuple[object, ...]]]) -> None:
+    """Raise `StoreError` for the state of a version before 0.4, whose ends are not in the table."""
+    if list(query(_BEFORE_0_4)) != [(0,)]:
+        raise StoreError(
+            "the state was made by a version before 0.4: install 0.4.1, start it once, then install this version"
+        )
 
 
 class Database:

@@ -22,8 +22,7 @@ from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
 from appliance.features.table import members
-from appliance.store.ends import require_0_4
-from appliance.store.writer_thread import StoreError
+from appliance.store.writer_thread import StoreError, require_0_4
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
 from appliance.supervisor.users import account_of

@@ -82,7 +82,6 @@ LOOKING = [
     ("alarm", "silence", "nothing", "--for", "1h"),
     ("guard", "list"), ("guard", "show", "nobody"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
     ("door", "list"), ("door", "ticket", "nobody"), ("door", "remove", "nobody"), ("drive", "status"),
-    ("drive", "take", "base", "--host", "robot"), ("drive", "give", "base"),
     ("drive", "assign", "base", "--host", "robot"), ("drive", "free", "base"), ("approval", "refuse", "48213"),
     ("policy", "unused", "--json"), ("policy", "enforce", "Publishers", "--dry-run"), ("who-drove", "--at", "0s"),
     ("drive", "ask", "base", "--host", "robot"), ("approve",),

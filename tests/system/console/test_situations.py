@@ -125,16 +125,16 @@ def test_a_denied_call(appliance: Appliance, windows: list[Reader]) -> None:
 
 
 def test_the_holder_and_a_hand_over(appliance: Appliance, windows: list[Reader]) -> None:
-    appliance.rosrv("drive", "take", "base", "--host", TABLET)
+    appliance.rosrv("drive", "assign", "base", "--host", TABLET)
     see(windows, lambda page: fact(page, "Drives"), re.compile(r"tablet.*drives base for .* s"))
     appliance.rosrv("drive", "ask", "base", "--host", "127.0.0.1")
     see(windows, lambda page: fact(page, "Drives"), re.compile(r"tablet.*waits.*127\.0\.0\.1"))
-    appliance.rosrv("drive", "give", "base", "--to", "127.0.0.1")
+    appliance.rosrv("drive", "free", "base", "--to", "127.0.0.1")
     see(windows, lambda page: fact(page, "Drives"), re.compile(r"127\.0\.0\.1.*drives base"))
 
 
 def test_a_guards_stop(appliance: Appliance, windows: list[Reader], tmp_path: Path) -> None:
-    appliance.rosrv("drive", "take", "base", "--host", "127.0.0.1")
+    appliance.rosrv("drive", "assign", "base", "--host", "127.0.0.1")
     with RosSession(appliance.master_uri, tmp_path) as ros:
         base = ros.start(["rostopic", "echo", "-p", "/cmd_vel"])
         driver = ros.start(

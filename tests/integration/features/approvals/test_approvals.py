@@ -195,7 +195,7 @@ def test_an_approved_motion_ends_by_silence_and_the_guard_stops_the_robot(
             # A door that still has the publication refuses the message, not the advertisement.
             held = number_in(agent(robot, advertise, publish, answer="status")["msg"])
             appliance.rosrv("approve", held, "--for", "60s")
-            appliance.rosrv("drive", "take", "base", "--host", "door:agent-1")
+            appliance.rosrv("drive", "assign", "base", "--host", "door:agent-1")
             robot.run(lambda: refused(publish))
             echo.wait_for_text(DRIVES)
 

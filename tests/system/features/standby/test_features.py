@@ -75,7 +75,7 @@ def test_a_door_a_held_group_and_guards(site: StandbySite) -> None:
         a.rosrv("door", "add", "viewer")
         path = a.rosrv("door", "ticket", "viewer").stdout.strip().partition("ADDRESS:8443")[2]
         assert tablet.run(lambda: eventually(lambda: watched("a", path), site.story))
-        a.rosrv("drive", "take", "base", "--host", ROBOT)
+        a.rosrv("drive", "assign", "base", "--host", ROBOT)
         a.rosrv("guard", "new", "speed", "/cmd_vel", "vMax=0.2")
         a.rosrv("guard", "new", "deadman", "/cmd_vel", "--shadow")
         eventually(lambda: b.rosrv("standby", "status", check=False).returncode == 0, site.story)
@@ -88,5 +88,5 @@ def test_a_door_a_held_group_and_guards(site: StandbySite) -> None:
             "deadman": True,
         }
         changed = guards(site, "b")["speed"]["changes"]
-        b.rosrv("drive", "take", "base", "--host", ROBOT)
+        b.rosrv("drive", "assign", "base", "--host", ROBOT)
         eventually(lambda: guards(site, "b")["speed"]["changes"] > changed + 10, site.story)
