@@ -68,6 +68,7 @@ class WitnessFollower:
         self._saved = epoch
         self._admitted = "?"  # unknown: an earlier process may have written rules
         self._opened = False
+        self._epoch_admitted = 0
         self._interrupted = []  # type: List[float]
         self.tick()
 
@@ -142,6 +143,10 @@ class WitnessFollower:
         """Write the rules; after a `WitnessError`, the next `tick` tries again."""
         if self._opened and not name:
             self._interrupted = [*self._interrupted[1 - _MOST_FLAPS :], self._clock()]
+        elif name:
+            if not self._opened and self._used.epoch > self._epoch_admitted and self._interrupted:
+                self._interrupted.pop()  # the pause of a takeover
+            self._epoch_admitted = self._used.epoch
         self._admitted, self._opened = "?", bool(name)
         self._admit(name, lambda: self._left(name))
         self._admitted = name

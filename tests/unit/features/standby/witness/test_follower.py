@@ -518,6 +518,19 @@ def test_both_appliances_learn_that_a_follower_interrupts_topics_again_and_again
     assert robot.told() == dict.fromkeys(BOTH, "")
 
 
+def test_takeovers_are_not_reported_as_interruptions() -> None:
+    robot = following()
+    for holder in "baba":
+        robot.now += EXPIRY
+        robot.follower.tick()
+        assert robot.follower_admits[-1] == ""
+        assert robot.witness.handle(holder, "claim", 0, "") == ""
+        robot.look()
+        assert robot.look() == holder
+    robot.follower.note("")
+    assert robot.follower.report == ""
+
+
 def test_a_report_neither_fills_an_answer_nor_replaces_its_text() -> None:
     robot = following()
     robot.follower.note('\\"\n\u20ac' * 100)
