@@ -9,6 +9,7 @@ from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_operation import parameter, rest
 
 SHORTEST, LONGEST = 1.0, 3600.0
+WITHHELD = "withheld"
 _PROBLEMS = {
     404: "No call has this number any longer.",
     422: "The approval cannot last so long, or another operator has answered the call.",
@@ -43,9 +44,15 @@ class Approval(msgspec.Struct, frozen=True):
     ]
     resource: Annotated[str, doc("the topic, service or parameter")]
     type: Annotated[str, doc("type of the service; empty for a topic or a parameter")]
-    sha256: Annotated[str, doc("hash of the arguments, or empty if the approval is for any arguments")]
+    sha256: Annotated[
+        str,
+        doc("hash of the arguments, `withheld` for viewers, or empty if the approval is for any arguments"),
+    ]
     arguments: Annotated[
-        str, doc("first 4096 bytes of the arguments as the service would get them, in hexadecimal")
+        str,
+        doc(
+            "first 4096 bytes of the arguments as the service would get them, in hexadecimal; empty for viewers"
+        ),
     ]
     size: Annotated[
         int, doc("bytes of all arguments; if they are more, an approval is for bytes that are not shown")

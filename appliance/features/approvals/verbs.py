@@ -15,6 +15,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, say_row, usage_error
 from appliance.features.approvals.requests import (
+    WITHHELD,
     Approval,
     ApprovalsWanted,
     ApproveCall,
@@ -155,6 +156,8 @@ def _line(appliance: Appliance, one: Approval) -> tuple[str, str]:
 def _arguments(one: Approval) -> str:
     if not one.sha256:
         return " with any arguments" if one.category == "call" else ""
+    if one.sha256 == WITHHELD:
+        return f" with {counted(one.size, 'byte')} of arguments, which viewers do not see"
     data = bytes.fromhex(one.arguments)
     fields, rest = _fields(one.type, data)
     shown = f"{data!r} ({one.type}, sha256 {one.sha256[:12]})" if fields is None else str(fields)

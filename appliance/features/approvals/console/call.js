@@ -9,7 +9,7 @@ const SHOWN = 160; // characters; the number of bytes tells that the arguments h
 /** What a held call does, with its arguments. @param {any} one */
 export function wants(one) {
   const size = one.size > SHOWN && html` of ${one.size} bytes`;
-  const call = one.sha256 ? html`<${Given} value=${`${one.type} ${printable(one.arguments)}`} mono most=${SHOWN} />${size}` : "with any arguments";
+  const call = one.sha256 === "withheld" ? `${one.type} with ${one.size} bytes of arguments, which viewers do not see` : one.sha256 ? html`<${Given} value=${`${one.type} ${printable(one.arguments)}`} mono most=${SHOWN} />${size}` : "with any arguments";
   return html`${one.category} <${Given} value=${one.resource} mono most=${80} />${one.category === "call" && html`<div class="muted small">${call}</div>`}`;
 }
 

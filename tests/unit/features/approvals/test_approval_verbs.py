@@ -5,9 +5,10 @@ import pytest
 
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.features.approvals import verbs
-from appliance.features.approvals.requests import Approval, Approvals, RefuseCall
+from appliance.features.approvals.requests import Approval, Approvals, ApprovalsWanted, RefuseCall
 from appliance.features.approvals.verbs import changes
 from tests.support.memory_call import call_of
+from tests.support.rest_world import ROLES, RestWorld
 
 REST = ("10.0.0.7", "/agent", "call", "/log", "roscpp/SetLoggerLevel", "4bf5")
 
@@ -48,6 +49,19 @@ def test_an_operator_sees_every_byte_of_the_arguments(
     row = Approval(48213, "waits", *call, data.hex(), len(data), 60.0, "")  # type: ignore[arg-type]  # of a tuple
     verbs.approve.function(call_of(lambda _request: Approvals([row])), None)
     assert shown in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_a_viewer_reads_no_arguments_of_held_calls(role: str, capsys: pytest.CaptureFixture[str]) -> None:
+    world = RestWorld()
+    held = Approval(7, "waits", *REST, b"secret".hex(), 6, 60.0, "")  # type: ignore[arg-type]  # of a tuple
+    world.carried.answers[ApprovalsWanted] = Approvals([held])
+    told = msgspec.json.decode(world.asked("GET", "/v1/approvals", None, role).content, type=Approvals)
+    assert (told.approvals == [held]) is (role != "viewer")
+    verbs.approve.function(call_of(lambda _request: told), None)
+    words = "with 6 bytes of arguments, which viewers do not see: waits"
+    assert (words in capsys.readouterr().out) is (role == "viewer")
+    assert role != "viewer" or (told.approvals[0].arguments, told.approvals[0].sha256) == ("", "withheld")
 
 
 def test_a_watched_call_is_shown_when_it_comes_changes_and_ends() -> None:
