@@ -108,6 +108,9 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         raise LogUnreadableError(f"{path}: {error.strerror}; run as root or as the log's owner") from error
     if not os.access(path, os.R_OK):
         raise LogUnreadableError(f"{path}: permission denied; run as root or as the log's owner")
+    for file in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))):
+        if file.exists() and not file.is_file():  # a pipe has no end
+            raise LogUnreadableError(f"{file}: not a regular file, so not written by rosrv; keep it as evidence")
     mode = "ro"
     if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
         mode = "ro&immutable=1"  # a copy on a read-only medium does not change
@@ -153,7 +156,13 @@ def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connec
                 )
             for setting in settings:
                 connection.execute(setting)
-            connection.execute("SELECT count(*) FROM sqlite_schema")  # an error may quote bytes of the schema
+            # An error may quote bytes of the schema. A view has rows without an end.
+            views = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'view'").fetchall()
+            if views:
+                names = ", ".join(str(name) for (name,) in views)
+                raise LogUnreadableError(
+                    f"{path}: has the view {names}, which no log has: rosrv did not write it; keep it as evidence"
+                )
         except sqlite3.OperationalError:
             raise
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:

@@ -5,6 +5,7 @@ and write the signer's memory. Each takes the state directory; `before` has a co
 """
 
 import hashlib
+import os
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -312,6 +313,26 @@ _statements(
     "ALTER TABLE record RENAME TO hidden",
     "CREATE VIEW record AS SELECT * FROM hidden WHERE event != 'monitor disabled'",
 )  # fmt: skip
+_statements(
+    "let the records have no end",
+    "DROP TABLE record",
+    "CREATE VIEW record AS WITH RECURSIVE n(sequence) AS (VALUES (1) UNION ALL SELECT sequence + 1 FROM n)"
+    " SELECT sequence, x'00' AS hash FROM n",
+)
+
+
+@attack
+def put_a_pipe_in_place_of_the_log(state: Path, _before: Path) -> None:
+    _log(state).unlink()
+    os.mkfifo(_log(state))
+
+
+@attack
+def put_a_pipe_beside_the_log(state: Path, _before: Path) -> None:
+    _log(state).with_name("audit.db-wal").unlink(missing_ok=True)
+    os.mkfifo(_log(state).with_name("audit.db-wal"))
+
+
 _statements("keep something else in the log", "CREATE TABLE extra (x)")
 
 # --- root ---
@@ -320,6 +341,12 @@ _statements("keep something else in the log", "CREATE TABLE extra (x)")
 @as_root
 def remove_the_memory(state: Path, _before: Path) -> None:
     for file in (state / "signer").glob("*.signed"):
+        file.unlink()
+
+
+@as_root
+def empty_the_signers_folder_and_its_memory(state: Path, _before: Path) -> None:
+    for file in (state / "signer").iterdir():
         file.unlink()
 
 
