@@ -36,6 +36,7 @@ from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import Database, StoreError, require_0_4
 
 _ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)
+SERVING_ROOM = 16 << 20  # that an active appliance may need before its log is written back (`wal_autocheckpoint`)
 
 _log = structlog.get_logger()
 
@@ -107,12 +108,12 @@ class StartRehearsal:
         return next(iter(store.monitor_revisions(1)), None), store.settings().get(SWITCHES, "{}")
 
 
-def lacking_room(folder: Path) -> str:
+def lacking_room(folder: Path, wanted: int = _ROOM) -> str:
     disk = os.statvfs(folder)
     free = disk.f_bavail * disk.f_frsize
-    if free >= _ROOM:
+    if free >= wanted:
         return ""
-    return f"{folder}: {free} bytes are free on its disk, {_ROOM} are wanted: free space"
+    return f"{folder}: {free} bytes are free on its disk, {wanted} are wanted: free space"
 
 
 def _require_room(folder: Path) -> None:

@@ -3,6 +3,7 @@ import pytest
 from tests.support.examples import seeds_of_night
 from tests.world.mutants import MUTANTS, NOT_SEEN, PAIR_MUTANTS, first_broken
 from tests.world.pair import PairWorld
+from tests.world.unable import REASONS, UnableWorld
 from tests.world.world import World, run
 
 _AT_GATE, _PAIRS_AT_GATE = 25, 5
@@ -30,6 +31,12 @@ def test_no_history_of_a_night_breaks_a_promise(case: int) -> None:
 @pytest.mark.parametrize("case", range(_PAIRS_AT_NIGHT // _IN_ONE_CASE))
 def test_no_history_of_two_appliances_of_a_night_breaks_a_promise(case: int) -> None:
     _run(seeds_of_night(_PAIRS_AT_NIGHT)[case * _IN_ONE_CASE :][:_IN_ONE_CASE], PairWorld, "--pair ")
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("reason", REASONS)
+def test_two_appliances_that_cannot_serve_pass_the_lease_at_most_twice_in_ten_minutes(reason: str) -> None:
+    run(1, kind=type(reason, (UnableWorld,), {"reason": reason}))
 
 
 def _run(seeds: range, kind: type[World], option: str) -> None:

@@ -33,6 +33,10 @@ class OtherAppliance(msgspec.Struct, frozen=True):
             "on the active appliance: seconds since the witness last answered the other one, or null if not known"
         ),
     ]
+    refusal: Annotated[
+        str,
+        doc("why the standby refused the last change of the active appliance, or empty once it accepts one"),
+    ] = ""
 
 
 class WitnessSeen(msgspec.Struct, frozen=True):
@@ -84,3 +88,7 @@ class StandbyState(msgspec.Struct, frozen=True):
     troubles: Annotated[
         list[str], doc("why the standby could not take over now, with the remedies, or empty if it could")
     ]
+    not_serving: Annotated[
+        str,
+        doc("why the active appliance does not serve the robot, and keeps the lease, or empty if it serves"),
+    ] = ""

@@ -32,6 +32,7 @@ SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits fo
 FARTHEST = 1 << 20  # takeovers and restarts that an appliance may have missed
 _RENEWABLE = 2 * EXPIRY  # in this time after its lease has lapsed, the other appliance has claimed, or cannot
 _MOST_PENDING = 16
+_MOST_TOLD = 200  # characters of a fault in a datagram
 
 Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
 
@@ -72,6 +73,8 @@ class PromiseRequest:
     epoch: int
     session: str
     number: int
+    fault: str = ""
+    """Why the sender does not serve, and keeps the lease."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,9 @@ class ApplianceLease:
         self.refusal = ""  # why the witness grants this appliance nothing until an operator acts
         self.seen: WitnessAnswer | None = None  # the last answer that knew it
         self.ready = True  # False: this appliance could not serve, so it does not claim
+        self.able = True  # False: it claims only what the other one has lost
+        self.fault = ""  # why this appliance does not serve, and keeps the lease
+        self._other_fault = ""
         self._name = name
         self._other = other
         self._session = session
@@ -189,6 +195,12 @@ class ApplianceLease:
 
     def is_active(self, now: float) -> bool:
         return self.held is not None and self._promised_until <= now < self._valid_until
+
+    def active_fault(self, now: float) -> str:
+        """Return why the active appliance does not serve, and keeps the lease; empty if it is not known."""
+        if self.is_active(now):
+            return self.fault
+        return self._other_fault if now < self._promised_until else ""
 
     def may_be_renewed(self, now: float) -> bool:
         """Return whether a lapsed lease may be renewed in its epoch: no other appliance can have been active since."""
@@ -302,7 +314,9 @@ class ApplianceLease:
                     self._promised_to = (
                         message  # an earlier request that arrives late is not the last promise
                     )
-                able, unheard = self.ready and not (self.refusal or self._trouble), now - self._witnessed_at
+                self._other_fault = message.fault
+                able = self.ready and self.able and not (self.refusal or self._trouble)
+                unheard = now - self._witnessed_at
                 return (ClaimPromise(message.epoch, message.session, message.number, able, unheard),)
             case ClaimPromise(epoch, session, number):
                 asked = self._asked.get(number)
@@ -376,7 +390,7 @@ class ApplianceLease:
         self._number += 1
         self._asked[self._number] = now
         self._asked.pop(self._number - _MOST_PENDING, None)
-        return PromiseRequest(self.epoch, self._session, self._number)
+        return PromiseRequest(self.epoch, self._session, self._number, self.fault[:_MOST_TOLD])
 
     def _take_over(self) -> TakeOver:
         return TakeOver(self.epoch, self._session, self._void_number)

@@ -26,23 +26,23 @@ class LeaseClient:
     def __init__(self) -> None:
         self.state: lease_link.LeaseState | None = None
         self._listeners: list[Callable[[lease_link.LeaseState], None]] = []
-        self._present = False
+        self._present: lease_link.ControlPresent | None = None
         self._link = Link(self.heard, self._lost)
         self._news = asyncio.Event()
         self._handing_over: asyncio.Future[str] | None = None
 
     def attach(self, channel: Channel) -> None:
         self._link.attach(channel)
-        if self._present:
-            self.send(lease_link.ControlPresent())
+        if self._present is not None:
+            self.send(self._present)
 
-    def present(self) -> None:
-        self._present = True
-        self.send(lease_link.ControlPresent())
+    def present(self, *, able: bool = True) -> None:
+        self._present = lease_link.ControlPresent(able)
+        self.send(self._present)
 
     def withdraw(self) -> None:
-        if self._present:
-            self._present = False
+        if self._present is not None:
+            self._present = None
             self.send(lease_link.ControlUnready())
 
     async def report_service(self, report: Callable[[], lease_link.ControlServes]) -> None:

@@ -42,6 +42,8 @@ class LeaseState(Message):
     """Whether the witness's in-sync set names only this appliance."""
     expired_since: float | None = None
     """The time since which the witness has said that no appliance holds the lease."""
+    fault: str = ""
+    """Why the active appliance does not serve, and keeps the lease."""
 
 
 class HandOverAnswered(Message):
@@ -69,6 +71,9 @@ class EpochSeen(Message):
 
 class ControlPresent(Message):
     """Control stands by or serves, so this appliance may be active. A link begins without this."""
+
+    able: bool = True
+    """Whether the other appliance may give the lease to this one, and not only lose it."""
 
 
 class ControlUnready(Message):

@@ -19,7 +19,7 @@ from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
-from appliance.features.standby.summary import follower_troubles
+from appliance.features.standby.summary import present_troubles
 from appliance.features.standby.view import answer_in_words, connection, lag_in_words
 from rosmop.tool.terminal import printable, say
 
@@ -29,9 +29,8 @@ _RED = "bold red"
 
 
 def standby_view(state: StandbyState) -> StatusView:
-    return StatusView(
-        1 if state.troubles or state.witness.follower_trouble else 0, StandbyScreen(state), in_full(state)
-    )
+    troubled = state.troubles or any(present_troubles(state))
+    return StatusView(1 if troubled else 0, StandbyScreen(state), in_full(state))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +41,7 @@ class StandbyScreen:
 
     def __rich_console__(self, _console: Console, _options: ConsoleOptions) -> RenderResult:
         state = self.state
-        for trouble in [*state.troubles, *(trouble.text for trouble in follower_troubles(state))]:
+        for trouble in [*state.troubles, *(trouble.text for trouble in present_troubles(state))]:
             yield Text(f"! {trouble}", style=_RED)
         other, witness = state.other, state.witness
         grid = Table.grid(padding=(0, 2))
@@ -84,8 +83,8 @@ def status(
 ) -> None:
     """Show both appliances and the witness: which one is active, and how far behind the standby is.
 
-    Exit status, on both appliances: 0 if the standby could take over now; 1 if not, or if a follower reports trouble,
-    with the reason; 2 if no appliance runs.
+    Exit status, on both appliances: 0 if the standby could take over now; 1 if not, or if the active appliance does not
+    serve or a follower reports trouble, with the reason; 2 if no appliance runs.
 
     Example: rosrv standby status --watch
     """

@@ -35,7 +35,7 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.admin_socket import AdminServer, RequestHandler
 from appliance.control.operators.token_orders import TOKENS, kept_by_api
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
-from appliance.control.start_rehearsal import StartRehearsal
+from appliance.control.start_rehearsal import SERVING_ROOM, StartRehearsal, lacking_room
 from appliance.features.standby.answers import OtherAppliance, StandbyState
 from appliance.features.standby.inheritance import CopyAge
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
@@ -69,7 +69,9 @@ from appliance.store.writer_thread import StoreError
 # The check also writes to the disk of the state and to the audit log, and compiles the specifications, so that a
 # takeover need not. It is repeated, because the appliance's own files, disk and ports may change. While it fails,
 # this
-# appliance does not claim the lease, but still follows the active one and stays in the in-sync set.
+# appliance does not claim the lease, but still follows the active one and stays in the in-sync set. With little room
+# it claims a lease that the active one has lost, but is given none: as a standby it writes less, so both could pass
+# the lease to and fro.
 
 _CHECK_AGAIN_SECONDS = 15.0
 
@@ -90,13 +92,16 @@ class TakeoverCheck:
         self._rehearsal = StartRehearsal(settings, compile_specifications, parts, robot=membership.witness)
         self._again = again
         self.obstacle = UNCHECKED
+        self.scarce = ""
         self.news = asyncio.Event()
 
     async def run(self, changed: Callable[[], None]) -> None:
         while True:
             self.news.clear()
             obstacle = await self._find_obstacle()
-            if obstacle != self.obstacle:
+            scarce = "" if obstacle else self._find_scarce()
+            if (obstacle, bool(scarce)) != (self.obstacle, bool(self.scarce)):
+                self.scarce = scarce
                 if self.obstacle not in ("", UNCHECKED):
                     _log.info("the reason why this appliance cannot take over is gone", reason=self.obstacle)
                 self.obstacle = obstacle
@@ -104,6 +109,10 @@ class TakeoverCheck:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._again):
                     await self.news.wait()
+
+    def _find_scarce(self) -> str:
+        short, other = lacking_room(self._rehearsal.folder, SERVING_ROOM), self._membership.other
+        return short and f"{short}; until then it takes over only while {other} is away"
 
     async def _find_obstacle(self) -> str:
         try:
@@ -251,6 +260,7 @@ class PassiveRest:
 
 
 _AGAIN_SECONDS = 0.3
+_MOST_AGAIN_SECONDS = 5.0  # after refusals: each begins with the whole state
 _ADMIN = "admin"
 
 _log = structlog.get_logger()
@@ -356,6 +366,10 @@ class PassiveControl:
     @property
     def obstacle(self) -> str:
         """Why this appliance could not take over, although it may follow."""
+        return self._unfit or self._check.scarce
+
+    @property
+    def _unfit(self) -> str:
         return self._check.obstacle or self._replica.unsynced or ("" if self._complete else INCOMPLETE)
 
     @property
@@ -369,24 +383,26 @@ class PassiveControl:
         return self.copies.at(clock.now() if self._connected else self._away_since)
 
     def _state_presence(self) -> None:
-        if self.obstacle:
+        if self._unfit:
             self._lease.withdraw()
         else:
-            self._lease.present()
+            self._lease.present(able=not self._check.scarce)
 
     def state(self) -> StandbyState:
-        lease = self._lease.state
+        lease, refused = self._lease.state, self._receiver.refusal.reason
+        connected = self._connected and not refused
         other = OtherAppliance(
             name=self._membership.other,
             address=self._membership.other_address,
-            connected=self._connected,
+            connected=connected,
             in_sync=lease is not None and lease.in_sync,
             behind_changes=0,
             behind_bytes=0,
             waiting_seconds=None,
-            reason="" if self._connected else self._reason,
-            trouble_seconds=None if self._connected else round(clock.now() - self._away_since, 3),
+            reason="" if connected else refused or self._reason,
+            trouble_seconds=None if connected else round(clock.now() - self._away_since, 3),
             witness_seconds=None,
+            refusal=refused,
         )
         return state_of(
             self._membership,
@@ -440,7 +456,9 @@ class PassiveControl:
 
     async def _follow(self) -> None:
         context: ssl.SSLContext | None = None
+        pause = _AGAIN_SECONDS
         while True:
+            refused = self._receiver.refusal.reason
             try:
                 context = context or replication_context(self._membership, self._folder, server=False)
                 await follow_at(
@@ -452,8 +470,11 @@ class PassiveControl:
                     _log.info("the active appliance is not followed", reason=self._reason)
             finally:
                 if self._connected:
-                    self._connected, self._away_since = False, clock.now()
-            await asyncio.sleep(_AGAIN_SECONDS)
+                    self._connected = False
+                    if not (refused and self._receiver.refusal.reason):
+                        self._away_since = clock.now()
+            pause = min(2 * pause, _MOST_AGAIN_SECONDS) if self._receiver.refusal.reason else _AGAIN_SECONDS
+            await asyncio.sleep(pause)
 
     async def _prepare_tunnels(self) -> None:
         while not await asyncio.to_thread(self._replica.has_hosts):

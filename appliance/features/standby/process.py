@@ -135,15 +135,14 @@ class WitnessChannel:
 # A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
 # relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
 #
-# If the lease is given away soon, all limits are doubled until this appliance serves steadily, so that two appliances
-# that cannot serve do not keep passing it back and forth.
+# Each appliance gives the lease away once in `AGAIN_SECONDS`, so two that cannot serve do not keep passing it back and
+# forth, whatever the reason: the one that has it then keeps it, and reports why it does not serve.
 
 OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
 RESTART_SECONDS = 10.0
-STEADY_SECONDS = 4.0
-_MOST_DOUBLINGS = 5
+AGAIN_SECONDS = 600.0
 
 
 class ServiceWatch:
@@ -158,7 +157,7 @@ class ServiceWatch:
         self._ready: float | None = None  # time of the first report without an obstacle in this activation
         self._obstacle = ""
         self._obstacle_since = 0.0
-        self._doublings = 0
+        self._given_at = float("-inf")
 
     def linked(self) -> None:
         self._serves, self._obstacle = False, ""
@@ -168,15 +167,13 @@ class ServiceWatch:
         if not obstacle:
             self._served, self._serves, self._cold = now, True, False
             self._ready = now if self._ready is None else self._ready
-            if now - self._ready > STEADY_SECONDS:
-                self._doublings = 0
         elif not self._obstacle:
             self._obstacle_since = now
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:
         """Note whether the lease is held (`active`), and whether control stands by or serves (`present`); return why
-        to give the lease away, or an empty string.
+        this appliance does not serve, or an empty string.
         """
         if active and not self._active:
             self._served, self._cold = now, not present
@@ -187,23 +184,21 @@ class ServiceWatch:
             return ""
         if self._cold and not self._keeps_state:
             return "control has just started when the lease came back"
-        scale = 1 << self._doublings
         if self._obstacle:
-            late = now - self._obstacle_since > scale * OBSTACLE_SECONDS
-            return self._obstacle if late else ""
+            return self._obstacle if now - self._obstacle_since > OBSTACLE_SECONDS else ""
         silent = now - self._served
         limit = START_SECONDS if self._ready is None else RESTART_SECONDS
-        if silent <= scale * (SILENT_SECONDS if self._serves else limit):
+        if silent <= (SILENT_SECONDS if self._serves else limit):
             return ""
         what = "has not reported" if self._serves else "has not been ready"
         return f"control {what} for {silent:.1f} s"
 
-    def given_away(self) -> None:
-        if self._cold:
-            return  # the other one stands by, and nothing was tried here
-        steady = self._ready is not None and self._served - self._ready > STEADY_SECONDS
-        if not steady:
-            self._doublings = min(self._doublings + 1, _MOST_DOUBLINGS)
+    def given_away(self, now: float) -> None:
+        self._given_at = now
+
+    def kept_for(self, now: float) -> float:
+        """Return the seconds for which this appliance keeps the lease although it does not serve."""
+        return max(0.0, self._given_at + AGAIN_SECONDS - now)
 
 
 # The datagrams between two appliances, each authenticated with a shared key.
@@ -312,7 +307,7 @@ class LeaseProcess:
         self.peers = peers
         self.asking = asking
         self._report = lease_link.ReplicationReported(0, False, None)
-        self._present = False
+        self._present = self._able = False
         self._service = ServiceWatch()
         self._permission = 0
         self._alone = False
@@ -365,7 +360,7 @@ class LeaseProcess:
                 self._permission += 1
                 current = False
         self._alone = lease.answers_alone
-        lease.ready = self._present
+        lease.ready, lease.able = self._present, self._able
         self._give_away(now)
         caught_up = current and report.caught_up
         self._after(lease.tick(now, waiting_since=waiting, caught_up=caught_up))
@@ -373,14 +368,22 @@ class LeaseProcess:
     def _give_away(self, now: float) -> None:
         fault = self._service.fault(now, active=self._lease.is_active(now), present=self._present)
         if not fault:
+            self._lease.fault = ""
             return
-        with contextlib.suppress(LeaseError):  # the other appliance could not serve, either
+        kept = self._service.kept_for(now)
+        try:
+            if kept:
+                raise LeaseError(f"it gave the lease away before, and does so again in {kept:.0f} s at the earliest")
             due = self._lease.switch_over(now)
-            self._service.given_away()
-            _log.error(
-                "the lease is given to the other appliance, because this one does not serve", reason=fault
-            )
-            self._after(due)
+        except LeaseError as error:
+            if not self._lease.fault:
+                _log.error("this appliance does not serve, and keeps the lease", reason=fault, kept=str(error))
+            self._lease.fault = f"{fault}; it keeps the lease: {error}"
+            return
+        self._lease.fault = ""
+        self._service.given_away(now)
+        _log.error("the lease is given to the other appliance, because this one does not serve", reason=fault)
+        self._after(due)
 
     def _after(self, due: Outgoing) -> None:
         epoch = self._lease.epoch
@@ -457,6 +460,7 @@ class LeaseProcess:
             takeover_obstacle=lease.takeover_obstacle(now),
             trouble=seen.trouble if seen is not None else "",
             follower_trouble=seen.follower_trouble if seen is not None else "",
+            fault=lease.active_fault(now),
         )
         if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
             self._told, self._told_at = state, now
@@ -476,8 +480,8 @@ class LeaseProcess:
                 self._report = message
             case lease_link.EpochSeen(epoch) if epoch <= HIGHEST:
                 self._lease.follow(epoch)
-            case lease_link.ControlPresent():
-                self._present = True
+            case lease_link.ControlPresent(able):
+                self._present, self._able = True, able
             case lease_link.ControlUnready():
                 self._present = False
             case lease_link.ControlServes(obstacle, keeps_state):

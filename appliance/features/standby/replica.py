@@ -31,6 +31,7 @@ from appliance.features.standby.replication_frames import (
     SnapshotRows,
     Stored,
 )
+from appliance.features.standby.summary import MISFIT
 from appliance.store.changes import Change, ChangeError
 from appliance.store.writer_thread import Database, StoreError
 
@@ -164,6 +165,6 @@ class Replica:
         try:
             yield
         except (ChangeError, sqlite3.IntegrityError) as error:
-            raise ReplicationError(f"a change does not fit: {error}") from error
+            raise ReplicationError(f"{MISFIT}: {error}") from error
         except sqlite3.Error as error:
             raise StoreError(f"{self._path}: {error}; free space there") from error

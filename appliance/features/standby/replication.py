@@ -196,6 +196,7 @@ def state_of(
         ),
         obstacle=obstacle,
         troubles=[],
+        not_serving=lease.fault if lease is not None else "",
     )
     found = takeover_obstacles(state, lease.takeover_obstacle if lease is not None else "")
     return msgspec.structs.replace(state, troubles=found)
@@ -319,9 +320,12 @@ class Replication:
             behind_changes=lag.changes,
             behind_bytes=lag.bytes,
             waiting_seconds=None if waiting is None else round(now - waiting, 3),
-            reason="" if self._connected() else self._port.trouble or lag.reason or "it does not answer",
+            reason=""
+            if self._connected()
+            else self._port.trouble or lag.refusal or lag.reason or "it does not answer",
             trouble_seconds=None if trouble is None else round(now - trouble, 3),
             witness_seconds=None if witnessed is None else round(clock.since_boot() - witnessed, 3),
+            refusal=lag.refusal,
         )
         return state_of(
             self._membership,
@@ -336,11 +340,10 @@ class Replication:
         return self.sender.lag().connected
 
     def _connected(self) -> bool:
-        lease = self._lease.state
+        lease, lag = self._lease.state, self.sender.lag()
         heard = lease.heard if lease is not None else None
-        return (
-            self.sender.lag().connected and heard is not None and clock.since_boot() - heard < _ANSWER_SECONDS
-        )
+        answers = heard is not None and clock.since_boot() - heard < _ANSWER_SECONDS
+        return lag.connected and not lag.refusal and answers
 
     async def require_ready(self, rehearse: Callable[[], Awaitable[None]]) -> None:
         """Raise `HandOverError` unless the standby can take over; `rehearse` writes as much as the switchover.

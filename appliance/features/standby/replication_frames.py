@@ -12,6 +12,7 @@ from typing import Annotated, Generic, TypeVar
 
 import msgspec
 
+from appliance.base import clock
 from appliance.channel.messages import Fingerprint
 from appliance.store.changes import Change, Put
 
@@ -20,6 +21,7 @@ _PIECE = 256 << 10
 _WRITE_SECONDS = 30.0
 _LENGTH = struct.Struct(">I")
 _LONGEST_REASON = 500
+_REFUSED_SECONDS = 60.0
 
 M = TypeVar("M")
 _Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
@@ -123,6 +125,26 @@ def refusal_of(reason: str) -> SwitchoverRefused:
 
 def obstacle_of(reason: str) -> ObstacleFound:
     return ObstacleFound(reason[:_LONGEST_REASON])
+
+
+class LastRefusal:
+    """Why the standby last refused a change: until it accepts one, or has been away for `_REFUSED_SECONDS`.
+
+    Each link to it begins as if it accepted, so without this the reason would come and go with the links.
+    """
+
+    def __init__(self) -> None:
+        self._reason, self._until = "", 0.0
+
+    @property
+    def reason(self) -> str:
+        return self._reason if clock.now() < self._until else ""
+
+    def note(self, reason: str) -> None:
+        self._reason, self._until = reason, clock.now() + _REFUSED_SECONDS
+
+    def end(self) -> None:
+        self._until = 0.0
 
 
 class ReplicationLink(Generic[M]):

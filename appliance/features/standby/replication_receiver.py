@@ -8,6 +8,7 @@ from appliance.features.standby.replication_frames import (
     Changes,
     FromActive,
     Introduction,
+    LastRefusal,
     Refused,
     ReplicationError,
     ReplicationLink,
@@ -43,6 +44,7 @@ class ReplicationReceiver:
         self._replica = replica
         self._accepts = accepts
         self._link: ReplicationLink[FromActive] | None = None
+        self.refusal = LastRefusal()
         self.followed = False
         """Whether the active appliance has sent the missing changes since this object was made."""
         self._introduction = introduction
@@ -90,10 +92,13 @@ class ReplicationReceiver:
                 try:
                     self._require_accepted(message)
                     await self._take(message)
-                    self.followed = self.followed or isinstance(message, Changes | SnapshotEnd)
+                    if isinstance(message, Changes | SnapshotEnd):
+                        self.followed = True
+                        self.refusal.end()
                     if _has_revisions(message):
                         self._revised()
                 except (ReplicationError, StoreError) as error:
+                    self.refusal.note(str(error))
                     await link.send(reason_of(error))
                     raise
                 await link.send(self._replica.position)

@@ -25,6 +25,7 @@ from appliance.features.standby.replication_frames import (
     EncodedChanges,
     FromStandby,
     Introduction,
+    LastRefusal,
     ObstacleFound,
     Refused,
     ReplicationError,
@@ -67,6 +68,7 @@ class ReplicationLag(NamedTuple):
     reason: str
     obstacle: str = ""
     """Why the connected standby could not serve after a takeover."""
+    refusal: str = ""
 
     @property
     def caught_up(self) -> bool:
@@ -99,6 +101,7 @@ class ReplicationSender:
         self._unanswered = 0
         self._answered = asyncio.Event()
         self._reason = self._obstacle = ""
+        self._refusal = LastRefusal()
         self.link: asyncio.Task[None] | None = None
         self._open: ReplicationLink[FromStandby] | None = None
         self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
@@ -138,6 +141,7 @@ class ReplicationSender:
             min((since for _number, since in self._waiting.values()), default=None),
             self._reason,
             self._obstacle if self.link is not None else "",
+            self._refusal.reason,
         )
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -225,6 +229,7 @@ class ReplicationSender:
         while True:
             message = await link.receive(_SILENCE_SECONDS)
             if isinstance(message, Refused):
+                self._refusal.note(message.reason)
                 raise ReplicationError(f"the standby refuses: {message.reason}")
             if isinstance(message, SwitchoverWanted):
                 self._switchover_wanted()
@@ -238,7 +243,10 @@ class ReplicationSender:
             self._unanswered -= 1
             self._answered.set()
             if message.history == self._database.history:
+                before = self._acknowledged
                 self.take(message)
+                if message.number > before or message.number == self._database.number:
+                    self._refusal.end()
 
     def take(self, stored: Stored) -> None:
         if stored.number > self._sent:

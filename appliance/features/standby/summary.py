@@ -19,6 +19,9 @@ SILENT_SECONDS = 5.0
 UNCHECKED = "it has just started, and still checks whether it could serve"
 """The obstacle of a standby before its first check ends, which takes as long as its specifications need."""
 
+MISFIT = "a change does not fit"
+"""The beginning of a refusal of a standby whose tables are others, as those of an earlier version are."""
+
 
 def takeover_obstacles(state: StandbyState, lease: str) -> list[str]:
     """Return why the standby could not take over now. `lease` is the judgement of the process `lease`, which notices
@@ -38,7 +41,9 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
         yield Trouble("alarm", "both-active", text)
     if state.obstacle and (state.obstacle != UNCHECKED or seconds >= patience):
         yield _unready(state)
-    if not other.connected and seconds >= patience:
+    if other.refusal and seconds >= patience:
+        yield _refusing(state)
+    elif not other.connected and seconds >= patience:
         yield _away(state, seconds)
     # A witness that refuses does not report who is in sync.
     if other.connected and not other.in_sync and not state.witness.refusal and seconds >= patience:
@@ -53,8 +58,13 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
         yield _unsaved(state.witness)
 
 
-def follower_troubles(state: StandbyState) -> Iterator[Trouble]:
-    """Return the troubles of other computers of the robot, which prevent no takeover."""
+def present_troubles(state: StandbyState) -> Iterator[Trouble]:
+    """Return the troubles of the active appliance and of other computers of the robot, which prevent no takeover."""
+    if state.not_serving:
+        other = state.other
+        name, address = (state.name, state.address) if state.role == "active" else (other.name, other.address)
+        text = f"the active appliance {name} ({address}) does not serve the robot: {state.not_serving}"
+        yield Trouble("alarm", "not-serving", text)
     if state.witness.follower_trouble and not is_silent(state.witness):
         text = (
             f"a computer that follows the witness reports: {state.witness.follower_trouble}; check its load there, and"
@@ -100,6 +110,18 @@ def _away(state: StandbyState, seconds: float) -> Trouble:
             f" since then are missing here{why}; {check}"
         )
     return Trouble("warning", "standby-away", text)
+
+
+def _refusing(state: StandbyState) -> Trouble:
+    active = state.role == "active"
+    name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
+    text = (
+        f"the standby {name} ({address}) does not follow, because it refuses what the active appliance sends:"
+        f" {state.other.refusal}"
+    )
+    if MISFIT in text:
+        text += f"; if the version of {name} is older (rosrv --version), upgrade it: until then there is no standby"
+    return Trouble("alarm", "standby-refuses", text)
 
 
 def _unready(state: StandbyState) -> Trouble:

@@ -7,10 +7,10 @@ from appliance.features.standby.answers import OtherAppliance, StandbyState, Wit
 from appliance.features.standby.summary import (
     PATIENCE_SECONDS,
     both_active,
-    follower_troubles,
     is_silent,
     lag_of,
     lasting,
+    present_troubles,
     standby_troubles,
 )
 from appliance.features.view import FeatureView, Pieces, Samples, StateView
@@ -118,7 +118,7 @@ STANDBY_VIEW = FeatureView(
             StandbyState,
             "this appliance as one of two, or null on a single one",
             before="handled_alarms",
-            alarms=lambda state: (*standby_troubles(state, PATIENCE_SECONDS), *follower_troubles(state)),
+            alarms=lambda state: (*standby_troubles(state, PATIENCE_SECONDS), *present_troubles(state)),
             metrics=_METRICS,
             samples=samples_of,
             line=standby_line,

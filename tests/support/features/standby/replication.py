@@ -112,19 +112,25 @@ class ActiveSide:
 
 class StandbySide:
     def __init__(
-        self, path: Path, context: ssl.SSLContext, port: Callable[[], int], *, largest: int = 1 << 30
+        self,
+        path: Path,
+        context: ssl.SSLContext,
+        port: Callable[[], int],
+        *,
+        largest: int = 1 << 30,
+        schema: str = SCHEMA,
     ) -> None:
         self.ends: list[str] = []
-        self.replica = Replica(path, SCHEMA, failed=print, largest=largest)
+        self.replica = Replica(path, schema, failed=print, largest=largest)
+        self.receiver = ReplicationReceiver(self.replica, lambda _epoch: True)
         self._context = context
         self._port = port
         self._task = asyncio.create_task(self._run())
 
     async def _run(self) -> None:
-        receiver = ReplicationReceiver(self.replica, lambda _epoch: True)
         while True:
             try:
-                await follow_at("127.0.0.1", self._port(), self._context, receiver)
+                await follow_at("127.0.0.1", self._port(), self._context, self.receiver)
             except (ReplicationError, StoreError) as error:
                 self.ends.append(str(error))
             await asyncio.sleep(0.02)
@@ -181,7 +187,8 @@ class CuttingProxy:
 async def replicated(directory: Path, **options: Any) -> AsyncIterator[tuple[ActiveSide, StandbySide]]:
     server, client = certificates(directory)
     active = ActiveSide(directory / "active.db", server, **options)
-    standby = StandbySide(directory / "standby.db", client, lambda: active.port)
+    schema = options.get("schema", SCHEMA)
+    standby = StandbySide(directory / "standby.db", client, lambda: active.port, schema=schema)
     try:
         yield active, standby
     finally:

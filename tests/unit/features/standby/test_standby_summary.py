@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from appliance.channel.alarms import open_alarms
 from appliance.features.standby.answers import StandbyState
@@ -90,6 +91,21 @@ def test_a_whole_pair_has_no_trouble(of: dict[str, Any]) -> None:
             "the witness on the robot (10.0.0.10) could not carry out a takeover: Read-only file system; correct that"
             " on the robot",
         ),
+        *(
+            (
+                of,
+                {"other": {"connected": False, "refusal": "a change does not fit: the state has no table 'ends'"}},
+                "the standby b (10.0.0.2) does not follow, because it refuses what the active appliance sends: a change"
+                " does not fit: the state has no table 'ends'; if the version of b is older (rosrv --version), upgrade"
+                " it: until then there is no standby",
+            )
+            for of in (ACTIVE, STANDBY)
+        ),
+        (
+            ACTIVE, {"other": {"connected": False, "refusal": "state.db: database or disk is full; free space there"}},
+            "the standby b (10.0.0.2) does not follow, because it refuses what the active appliance sends: state.db:"
+            " database or disk is full; free space there",
+        ),
         (
             ACTIVE, {"witness": {"holder": "b"}},
             "both appliances claim to be active: this one does, but the witness names b, and the robot admits only"
@@ -104,6 +120,21 @@ def test_each_trouble_is_reported_everywhere(of: dict[str, Any], more: dict[str,
     assert standby_view(reported).exit_status == 1
     assert [*samples_of(reported)["rosrv_standby_can_take_over"]] == [((), False)]
     assert [*samples_of(state(of, {}))["rosrv_standby_can_take_over"]] == [((), True)]
+
+
+@pytest.mark.parametrize("of", [ACTIVE, STANDBY])
+def test_an_active_appliance_that_does_not_serve_is_reported_on_both(of: dict[str, Any]) -> None:
+    """It is no reason against a switchover, which may be the remedy."""
+    reported = state(of, {"not_serving": "the disk is full; it keeps the lease: b could not serve"})
+    assert takeover_obstacles(reported, "") == []
+    view = standby_view(reported)
+    text = "the active appliance a (10.0.0.1) does not serve the robot: the disk is full; it keeps the lease: b could"
+    console = Console(width=400)
+    with console.capture() as shown:
+        console.print(view.screen)
+    assert (view.exit_status, text in shown.get()) == (1, True)
+    alarms = open_alarms(changed("standby", of | {"not_serving": "the disk is full"}))
+    assert [(alarm.kind, alarm.severity) for alarm in alarms] == [("not-serving", "alarm")]
 
 
 def test_a_lease_of_another_time_is_not_taken_for_two_active_appliances() -> None:

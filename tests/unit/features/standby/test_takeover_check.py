@@ -4,6 +4,7 @@ import json
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -120,6 +121,25 @@ async def test_a_standby_without_obstacles(standby: Standby) -> None:
     async with standby.checked() as checked:
         assert checked.check.obstacle == UNCHECKED
         assert await checked.next_obstacle() == ""
+
+
+async def test_a_standby_with_little_room_takes_over_only_what_the_other_one_has_lost(
+    standby: Standby, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would serve, but in service it needs more than it has: the two could pass the lease to and fro."""
+    free = 16 << 20
+    monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=free, f_frsize=1))
+    async with standby.checked() as checked:
+        assert (await checked.next_obstacle(), checked.check.scarce) == ("", "")
+        free -= 1
+        await checked.replicate()
+        assert await checked.next_obstacle() == ""
+        assert "16777215 bytes are free on its disk, 16777216 are wanted" in checked.check.scarce
+        assert "takes over only while a is away" in checked.check.scarce
+        free = (4 << 20) - 1
+        await checked.replicate()
+        assert "4194303 bytes are free" in await checked.next_obstacle()
+        assert checked.check.scarce == ""
 
 
 async def test_the_state_of_an_active_appliance_before_0_4(standby: Standby) -> None:
