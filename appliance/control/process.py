@@ -340,7 +340,8 @@ class _Control:
         listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
         calls, own = parts.pipeline.handler(parts.table), parts.pipeline.handler(parts.table, own=True)
         listen = listener_limits.server
-        await listener_limits.open(listen(sockets[RVMASTER].dup(), calls))
+        watched = listener_limits.answering.watched(calls)
+        await listener_limits.open(listen(sockets[RVMASTER].dup(), watched))
         await listener_limits.open(listen(sockets[OWN].dup(), own, guarded=False))
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
         await listener_limits.open(listen(sockets[INNER].dup(), inner.handle, guarded=False, keep=False))
@@ -444,4 +445,5 @@ def _starting(base: Foundation, parts: Parts) -> StartingControl:
         ready=parts.reconciler.ready,
         relays=lambda: parts.endpoints.relay.presence,
         probe=lambda: base.lifeline.surroundings.probe,
+        overdue=base.listener_limits.answering.overdue,
     )

@@ -37,6 +37,8 @@ class StartingControl:
     """Returns whether the relays are connected, as `RelayControl.presence`."""
     probe: Callable[[], str]
     """Returns the result of the probe of the ROS master's isolation."""
+    overdue: Callable[[], float]
+    """Returns the seconds for which a call has waited while none was answered."""
 
 
 class StartGate:

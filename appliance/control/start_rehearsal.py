@@ -36,7 +36,9 @@ from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import Database, StoreError, require_0_4
 
 _ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)
-SERVING_ROOM = 16 << 20  # that an active appliance may need before its log is written back (`wal_autocheckpoint`)
+SERVING_ROOM = (
+    16 << 20
+)  # that an active appliance may need before its log is written back (`wal_autocheckpoint`)
 
 _log = structlog.get_logger()
 

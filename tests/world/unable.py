@@ -8,13 +8,18 @@ from unittest.mock import patch
 
 from appliance.audit.log.log import AuditLog
 from appliance.control import start_rehearsal
+from appliance.control.assembly.listener_limits import Answering
 from appliance.features.standby import requests as standby_requests
 from tests.world.appliance import Appliance
 from tests.world.loop import BrokenPromiseError, present_process
 from tests.world.pair import PairWorld
 
 _AGAIN_SECONDS = 0.05  # sooner than a control is ready
-_WHOLE_SECONDS, _HARMED_SECONDS, _MOST_TAKEOVERS = 30.0, 585.0, 2  # ten minutes by a clock that runs 1 % faster are 594
+_WHOLE_SECONDS, _HARMED_SECONDS, _MOST_TAKEOVERS = (
+    30.0,
+    585.0,
+    2,
+)  # ten minutes by a clock that runs 1 % faster are 594
 _FULL, _FREE = 3 << 20, 20 << 20
 
 
@@ -37,7 +42,12 @@ class UnableWorld(PairWorld):
         disk = SimpleNamespace(statvfs=self._statvfs)
         works: Any = AuditLog.failed
         failed = property(lambda log: "it is away" if self._fails("log") else works.fget(log))
-        with patch.object(start_rehearsal, "os", disk), patch.object(AuditLog, "failed", failed):
+        overdue = lambda _calls: 60.0 if self._fails("calls") else 0.0  # noqa: E731  as the two above
+        with (
+            patch.object(start_rehearsal, "os", disk),
+            patch.object(AuditLog, "failed", failed),
+            patch.object(Answering, "overdue", overdue),
+        ):
             await self.passes(_WHOLE_SECONDS)
             self.harmed = True
             self._harm()
@@ -69,7 +79,11 @@ class UnableWorld(PairWorld):
 
     def _fails(self, reason: str) -> bool:
         here = present_process().machine.name
-        return self.reason == reason and self.harmed and any(one.active for one in self.appliances if one.address == here)
+        return (
+            self.reason == reason
+            and self.harmed
+            and any(one.active for one in self.appliances if one.address == here)
+        )
 
     def _statvfs(self, _folder: Path) -> SimpleNamespace:
         return SimpleNamespace(f_bavail=_FULL if self._fails("disk") else _FREE, f_frsize=1)
@@ -81,6 +95,9 @@ class UnableWorld(PairWorld):
 
     def log(self, appliance: Appliance) -> None:
         """An active appliance cannot write its log."""
+
+    def calls(self, appliance: Appliance) -> None:
+        """An active appliance reports, and answers no calls."""
 
     def silent(self, appliance: Appliance) -> None:
         if appliance.ready and appliance.control is not None:
@@ -100,4 +117,4 @@ class UnableWorld(PairWorld):
         appliance.relay.process.kill()
 
 
-REASONS = ("disk", "log", "silent", "unready", "died", "relays")
+REASONS = ("disk", "log", "calls", "silent", "unready", "died", "relays")

@@ -110,7 +110,9 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         raise LogUnreadableError(f"{path}: permission denied; run as root or as the log's owner")
     for file in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))):
         if file.exists() and not file.is_file():  # a pipe has no end
-            raise LogUnreadableError(f"{file}: not a regular file, so not written by rosrv; keep it as evidence")
+            raise LogUnreadableError(
+                f"{file}: not a regular file, so not written by rosrv; keep it as evidence"
+            )
     mode = "ro"
     if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
         mode = "ro&immutable=1"  # a copy on a read-only medium does not change

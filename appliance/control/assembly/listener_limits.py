@@ -5,12 +5,14 @@ the policy is audit-only, only a blocked host is. The beginning of its body is r
 call. While the ROS master is not hidden, every host is refused.
 """
 
+import itertools
 import socket
 from collections.abc import Callable
 from functools import partial
 
 from appliance.audit.log.budget import THE_ROBOT, DiskGroup
 from appliance.audit.log.record import Severity
+from appliance.base import clock
 from appliance.configuration.settings import Settings
 from appliance.master.calls.call import with_record
 from appliance.master.calls.request_peek import asked_for
@@ -25,9 +27,35 @@ from appliance.rpc.connection_table import ConnectionTable
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.server import Handler, HttpServer, Peer, Refusal
+from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import XmlRpcLimits, build_fault
+
+
+class Answering:
+    """Whether calls are answered; it counts those that are being carried out, so no host's queue matters."""
+
+    def __init__(self) -> None:
+        self._begun: dict[int, float] = {}  # oldest first
+        self._numbers = itertools.count()
+        self._answered = clock.now()
+
+    def watched(self, handler: Handler) -> Handler:
+        async def handle(request: HttpRequest) -> bytes:
+            number = next(self._numbers)
+            self._begun[number] = clock.now()
+            try:
+                return await handler(request)
+            finally:
+                del self._begun[number]
+                self._answered = clock.now()
+
+        return handle
+
+    def overdue(self) -> float:
+        """Return the seconds for which a call has waited while none was answered."""
+        oldest = next(iter(self._begun.values()), None)
+        return 0.0 if oldest is None else clock.now() - max(oldest, self._answered)
 
 
 class ListenerLimits:
@@ -56,6 +84,7 @@ class ListenerLimits:
         self.turns = Turns(RVMASTER_REQUESTS.bounds, quota_class, alike, trail.pause, own_slots=True)
         self.time = ProcessorTime(alike)
         self.first = NamedFirst(policy)
+        self.answering = Answering()
         self.own_connection_table = ConnectionTable(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._trail = trail

@@ -373,11 +373,15 @@ class LeaseProcess:
         kept = self._service.kept_for(now)
         try:
             if kept:
-                raise LeaseError(f"it gave the lease away before, and does so again in {kept:.0f} s at the earliest")
+                raise LeaseError(
+                    f"it gave the lease away before, and does so again in {kept:.0f} s at the earliest"
+                )
             due = self._lease.switch_over(now)
         except LeaseError as error:
             if not self._lease.fault:
-                _log.error("this appliance does not serve, and keeps the lease", reason=fault, kept=str(error))
+                _log.error(
+                    "this appliance does not serve, and keeps the lease", reason=fault, kept=str(error)
+                )
             self._lease.fault = f"{fault}; it keeps the lease: {error}"
             return
         self._lease.fault = ""

@@ -172,6 +172,7 @@ def _decoded(text: str, kind: type[_T]) -> _T | None:
 
 
 _REPAIR_SECONDS = 8.0
+_OVERDUE_SECONDS = 10.0  # with a processor that is shared a hundred times, calls still take a second or two
 
 
 class ServiceReport:
@@ -185,9 +186,10 @@ class ServiceReport:
         *,
         relays: Callable[[], str],
         probe: Callable[[], str],
+        overdue: Callable[[], float],
     ) -> None:
         self._settings, self._audit, self._keeps_state = settings, audit, keeps_state
-        self._relays, self._probe = relays, probe
+        self._relays, self._probe, self._overdue = relays, probe, overdue
         self._sound = clock.now()  # when nothing was to be repaired
 
     def now(self) -> lease_link.ControlServes:
@@ -196,6 +198,8 @@ class ServiceReport:
         obstacle = lacking_room(settings.state / "control")
         if failed is not None and settings.audit.on_audit_failure == "deny":
             obstacle = f"nothing is granted, because the audit log cannot be written: {failed}"
+        if not obstacle and (overdue := self._overdue()) > _OVERDUE_SECONDS:
+            obstacle = f"no call has been answered for {overdue:.0f} s"
         return lease_link.ControlServes(obstacle or self._lasting(), self._keeps_state())
 
     def _lasting(self) -> str:
@@ -254,6 +258,7 @@ async def begin(control: StartingControl) -> ControlPart:
             lambda: holds_if_lost(monitors.checked.states, monitors.switches.enabled),
             relays=control.relays,
             probe=control.probe,
+            overdue=control.overdue,
         )
         await pair.lease.report_service(report.now)
 

@@ -10,7 +10,7 @@ import pytest
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.listener_limits import ListenerLimits, class_of
+from appliance.control.assembly.listener_limits import Answering, ListenerLimits, class_of
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
@@ -20,6 +20,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
 from tests.support.core import FakeTrail
 from tests.support.engines import open_log
+from tests.support.virtual_clock import let_time_pass
 
 pytestmark = pytest.mark.anyio
 
@@ -52,6 +53,29 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
         sweep.cancel()
         listener_limits.close()
     log.close()
+
+
+async def test_calls_are_overdue_while_one_waits_and_none_is_answered() -> None:
+    peer, answering, due = Peer(address_of("10.0.0.7"), "10.0.0.7", "10.0.0.1"), Answering(), asyncio.Event()
+
+    async def answer(request: HttpRequest) -> bytes:
+        if request.body == b"slow":
+            await due.wait()
+        return b"!"
+
+    call = answering.watched(answer)
+    let_time_pass(60.0)
+    assert answering.overdue() == 0.0
+    slow = asyncio.create_task(call(HttpRequest(peer, "/", b"slow", 0)))
+    await asyncio.sleep(0)
+    let_time_pass(20.0)
+    assert answering.overdue() == 20.0
+    await call(HttpRequest(peer, "/", b"quick", 0))
+    let_time_pass(5.0)
+    assert answering.overdue() == 5.0
+    due.set()
+    await slow
+    assert answering.overdue() == 0.0
 
 
 def test_hosts_of_a_wildcard_share_processor_time() -> None:

@@ -27,8 +27,16 @@ def report_of(
     keeps_state: bool = False,
     relays: Callable[[], str] = lambda: "connected",
     probe: Callable[[], str] = lambda: "passed",
+    overdue: Callable[[], float] = lambda: 0.0,
 ) -> ServiceReport:
-    return ServiceReport(settings, log or FakeTrail().log, lambda: keeps_state, relays=relays, probe=probe)
+    log = log or FakeTrail().log
+    return ServiceReport(settings, log, lambda: keeps_state, relays=relays, probe=probe, overdue=overdue)
+
+
+def test_calls_that_nobody_answers_are_an_obstacle(settings: Settings) -> None:
+    """Control reports in time, but serves nobody."""
+    for seconds, obstacle in ((10.0, ""), (10.4, "no call has been answered for 10 s")):
+        assert report_of(settings, overdue=lambda seconds=seconds: seconds).now().obstacle == obstacle  # type: ignore[misc]  # mypy infers no type for a lambda's default
 
 
 def test_a_full_disk_is_an_obstacle(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
