@@ -1,3 +1,4 @@
+import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,11 +21,12 @@ def small_disk(place: Path, size: str, *options: str) -> Iterator[Path]:
 
 
 @contextmanager
-def filled(place: Path) -> Iterator[None]:
+def filled(place: Path, left: int = 0) -> Iterator[None]:
+    """Fill the disk for the block, but for about `left` bytes."""
     filler = place / "filler"
     with filler.open("wb", buffering=0) as file:
         part = b"x" * (1 << 20)
-        while part:
+        while part and shutil.disk_usage(place).free > left:
             try:
                 part = part if file.write(part) == len(part) else part[:-1]
             except OSError:

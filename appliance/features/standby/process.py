@@ -135,14 +135,16 @@ class WitnessChannel:
 # A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
 # relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
 #
-# Each appliance gives the lease away once in `AGAIN_SECONDS`, so two that cannot serve do not keep passing it back and
-# forth, whatever the reason: the one that has it then keeps it, and reports why it does not serve.
+# Each appliance gives the lease away once in `AGAIN_SECONDS`, or after it has served for `STEADY_SECONDS`. So two that
+# cannot serve do not keep passing it back and forth, whatever the reason: the one that has it then keeps it, and reports
+# why it does not serve.
 
 OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
 RESTART_SECONDS = 10.0
 AGAIN_SECONDS = 600.0
+STEADY_SECONDS = 60.0
 
 
 class ServiceWatch:
@@ -158,17 +160,21 @@ class ServiceWatch:
         self._obstacle = ""
         self._obstacle_since = 0.0
         self._given_at = float("-inf")
+        self._steady: float | None = None  # since when this control has reported no obstacle
 
     def linked(self) -> None:
-        self._serves, self._obstacle = False, ""
+        self._serves, self._obstacle, self._steady = False, "", None
 
     def reported(self, now: float, obstacle: str, *, keeps_state: bool) -> None:
         self._keeps_state = keeps_state
         if not obstacle:
             self._served, self._serves, self._cold = now, True, False
             self._ready = now if self._ready is None else self._ready
+            self._steady = now if self._steady is None else self._steady
+            if now - self._steady > STEADY_SECONDS:
+                self._given_at = float("-inf")
         elif not self._obstacle:
-            self._obstacle_since = now
+            self._obstacle_since, self._steady = now, None
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:

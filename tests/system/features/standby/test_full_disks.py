@@ -1,5 +1,6 @@
 import os
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ from tests.support.requirements import need_program, need_root, needs
 from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
 
+_LITTLE = 3 << 20  # bytes
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
@@ -27,18 +30,19 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
         small_disk(home / "robot", "1m") as disk,
         Lab("rosrv-disks") as lab,
         StandbySite(lab, home, lease_folder=disk) as made,
+        ExitStack() as disks,
     ):
-        state = made.appliances["a"].state
-        member = load_membership(path_of(state))
-        assert member is not None
-        with small_disk(state, "200m", "mode=0711"):
-            save_membership(path_of(state), member)
-            made.start_witness()
-            made.start("a")
-            made.until_active("a")
-            made.start("b")
-            made.until_both_in_sync()
-            yield made
+        for one in made.appliances.values():
+            member = load_membership(path_of(one.state))
+            assert member is not None
+            disks.enter_context(small_disk(one.state, "200m", "mode=0711"))
+            save_membership(path_of(one.state), member)
+        made.start_witness()
+        made.start("a")
+        made.until_active("a")
+        made.start("b")
+        made.until_both_in_sync()
+        yield made
 
 
 def until_able(site: StandbySite) -> None:
@@ -113,16 +117,38 @@ def test_a_full_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> Non
     site.until_both_in_sync()
 
 
-def test_a_full_disk_of_the_active_appliance(site: StandbySite, robot: StandbyRobot) -> None:
+def test_two_nearly_full_disks(site: StandbySite, robot: StandbyRobot) -> None:
+    """The lease does not go to and fro: while neither can serve, and after it has gone both ways."""
+
+    def reports(name: str, words: str) -> None:
+        def told() -> bool:
+            done = site.appliances[name].rosrv("standby", "status", check=False)
+            return done.returncode == 1 and words in " ".join(done.stdout.split())
+
+        eventually(told, site.story)
+
     until_able(site)
-    site.promote("b")
-    site.until_taken_over("a")
-    site.until_active("a")
+    epoch, (first, second) = site.lease.read().epoch, site.pair()
+    states = {name: one.state for name, one in site.appliances.items()}
+    with filled(states[second], _LITTLE):
+        reports(first, "are free on its disk")
+        with filled(states[first], _LITTLE):
+            for name in (first, second):
+                reports(name, f"does not serve the robot: {states[first]}")
+        assert site.lease.read().epoch == epoch
     until_able(site)
-    with filled(site.appliances["a"].state):
-        site.until_taken_over("b")
+    with filled(states[first], _LITTLE):
+        site.until_taken_over(second)
         robot.serves_newcomers()
     until_able(site)
+    with filled(states[second], _LITTLE):
+        site.until_taken_over(first)
+    with filled(states[first], _LITTLE):
+        for name in (first, second):
+            reports(name, "it keeps the lease: it gave the lease away before")
+        assert site.lease.read().epoch == epoch + 2
+    until_able(site)
+    robot.serves_newcomers()
 
 
 def refuse(site: StandbySite, words: str) -> None:

@@ -65,3 +65,15 @@ def test_it_keeps_the_lease_for_ten_minutes_after_it_gave_it_away() -> None:
     assert watch.fault(112.0, active=True) == "full"
     assert watch.kept_for(112.0) == AGAIN_SECONDS - 7.0
     assert watch.kept_for(105.0 + AGAIN_SECONDS) == 0.0
+
+
+def test_a_minute_of_service_ends_that_time() -> None:
+    """A later full disk of this appliance has nothing to do with the earlier one."""
+    watch = serving()
+    watch.given_away(105.0)
+    assert watch.fault(106.0, active=False) == watch.fault(110.0, active=True) == ""
+    for seconds, obstacle in ((0.0, ""), (30.0, "full"), (31.0, ""), (91.0, "")):
+        watch.reported(110.0 + seconds, obstacle, keeps_state=False)
+        assert watch.kept_for(110.0 + seconds)
+    watch.reported(201.1, "", keeps_state=False)
+    assert watch.kept_for(201.1) == 0.0
