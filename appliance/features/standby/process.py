@@ -135,9 +135,9 @@ class WitnessChannel:
 # A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
 # relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
 #
-# Each appliance gives the lease away once in `AGAIN_SECONDS`, or after it has served for `STEADY_SECONDS`. So two that
-# cannot serve do not keep passing it back and forth, whatever the reason: the one that has it then keeps it, and reports
-# why it does not serve.
+# Each appliance gives the lease away once in `AGAIN_SECONDS`, or after it has served for `STEADY_SECONDS`, so that two
+# which cannot serve do not keep passing it back and forth, whatever the reason. The one that has it then keeps it, and
+# reports why it does not serve.
 
 OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds

@@ -66,7 +66,7 @@ async def test_calls_are_overdue_while_one_waits_and_none_is_answered() -> None:
     call = answering.watched(answer)
     let_time_pass(60.0)
     assert answering.overdue() == 0.0
-    slow = asyncio.create_task(call(HttpRequest(peer, "/", b"slow", 0)))
+    slow = asyncio.ensure_future(call(HttpRequest(peer, "/", b"slow", 0)))
     await asyncio.sleep(0)
     let_time_pass(20.0)
     assert answering.overdue() == 20.0
