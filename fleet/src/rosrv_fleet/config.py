@@ -29,7 +29,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     `uploads` limits simultaneous uploads; each robot has at most one. The bytes per day include rejected uploads.
     `reserve_bytes` of the disk stay free. `check_seconds` is processor time. `searches` limits simultaneous searches;
     one token gets at most half. `header_seconds` limits a TLS handshake, and then each request's headers.
-    `address_connections` limits one address, not counting connections of robots.
+    `address_connections` limits one address, not counting connections of robots; each robot from there adds four.
     """
 
     segment_bytes: _Positive = 512 << 20

@@ -1,7 +1,8 @@
 """Limit the open connections of each robot, of each address, and in total.
 
 A connection counts from `accept` to `close`: for its address (in IPv6 its /64 network) until a robot's certificate is
-verified, then for the robot.
+verified, then for the robot. Each robot that has come from an address adds to the address's limit, because its next
+connections wait there for their handshakes, perhaps beside those of many robots behind the same address.
 
 An address is *proven* once a robot or an operator has connected from it. All unproven addresses together get at most
 half of the connections. When this half or the total is used up, the unproven address with the most connections loses
@@ -26,6 +27,7 @@ _OTHER_FILES = 256  # open files that are not connections: uploads, the database
 _LEAST_CONNECTIONS = 64
 _LOG_SECONDS = 60.0
 _MOST_PROVEN = 10_000
+_OF_EACH_ROBOT = 4  # connections that an appliance opens at once: segments, evidence, presence, bundles
 # Handshakes, or requests: of each proven address, behind which there may be many robots, and of all others together.
 _PROVEN_A_SECOND, _PROVEN_AT_ONCE = 200.0, 256.0
 _OTHERS_A_SECOND, _OTHER_AT_ONCE = 50.0, 32.0
@@ -94,15 +96,17 @@ class ClientConnections:
             str, dict[int, CountedSocket]
         ] = {}  # those of addresses that are not proven, oldest first
         self._others_open = 0
-        self._proven: OrderedDict[str, None] = OrderedDict()
+        self._proven: OrderedDict[str, set[str]] = OrderedDict()  # the robots that have come from there
         self._handshakes, self._requests = Shares(), Shares()
         self._logged = 0.0
 
     def accepted(self, connection: "CountedSocket", address: str) -> bool:
         owner = owner_of(address)
         proven = owner in self._proven
-        if self._owners[owner] >= self._limits.address_connections:
-            return self._refused(owner, self._limits.address_connections)
+        most = self._limits.address_connections
+        most = max(most, min(most + _OF_EACH_ROBOT * len(self._proven.get(owner, ())), self._most // 2))
+        if self._owners[owner] >= most:
+            return self._refused(owner, most)
         if not self._handshakes.take(owner, proven=proven):
             return self._refused(
                 f"handshakes of {owner}", int(_PROVEN_A_SECOND if proven else _OTHERS_A_SECOND)
@@ -131,6 +135,7 @@ class ClientConnections:
         if robot is None:
             return True
         self.prove(connection.owner)
+        self._proven[connection.owner].add(robot)
         owner = f"robot {robot}"
         if self._owners[owner] >= self._limits.robot_connections:
             return self._refused(owner, self._limits.robot_connections)
@@ -140,7 +145,7 @@ class ClientConnections:
         return True
 
     def prove(self, owner: str) -> None:
-        self._proven[owner] = None
+        self._proven.setdefault(owner, set())
         self._proven.move_to_end(owner)
         if len(self._proven) > _MOST_PROVEN:
             self._proven.popitem(last=False)

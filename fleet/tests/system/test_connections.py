@@ -69,6 +69,22 @@ def test_an_address_has_a_limit_of_connections(narrow: FleetSite) -> None:
 
 
 @pytest.mark.parametrize("narrow", [120.0], indirect=True)
+def test_a_known_robot_comes_in_beside_the_handshakes_of_its_address(narrow: FleetSite) -> None:
+    robot = FleetRobot(narrow, "arm")
+    context = ssl.create_default_context(cafile=narrow.server.ca)
+    context.load_cert_chain(robot.certificates.certificate, robot.certificates.key)
+    with ExitStack() as stack:
+        waiting = [stack.enter_context(_connect(narrow)) for _ in range(7)]
+        assert not any(map(_is_closed, waiting)), "an address that no robot has come from has six"
+        tls = stack.enter_context(
+            context.wrap_socket(stack.enter_context(_connect(narrow)), server_hostname="127.0.0.1")
+        )
+        assert _is_held(tls)
+        assert any(map(_is_closed, [stack.enter_context(_connect(narrow)) for _ in range(7)]))
+    robot.close()
+
+
+@pytest.mark.parametrize("narrow", [120.0], indirect=True)
 def test_a_robot_has_a_limit_of_connections(narrow: FleetSite) -> None:
     bad, good = FleetRobot(narrow, "bad"), FleetRobot(narrow, "good")
     context = ssl.create_default_context(cafile=narrow.server.ca)

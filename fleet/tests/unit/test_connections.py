@@ -63,6 +63,24 @@ async def test_unproven_addresses_leave_half_of_the_connections(table: ClientCon
     assert len(_opened(table, "10.0.0.1", 40)) == 40
 
 
+async def test_robots_behind_one_address_do_not_wait_for_each_others_handshakes(
+    table: ClientConnections,
+) -> None:
+    """After a pause of the site's link, all of them connect at once, again and again, while handshakes are slow."""
+    robots = [f"robot{number}" for number in range(30)]
+    first = _opened(table, "10.0.0.1", 30)
+    for one, robot in zip(first, robots, strict=True):
+        assert table.established(one.fileno(), robot)
+        table.closed(one.fileno())
+    waiting = _opened(table, "10.0.0.1", 300)
+    assert len(waiting) == 64 + 4 * 30
+    assert len(_opened(table, "10.0.0.2", 300)) == 64, "no robot has come from there"
+    others = [one for _number in range(100) for one in _opened(table, "10.0.0.3")]
+    for number, one in enumerate(others[:60]):
+        table.established(one.fileno(), f"another{number}")
+    assert len(_opened(table, "10.0.0.3", 300)) <= 200, "at most half of the whole is for one address"
+
+
 async def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
     (early,) = _opened(table, "10.0.0.7")
     many = [one for number in range(1, 5) for one in _opened(table, f"203.0.113.{number}", 64)]
