@@ -34,6 +34,7 @@ def test_no_history_of_two_appliances_of_a_night_breaks_a_promise(case: int) -> 
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("reason", REASONS)
 def test_two_appliances_that_cannot_serve_pass_the_lease_at_most_twice_in_ten_minutes(reason: str) -> None:
     run(1, kind=type(reason, (UnableWorld,), {"reason": reason}))

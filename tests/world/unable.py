@@ -63,7 +63,7 @@ class UnableWorld(PairWorld):
         await self.settled()
 
     async def _says(self) -> None:
-        """The standby reports that the active appliance does not serve: that one perhaps answers nobody."""
+        """The standby reports that the active appliance does not serve: that one perhaps answers no call."""
         [standby] = [one for one in self.appliances if not one.active]
         administration, _process = standby.admin.administration  # type: ignore[attr-defined]  # as `_AdminServer` sets it
         answer: Any = await administration.carry_out(standby_requests.StandbyWanted(), who="operator")

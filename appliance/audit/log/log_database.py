@@ -110,9 +110,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         raise LogUnreadableError(f"{path}: permission denied; run as root or as the log's owner")
     for file in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))):
         if file.exists() and not file.is_file():  # a pipe has no end
-            raise LogUnreadableError(
-                f"{file}: not a regular file, so not written by rosrv; keep it as evidence"
-            )
+            raise LogUnreadableError(f"{file}: not a regular file; keep it as evidence")
     mode = "ro"
     if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
         mode = "ro&immutable=1"  # a copy on a read-only medium does not change
@@ -163,7 +161,7 @@ def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connec
             if views:
                 names = ", ".join(str(name) for (name,) in views)
                 raise LogUnreadableError(
-                    f"{path}: has the view {names}, which no log has: rosrv did not write it; keep it as evidence"
+                    f"{path}: has the view {names}, which no log has; keep it as evidence"
                 )
         except sqlite3.OperationalError:
             raise

@@ -71,7 +71,7 @@ def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
     own = next((one for one in logs if one.log == log), None)
     beside = others(logs, log)
     if signed is None:
-        lost = own is None or own.lacks_memory  # even if the key is gone, too: a signer that signed has both
+        lost = own is None or own.lacks_memory  # a signer that signed has memory and key
         return SignerMemory(others=beside, lost=lost, key=key)
     removed_to = None if removed is None else int.from_bytes(removed, "big")
     first = int.from_bytes(signed[:HEADER_BYTES], "big")

@@ -80,7 +80,7 @@ async def require_equal(directory: Path, active: ActiveSide) -> None:
 async def test_a_standby_of_an_earlier_version_says_why_it_cannot_follow_until_it_is_upgraded(
     tmp_path: Path,
 ) -> None:
-    """It refuses a table of a later version on each link anew, and looks connected until then."""
+    """On each link it refuses a table of a later version, and looks connected until then."""
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server, schema=STATE_SCHEMA)
     why = "a change does not fit: the state has no table 'ends'"

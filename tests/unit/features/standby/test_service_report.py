@@ -33,8 +33,8 @@ def report_of(
     return ServiceReport(settings, log, lambda: keeps_state, relays=relays, probe=probe, overdue=overdue)
 
 
-def test_calls_that_nobody_answers_are_an_obstacle(settings: Settings) -> None:
-    """Control reports in time, but serves nobody."""
+def test_calls_without_an_answer_are_an_obstacle(settings: Settings) -> None:
+    """Control reports in time, but answers no call."""
     for seconds, obstacle in ((10.0, ""), (10.4, "no call has been answered for 10 s")):
         assert report_of(settings, overdue=lambda seconds=seconds: seconds).now().obstacle == obstacle  # type: ignore[misc]  # mypy infers no type for a lambda's default
 

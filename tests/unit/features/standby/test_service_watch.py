@@ -55,7 +55,7 @@ def test_an_obstacle_that_lasts() -> None:
 
 
 def test_it_keeps_the_lease_for_ten_minutes_after_it_gave_it_away() -> None:
-    """Two that cannot serve, for whatever reason, do not pass it back and forth. The reason is told all the time."""
+    """Two that cannot serve, for whatever reason, do not pass it back and forth. It reports the reason all the time."""
     watch = serving()
     assert watch.kept_for(103.0) == 0.0
     watch.reported(103.0, "full", keeps_state=False)

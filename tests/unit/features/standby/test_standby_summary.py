@@ -124,7 +124,7 @@ def test_each_trouble_is_reported_everywhere(of: dict[str, Any], more: dict[str,
 
 @pytest.mark.parametrize("of", [ACTIVE, STANDBY])
 def test_an_active_appliance_that_does_not_serve_is_reported_on_both(of: dict[str, Any]) -> None:
-    """It is no reason against a switchover, which may be the remedy."""
+    """It does not prevent a switchover, which may be the remedy."""
     reported = state(of, {"not_serving": "the disk is full; it keeps the lease: b could not serve"})
     assert takeover_obstacles(reported, "") == []
     view = standby_view(reported)
