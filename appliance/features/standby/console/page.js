@@ -29,6 +29,7 @@ export function StandbyPage() {
   return html`<main class="door" id="main"><div class="door-box standby">
     <div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">Standby</h1><div class="brand-sub">${value && !value.other.connected ? "The other appliance is away." : "The robot's nodes use the other appliance."}</div></div></div>
     <a class="button primary" href=${there} rel="noreferrer"><span>Open the console of ${value ? html`<${Given} value=${value.other.name} most=${40} />` : "the active appliance"}</span></a>
+    ${value?.not_serving && html`<${Banner} text=${`${value.other.name} is active and does not serve the robot: ${value.not_serving}`} />`}
     ${value?.troubles.map((/** @type {string} */ text) => html`<${Banner} key=${text} text=${text} />`)}
     ${value ? html`<${Pair} state=${value} />` : error ? html`<${Failure} error=${error} />` : html`<section class="panel"><${Loading} rows=${3} /></section>`}
     <div class="row row-apart"><span class="muted small"><${Given} value=${there} mono /></span><button class="button small" onClick=${signOut}>Sign out</button></div>

@@ -12,7 +12,7 @@ import { useStore } from "#console/store.js";
 import { SwitchOver } from "./switch.js";
 
 const SILENT = 5; // seconds, as in features/standby/standby_summary.py
-const GRAVE = ["both-active", "standby-unready", "standby-unchecked", "standby-away", "standby-behind", "witness-refuses", "witness-silent", "standby-blind", "witness-disk", "follower-trouble"];
+const GRAVE = ["both-active", "not-serving", "standby-refuses", "standby-unready", "standby-unchecked", "standby-away", "standby-behind", "witness-refuses", "witness-silent", "standby-blind", "witness-disk", "follower-trouble"];
 
 /** The panel on Now. @param {{status: any}} given */
 export function PairNow({ status }) {
