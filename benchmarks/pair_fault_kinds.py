@@ -12,6 +12,7 @@ from typing import Any
 
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.features.standby import requests as standby_requests
+from appliance.features.standby.process import STEADY_SECONDS
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.processes import Process
 from tests.support.small_disk import filled
@@ -122,6 +123,8 @@ def _shut(site: StandbySite, active: str, passive: str, said: Said) -> Iterator[
 
 def _full(site: StandbySite, active: str, passive: str, _said: Said, *, of: str) -> Any:
     places = {"active": site.appliances[active].state, "standby": site.appliances[passive].state}
+    if of == "active":
+        _NEVER.wait(1.1 * STEADY_SECONDS)  # an appliance that has just got the lease back keeps it
     return filled(places.get(of, site.home / "robot"))
 
 
