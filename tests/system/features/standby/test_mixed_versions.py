@@ -1,15 +1,13 @@
 """A pair is upgraded, and the state of the later version has a table that the earlier one does not know."""
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.support.features.standby.changed_product import changed_product
 from tests.support.features.standby.standby_robot import StandbyRobot
 from tests.support.features.standby.standby_site import StandbySite
-from tests.support.sources import ROOT
 from tests.support.waiting import eventually
 
 _CHANGES = {
@@ -26,18 +24,8 @@ _CHANGES = {
 
 @pytest.fixture
 def later() -> Iterator[Path]:
-    """A copy of the product whose state has one table more."""
-    folder = Path(tempfile.mkdtemp())  # the users of its processes cannot enter pytest's folder
-    folder.chmod(0o755)
-    for name in ("appliance", "rosmop", "roswire", "monitors"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "tests"))
-    for name, (old, new) in _CHANGES.items():
-        file = folder / "appliance" / name
-        text = file.read_text()
-        assert old in text, name
-        file.write_text(text.replace(old, new))
-    yield folder
-    shutil.rmtree(folder)
+    with changed_product(_CHANGES) as folder:
+        yield folder
 
 
 def test_the_earlier_one_of_a_half_upgraded_pair_says_why_it_cannot_follow(
