@@ -78,6 +78,7 @@ RUN apt-get update -q \
         rosout \
         strongswan-swanctl \
         tini \
+        tzdata \
         ${PINS} \
  && apt-get clean \
  && rm -rf /var/lib/apt/lists/* /var/cache/* /var/log/* /usr/share/doc/*/changelog* /usr/share/man/* /tmp/* \

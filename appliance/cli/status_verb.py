@@ -292,7 +292,10 @@ def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
 def doubted_clock(clock: ClockState) -> str | None:
     if clock.before_program_seconds:
         days = clock.before_program_seconds / 86_400
-        return f"wrong: {days:.0f} days before this program was built; set it before hosts get certificates"
+        return (
+            f"wrong: {days:.0f} days before this program was built; set it before hosts get certificates"
+            " (rights with a time grant nothing until then)"
+        )
     if clock.behind_seconds:
         return f"set back: {clock.behind_seconds:.0f} s before the last record"
     if clock.synchronised is None:

@@ -19,7 +19,7 @@ from appliance.channel.answers.inventory_answers import Inventory, Part
 # The packages of packages.txt whose programs run on the robot's computer.
 RUNS = (
     "python3-rosmaster", "rosout", "iproute2", "iptables", "nftables", "charon-systemd",
-    "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2",
+    "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2", "tzdata",
 )  # fmt: skip
 _STANDS_ON = {*RUNS, "python3", "libc6", "rosrv"}
 _LICENCE = re.compile(r"^License:[ \t]*+(\S[^\n]*+)$", re.MULTILINE)

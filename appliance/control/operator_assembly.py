@@ -50,9 +50,14 @@ class Operators:
 
 def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> QueryParts:
     settings, trail, ends = base.settings, base.trail, parts.endpoints
+
+    def stepped() -> None:
+        base.hosts.tunnels.state_anew()
+        base.policies.time_passed()
+
     rest, sessions = Current[RestLink](), Provided[Sessions]()
     tokens = TokenOrders(base.store, trail, base.ends, lambda: rest().state_tokens(), sessions=sessions)
-    clock = ClockCheck(trail, lambda: base.audit.ids.ahead, stepped=base.hosts.tunnels.state_anew)
+    clock = ClockCheck(trail, lambda: base.audit.ids.ahead, stepped=stepped)
     base.ends.when_cut_short(clock.cut_short)
     switched_off = SwitchedOffWatch(
         lambda: parts.monitors.switches.switched_off(),  # noqa: PLW0108  of those in force then

@@ -14,7 +14,7 @@ import msgspec
 from appliance.audit.log.record_format import LogEntry, rfc3339
 
 SUBJECTS: Mapping[str, tuple[str, ...]] = {
-    "policy": ("policy loaded", "policy confirmed", "policy file refused"),
+    "policy": ("policy loaded", "policy confirmed", "policy file refused", "rights changed"),
     "guards and monitors": (
         "specifications loaded", "specifications confirmed", "monitor enabled", "monitor disabled",
         "monitor in shadow mode", "monitor set", "monitor resumed", "monitor not built", "driver checked",
@@ -102,6 +102,7 @@ CHANGES: Mapping[str, StateChange] = {
     "policy loaded": _text(),
     "policy confirmed": StateChange("in force until its time limit", "confirmed"),
     "policy file refused": NOTHING_CHANGED,
+    "rights changed": NOTHING_CHANGED,  # the policy itself has the times; the reason names the rights
     "specifications loaded": _text(),
     "specifications confirmed": StateChange("in force until their time limit", "confirmed"),
     "monitor enabled": StateChange("{earlier}", "enabled"),

@@ -1,6 +1,7 @@
 """Run the test cases of a policy (`FILE.tests.yaml`, docs/policy.md).
 
-The policy is compiled with the `given` addresses, so its cases pass wherever it is deployed.
+The policy is compiled with the `given` addresses, so its cases pass wherever it is deployed. A case without `at` is
+decided as if each right with a time had begun and none had ended, so it passes whenever the policy is loaded.
 """
 
 import ipaddress
@@ -13,6 +14,7 @@ import yaml
 from appliance.base.validation_messages import meant, not_yaml
 from appliance.policy.actions import BadWordError, find_hosts, parse_action
 from appliance.policy.host_sets import canonical_address
+from appliance.policy.hours import instant
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -88,7 +90,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
 
 class _CaseReader:
     def __init__(self, policy: Policy, findings: Findings) -> None:
-        self._policy = policy
+        self._policy = policy.at_any_time()
         self._findings = findings
         self._checks = 0
 
@@ -108,7 +110,8 @@ class _CaseReader:
         if "hosts" in given:
             for name, (_, value) in self._mapping(given["hosts"][1], "hosts", None).items():
                 hosts.update((name, address) for address in self._addresses(value))
-        self._policy = compile_policy(self._policy.text, file=self._policy.file, hosts=hosts, robot=robot)
+        policy = compile_policy(self._policy.text, file=self._policy.file, hosts=hosts, robot=robot)
+        self._policy = policy.at_any_time()
 
     def _addresses(self, node: _Node) -> Iterator[Address]:
         for scalar in node.value if isinstance(node, yaml.SequenceNode) else [node]:
@@ -120,7 +123,7 @@ class _CaseReader:
                     self._error(scalar, f"{quoted(text)} is not an IP address")
 
     def _case(self, node: _Node) -> Iterator[CaseResult]:
-        case = self._mapping(node, "a case", ("host", "node", *_EXPECTED))
+        case = self._mapping(node, "a case", ("host", "node", "at", *_EXPECTED))
         if not case:
             return
         hosts = list(self._hosts(node, case))
@@ -129,11 +132,17 @@ class _CaseReader:
             caller_id = self._text(case["node"][1], "node")
             if not is_global_name(caller_id):
                 self._error(case["node"][1], f"{quoted(caller_id)} is not a node name, such as /joystick")
+        policy = self._policy
+        if "at" in case:
+            try:
+                policy = policy.at(instant(self._text(case["at"][1], "at"), policy.zone))
+            except ValueError as fault:
+                self._error(case["at"][1], str(fault))
         if case.keys().isdisjoint(_EXPECTED):
             self._error(node, "a case needs allow:, deny: or ask: with the actions of the host")
         for expected in _EXPECTED:
             for action in self._sequence(case[expected][1], expected) if expected in case else ():
-                yield from self._check(action, hosts, caller_id, expected)
+                yield from self._check(policy, action, hosts, caller_id, expected)
 
     def _hosts(self, node: _Node, case: _Pairs) -> Iterator[Address]:
         if "host" not in case:
@@ -148,7 +157,7 @@ class _CaseReader:
                 self._error(scalar, f"{fault}; addresses can be given below given:")
 
     def _check(
-        self, node: _Node, hosts: list[Address], caller_id: str, expected: Expected
+        self, policy: Policy, node: _Node, hosts: list[Address], caller_id: str, expected: Expected
     ) -> Iterator[CaseResult]:
         text = self._text(node, "what the host does")
         try:
@@ -165,7 +174,7 @@ class _CaseReader:
             if needs_node(request) and not caller_id:
                 self._error(node, f"{quoted(text)} makes a node part of the graph: the case needs node:")
                 return
-            decision = decide(self._policy, rights_of(request))
+            decision = decide(policy, rights_of(request))
             line, column = node.start_mark.line + 1, node.start_mark.column + 1
             yield CaseResult(self._findings.file, line, column, request, expected, decision)
 

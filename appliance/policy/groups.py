@@ -2,11 +2,12 @@
 
 import ipaddress
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.base.validation_messages import meant
 from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network, canonical_network
+from appliance.policy.hours import HoursTable, RightTime, host_units
 from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.model import DOOR, HOST, Address, known_name
 from appliance.policy.policy_findings import Findings, quoted
@@ -16,6 +17,7 @@ ROBOT = "robot"
 _GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*+", re.ASCII)
 _HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,252}", re.ASCII)
 _SHOWN_LIMIT = 80
+_MOST_TIMES = 1000
 
 
 @dataclass(slots=True)
@@ -37,6 +39,7 @@ class HostGroups:
         findings: Findings,
         hosts: Mapping[str, Address],
         robot: Collection[Address | Network],
+        now: float | None = None,
     ) -> None:
         self.robot = tuple(_as_network(member) for member in robot)
         self.groups: dict[str, HostGroup] = {ROBOT: HostGroup(table.group(), None, used=True)}
@@ -46,13 +49,15 @@ class HostGroups:
         self._kept: dict[str, Atom] = {}
         self._warned_loopback = False
         self._warned_hosts: set[str] = set()
+        self._now = now
+        self.hours = HoursTable(None, (), findings, now)
+        self.times: dict[Atom, RightTime] = {}
         table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
 
-    def define(self, section: SectionText | None) -> None:
-        if section is None:
-            return
-        for entry in section.entries:
+    def define(self, section: SectionText | None, hours: SectionText | None = None) -> None:
+        for entry in section.entries if section is not None else ():
             self._declare(entry)
+        self.hours = HoursTable(hours, self.groups, self._findings, self._now)
         for group in self.groups.values():
             self._table.put((atom for _, atom in self.read(group.values)), group.atom)
         self._find_cycles()
@@ -84,17 +89,37 @@ class HostGroups:
         else:
             self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
 
-    def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
+    def units(self, words: Sequence[Word]) -> list[tuple[Word, ...]]:
+        return host_units(words, self.groups)
+
+    def read(self, words: Sequence[Word]) -> tuple[tuple[str, Atom], ...]:
         atoms: dict[Atom, str] = {}
-        for word in words:
+        for unit in self.units(words):
             if self._findings.full:
                 break
-            atom = self._atom(word)
+            text = " ".join(word.text for word in unit)
+            atom = self._atom(unit[0]) if len(unit) == 1 else self._timed_atom(unit, text)
             if atom in atoms:
-                self._findings.warn(word, f"{quoted(word.text)} is listed twice")
+                self._findings.warn(unit[0], f"{quoted(text)} is listed twice")
             elif atom is not None:
-                atoms[atom] = word.text
+                atoms[atom] = text
         return tuple((text, atom) for atom, text in atoms.items())
+
+    def _timed_atom(self, unit: tuple[Word, ...], text: str) -> Atom | None:
+        """Return the atom of a host within its time, a group that hosts are in only then."""
+        time = self.hours.time_of(unit)
+        member = self._atom(unit[0]) if time is not None else None
+        if time is None or member is None:
+            return None
+        if text not in self._kept:
+            if len(self.times) == _MOST_TIMES:
+                self._findings.error(
+                    unit[1], f"more than {_MOST_TIMES} hosts with a time: put them in groups"
+                )
+            self._kept[text] = atom = self._table.group()
+            self._table.put([member], atom)
+            self.times[atom] = time
+        return self._kept[text]
 
     def _atom(self, word: Word) -> Atom | None:
         text = word.text
@@ -191,11 +216,11 @@ class HostGroups:
             text = f"the group contains itself: {' = '.join([*shown, cycle[0]])}"
             self._findings.error(word, text)
 
-    def shown(self, words: Iterable[Word]) -> str:
+    def shown(self, words: Sequence[Word]) -> str:
         parts: list[str] = []
         length = 0
-        for word in words:
-            part = self._spelled_out(word)
+        for word, *limits in self.units(words):
+            part = " ".join([self._spelled_out(word), *(limit.text for limit in limits)])
             if parts and length + len(part) > _SHOWN_LIMIT:
                 parts.append("…")
                 break

@@ -5,7 +5,7 @@ networks. A rule includes a host if they share an atom, so cost does not grow wi
 """
 
 import ipaddress
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Final
 
 from appliance.policy.model import Address
@@ -71,7 +71,8 @@ class HostSets:
     def parents(self, atom: Atom) -> list[Atom]:
         return self._parents[atom]
 
-    def atoms_of(self, address: Address) -> frozenset[Atom]:
+    def atoms_of(self, address: Address, closed: Container[Atom] = ()) -> frozenset[Atom]:
+        """Return the atoms of an address; none through the atoms `closed`."""
         address = canonical_address(address)
         number = int(address)
         waiting = [EVERYONE]
@@ -79,7 +80,7 @@ class HostSets:
             atom = table.get(number >> shift)
             if atom is not None:
                 waiting.append(atom)
-        return self.above(waiting)
+        return self.above(waiting, closed)
 
     def narrowest(self, address: Address) -> Network | None:
         plain = canonical_address(address)
@@ -90,13 +91,13 @@ class HostSets:
         network = ipaddress.IPv4Network if plain.version == 4 else ipaddress.IPv6Network
         return network((number >> min(shifts) << min(shifts), bits - min(shifts)))
 
-    def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
+    def above(self, atoms: Iterable[Atom], closed: Container[Atom] = ()) -> frozenset[Atom]:
         """Return the atoms and every group that contains one of them, at any depth."""
         waiting = list(atoms)
         found = set(waiting)
         while waiting:
             for parent in self._parents[waiting.pop()]:
-                if parent not in found:
+                if parent not in found and parent not in closed:
                     found.add(parent)
                     waiting.append(parent)
         return frozenset(found)

@@ -18,6 +18,10 @@ def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
     return frozenset((ipaddress.ip_address(host), Category(category), name) for host, category, name in rows)
 
 
+def ends_of(ended: Iterable[float], lasting: Iterable[float]) -> dict[float, bool]:
+    return {**dict.fromkeys(lasting, False), **dict.fromkeys(ended, True)}
+
+
 @dataclass(frozen=True, slots=True)
 class PolicyContext:
     """The surroundings of a policy: the addresses of `host:NAME` and `robot`, and the test cases.
@@ -25,6 +29,9 @@ class PolicyContext:
     `own` are the other addresses of the robot's machine, which belong to `robot` unless the policy names them.
     If the test cases could not be read, `cases_error` says why, and rejects the policy. `blocks`, `holders` and
     `approved` do not affect checks and test cases; None: they are not known.
+
+    `now` is the time by which rights with a time are decided; None: the clock is not set. `ends` says of some ends of
+    such rights whether they have passed, by the age clock. Both are in seconds since the epoch.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -37,14 +44,27 @@ class PolicyContext:
     holders: Mapping[str, Address] | None = None
     approved: frozenset[Approval] | None = None
     own: Collection[Address] = ()
+    now: float | None = None
+    ends: Mapping[float, bool] = field(default_factory=dict)
 
     def compiled(self, text: str, file: str) -> Policy:
         """Compile a text for these addresses. Raises `PolicyError`."""
-        return compile_policy(text, file=file, hosts=self.hosts, robot=self.robot, own=self.own)
+        return compile_policy(
+            text,
+            file=file,
+            hosts=self.hosts,
+            robot=self.robot,
+            own=self.own,
+            now=self.now,
+            ends=self.ends,
+        )
 
     def complete(self, policy: Policy) -> Policy:
-        """Return the policy with the present blocks, holders of groups and approvals."""
-        holders = None if self.holders is None else dict(self.holders)
+        """Return the policy with the present blocks, holders of groups and approvals, at the present time."""
+        holders, policy = (
+            None if self.holders is None else dict(self.holders),
+            policy.at(self.now, self.ends),
+        )
         return replace(policy, blocks=dict(self.blocks), holders=holders, approved=self.approved)
 
     def with_hosts(self, hosts: Mapping[str, Address]) -> Self:
@@ -66,6 +86,8 @@ class PolicyContext:
             holders={group: ipaddress.ip_address(host) for group, host in (fields["holders"] or {}).items()},
             approved=approvals_of(fields["approved"]),
             own=[ipaddress.ip_address(address) for address in fields["own"] or ()],
+            now=fields["now"],
+            ends=ends_of(fields["ended"] or (), fields["lasting"] or ()),
         )
 
     def fields(self) -> dict[str, Any]:
@@ -80,6 +102,9 @@ class PolicyContext:
             "blocks": {str(address): block for address, block in self.blocks.items()},
             "holders": {group: str(host) for group, host in (self.holders or {}).items()},
             "approved": [[str(host), category.value, name] for host, category, name in self.approved or ()],
+            "now": self.now,
+            "ended": [end for end, passed in self.ends.items() if passed],
+            "lasting": [end for end, passed in self.ends.items() if not passed],
         }
 
 

@@ -10,11 +10,13 @@
 import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from datetime import tzinfo
 from typing import NamedTuple, TypeVar
 
 from appliance.policy import commands
 from appliance.policy.authority import AuthorityGroup
 from appliance.policy.host_sets import Atom, HostSets, Network, canonical_address
+from appliance.policy.hours import ClosedTimes, Times, closed_times
 from appliance.policy.keys import Key, KeyTree, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.policy_findings import Place, PolicyFinding, quoted
@@ -77,9 +79,13 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """The policy's answers about an address; they are computed once."""
+    """The policy's answers about an address; they are computed once.
+
+    `ever` are its atoms at any time, `atoms` those at the time of the policy.
+    """
 
     atoms: frozenset[Atom]
+    ever: frozenset[Atom]
     known: bool
     named: bool
     named_as: Network
@@ -94,6 +100,8 @@ class Policy:
     `named` has the atoms of all hosts that a rule names. `blocks` has the end of a sentence for each blocked host,
     such as `blocked by ann`. A group without an entry in `holders` is free; without `holders` (for checks of a text),
     each host with a claim counts as the holder. Without `approved`, no request that needs an approval passes.
+    `times` are the times of rights, `closed` those that grant nothing now; `zone` is that of local
+    times.
     """
 
     text: str
@@ -112,6 +120,9 @@ class Policy:
     tell: str
     enrolled: Mapping[str, Address]
     robot: tuple[Network, ...]
+    times: Times
+    closed: ClosedTimes
+    zone: tzinfo
     blocks: Mapping[Address, str] = field(default_factory=dict)
     holders: Mapping[str, Address] | None = None
     approved: frozenset[Approval] | None = None
@@ -129,6 +140,18 @@ class Policy:
     def without_groups(self) -> "Policy":
         """Return the policy for monitors: a guard stops the robot even if another host holds the group."""
         return replace(self, authority={}) if self.authority else self
+
+    def at(self, now: float | None, ends: Mapping[float, bool] | None = None) -> "Policy":
+        """Return the policy as it decides at a time; both are those of `PolicyContext`."""
+        return replace(self, closed=closed_times(self.times, now, ends or {})) if self.times else self
+
+    def at_any_time(self) -> "Policy":
+        """Return the policy as if each right with a time had begun, and none had ended."""
+        return replace(self, closed={}) if self.times else self
+
+    def plain(self) -> "Policy":
+        """Return the policy without what operators decide: blocks, holders of groups, and approvals."""
+        return replace(self, blocks={}, holders=None, approved=None)
 
     def decide(self, request: Request) -> Decision:
         """Decide by the rules of the request's own category; `policy/rights` decides on additional rights."""
@@ -185,7 +208,7 @@ class Policy:
         rule = self.limit_rule(topic)
         if rule is None:
             return NO_LIMIT
-        return rule.rate(part, self.atoms_of(host) if host is not None else frozenset())
+        return rule.rate(part, self.standing(host).ever if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
         part = _LIMITED.get(request.category)
@@ -201,10 +224,11 @@ class Policy:
 
     def _standing(self, address: Address) -> HostStanding:
         text, network = str(canonical_address(address)), self.hosts.narrowest(address)
-        atoms, named_as = self.hosts.atoms_of(address), network or ipaddress.ip_network(text)
+        ever, named_as = self.hosts.atoms_of(address), network or ipaddress.ip_network(text)
+        atoms = self.hosts.atoms_of(address, self.closed) if self.closed else ever
         free, learned = self.blocked(address) is None, self._any_audit_only and not self.named
         known = free and (learned or not self.named.isdisjoint(atoms))
-        return HostStanding(atoms, known, free and network is not None, named_as, str(named_as), text)
+        return HostStanding(atoms, ever, known, free and network is not None, named_as, str(named_as), text)
 
     def knows(self, address: Address) -> bool:
         """Return whether a rule includes this address, and the host is not blocked.
@@ -212,6 +236,30 @@ class Policy:
         In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
         return self.standing(address).known
+
+    def times_of(self, address: Address, hosts: frozenset[Atom]) -> list[Atom]:
+        """Return the times with which the host is among `hosts`; none if it also is without."""
+        if not self.times or not hosts.isdisjoint(self.hosts.atoms_of(address, self.times)):
+            return []
+        times = self.standing(address).ever.intersection(self.times)
+        return [atom for atom in sorted(times) if not hosts.isdisjoint(self.hosts.above([atom]))]
+
+    def open_to(self, address: Address, hosts: frozenset[Atom]) -> str:
+        """Return the times by which the host is among `hosts` now, or an empty text if it always is."""
+        limits = [self.times[atom].limit for atom in self.times_of(address, hosts) if atom not in self.closed]
+        return " or ".join(dict.fromkeys(limits))
+
+    def closed_to(self, address: Address, hosts: frozenset[Atom]) -> str:
+        """Return why the host is not among `hosts` now although it is at another time, or an empty text."""
+        closed = [self.closed[atom].why for atom in self.times_of(address, hosts) if atom in self.closed]
+        return f"its right {' and '.join(dict.fromkeys(closed[:2]))}" if closed else ""
+
+    def unnamed(self, address: Address) -> str:
+        """Return why `knows` is false for a host that is not blocked."""
+        closed = self.closed_to(address, self.named)
+        return f"no rule of the policy names {self.standing(address).text}" + (
+            f" now: {closed}" if closed else ""
+        )
 
     def serves(self, address: Address) -> bool:
         return self.knows(address) or (self._any_audit_only and self.blocked(address) is None)
@@ -343,11 +391,17 @@ class Policy:
             return _decided(False, None, reason, table.audit_only)
         atoms = self.atoms_of(request.host)
         if found.grants(atoms):
-            return Decision(True, found.rule, f"{self._what(request, 'may')} by {found.place}")
+            reason = f"{self._what(request, 'may')} by {found.place}"
+            timed = f"{reason}, {self.open_to(request.host, found.hosts)}" if self.times else reason
+            fits = len(reason) + 2 < len(timed) <= _LONGEST_REASON
+            return Decision(True, found.rule, timed if fits else reason)
         if found.asks(atoms):
             return self._asking(request, found, table.audit_only)
         what = self._what(request, "is not among the hosts that may")
-        return _by_rule(what, found, table.audit_only)
+        closed = self.closed_to(request.host, found.hosts)
+        now = f"{what} now, because {closed}" if closed else what
+        fits = len(now) + len(found.place) < _LONGEST_REASON - len(", by ")
+        return _by_rule(now if fits else what, found, table.audit_only)
 
     def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
         """Return the decision on a request that needs an approval.

@@ -7,6 +7,7 @@ from appliance.policy import sections
 from appliance.policy.authority import read_authority
 from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import HostSets, Network
+from appliance.policy.hours import closed_times
 from appliance.policy.ini_reader import SectionText, read
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
@@ -24,8 +25,12 @@ def compile_policy(
     hosts: Mapping[str, Address] | None = None,
     robot: Collection[Address | Network] = (),
     own: Collection[Address] = (),
+    now: float | None = None,
+    ends: Mapping[float, bool] | None = None,
 ) -> Policy:
     """Return the policy. Raises `PolicyError` with every error in the text.
+
+    `now` is the time by which it decides, in seconds since the epoch. Without it, rights with a time grant nothing.
 
     `own` are further addresses of the robot's machine. They are in the group `robot`, unless the text names them.
     A name in `hosts` without an address matches no host and causes a warning.
@@ -33,8 +38,8 @@ def compile_policy(
     findings = Findings(file)
     written = _by_name(read(text, findings), findings)
     table = HostSets()
-    groups = HostGroups(table, findings, hosts or {}, robot)
-    groups.define(written.get(sections.GROUPS))
+    groups = HostGroups(table, findings, hosts or {}, robot, now)
+    groups.define(written.get(sections.GROUPS), written.get(sections.HOURS))
     options = read_options(written.get(sections.OPTIONS), findings)
     ports = read_ports(written.get(sections.PORTS), findings)
     monitor = read_monitor(written.get(sections.MONITOR), findings)
@@ -50,6 +55,7 @@ def compile_policy(
         for category in decider.categories:
             compiler.tables[category].audit_only = decider.name in options.audit_only
     groups.add_own(own)
+    groups.hours.warn_unused()
     findings.raise_errors()
     lint(compiler.tables, present, written, groups=groups, hosts=table, findings=findings)
     named = {atom for rules in compiler.tables.values() for rule in rules.rules for atom in rule.hosts}
@@ -70,6 +76,9 @@ def compile_policy(
         tell=options.tell,
         enrolled=dict(hosts or {}),
         robot=groups.robot,
+        times=groups.times,
+        closed=closed_times(groups.times, now, ends or {}),
+        zone=groups.hours.zone,
     )
 
 

@@ -44,7 +44,7 @@ def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
 
 def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
     named = {atom for rule in tables[Category.NODE].rules for atom in rule.atoms}
-    if EVERYONE in named:
+    if not named.isdisjoint(table.above([EVERYONE])):
         return
     nameless = _nameless(named, table)
     seen: dict[Network, tuple[CompiledRule, int]] = {}

@@ -49,6 +49,6 @@ DEFAULT = "default"
 """The key for names without another matching key in the section."""
 
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
-AUTHORITY = "Authority"
+AUTHORITY, HOURS = "Authority", "Hours"
 
-NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), LIMITS, AUTHORITY, OPTIONS)
+NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), LIMITS, AUTHORITY, HOURS, OPTIONS)

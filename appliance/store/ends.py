@@ -159,6 +159,10 @@ class EndTable:
         by_age = end.at + self._offset
         return (by_age if end.date is None or end.undated else min(end.date, by_age)) / _SECOND
 
+    def system_time(self) -> float | None:
+        """Return seconds since the epoch, or None while the system clock is behind any possible time."""
+        return None if self._behind() else clock.wall()
+
     def names(self, kind: EndKind) -> list[str]:
         return list(self._ends.get(kind.name, {}))
 

@@ -1,4 +1,5 @@
 import signal
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -80,3 +81,41 @@ def test_sighup_reloads_the_policy(appliance: Appliance) -> None:
     appliance.process.popen.send_signal(signal.SIGHUP)
     eventually(lambda: appliance.audit("--event", "policy refused"), "the rejection is recorded")
     assert appliance.status()["policy"]["revision"] == revision + 1
+
+
+def _only(words: str, hours: str = "") -> str:
+    return OPEN_POLICY.replace("[Subscribers]", f"/chatter = {words}\n[Subscribers]", 1) + hours
+
+
+def test_a_right_ends_and_begins_while_its_node_publishes(appliance: Appliance, ros: RosSession) -> None:
+    """Messages stop within a second, also after a crash of control, and come again without a new start of the node."""
+    appliance.reload(OPEN_POLICY)
+    listener = ros.listener("rospy", "/chatter")
+    ros.talker("rospy", "/chatter", name="voice")
+    listener.wait_for(event="received")
+    appliance.ignore_earlier_records()
+    end = (datetime.now(UTC) + timedelta(seconds=10)).replace(microsecond=0)
+    right = f"* until {end:%Y-%m-%dT%H:%M:%S}"
+    appliance.reload(_only(right))
+    listener.wait_for(event="received", since=listener.mark())
+    eventually(lambda: datetime.now(UTC) >= end, "the date comes")
+    at_end = listener.mark()
+    [record] = appliance.recorded("--event", "rights changed")
+    assert record["detail"]["ended"] == [f"{right} (line 5)"]
+    assert record["detail"]["revoked"] > 0
+    assert (
+        f"its right until {end:%Y-%m-%dT%H:%M:%S} has ended"
+        in appliance.recorded("--event", "revoked")[0]["reason"]
+    )
+    appliance.kill("control")
+    eventually(lambda: appliance.rosrv("status", check=False).returncode == 0, "control is back")
+    begin = (datetime.now(UTC) + timedelta(minutes=1)).replace(second=0, microsecond=0)
+    hours = f"{begin:%H:%M}-{begin + timedelta(minutes=5):%H:%M}"
+    appliance.reload(_only("* during shift", f"[Hours]\nshift = {hours}\n"))
+    assert listener.mark() - at_end <= 10  # the talker sends ten a second
+    appliance.ignore_earlier_records()
+    listener.wait_for(event="received", since=listener.mark(), timeout=90)
+    assert datetime.now(UTC) >= begin
+    [record] = appliance.recorded("--event", "rights changed")
+    assert record["reason"] == "began: * during shift (line 5)"
+    assert record["detail"]["restored"] > 0

@@ -14,6 +14,9 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 
+WALL = 1_790_000_000.0
+"""The system time at which things begin."""
+
 
 def ends_of(store: StateStore, folder: Path, **role: Any) -> EndTable:
     return EndTable(store, AgeClock(folder / "age"), **role)

@@ -28,6 +28,8 @@ EVENTS: dict[str, str] = {
     " what ended.",
     "host unblocked": "An operator lifted the block of a host; `detail` has who.",
     "host block ended": "The time of a host's block was over; the host is decided by the policy again.",
+    "rights changed": "Rights with a time (`until`, `during`) ended or began; `detail` has both, with their lines,"
+    " and the numbers of registrations and connections that were revoked and restored.",
     "authority handed over": "A group of [Authority] has another holder, or none; `resource` is the group, `detail` has"
     " the earlier holder, the holder, and who ordered it.",
     "approval ended": "A held call was not answered in time, or an approval is over; `reason` says why.",
@@ -246,7 +248,7 @@ SEVERITIES: dict[str, Severity] = {
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "driver checked", "guard loaded", "monitor resumed",
             "monitor set",
-            "policy loaded", "stop ended",
+            "policy loaded", "rights changed", "stop ended",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "state directory new", "switchover ordered",

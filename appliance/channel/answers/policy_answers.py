@@ -61,6 +61,14 @@ class PolicyInForce(RevisionText, frozen=True, kw_only=True):
             "other addresses of the robot's machine, which are in the group robot unless the policy names them"
         ),
     ] = []
+    now: Annotated[
+        float | None,
+        doc(
+            "the time that decides rights with a time, in seconds since the epoch, or null if the clock is not set"
+        ),
+    ] = None
+    ended: Annotated[list[float], doc("ends of rights that have passed, in seconds since the epoch")] = []
+    lasting: Annotated[list[float], doc("ends of rights that have not passed by the age clock")] = []
 
 
 class PolicyKnown(PolicyInForce, frozen=True):

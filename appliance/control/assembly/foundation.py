@@ -17,7 +17,7 @@ from appliance.control.assembly.host_blocks import BlockTable
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.listener_limits import HostQuotaClass, ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
-from appliance.control.assembly.policies import Policies
+from appliance.control.assembly.policies import Policies, passed_changes
 from appliance.control.assembly.robot import robot_addresses
 from appliance.control.assembly.services import CallHolder, OwnServiceTable, PolicyServices
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
@@ -93,7 +93,7 @@ async def make_foundation(
     role.hand_tunnels_to(hosts.tunnels)
     await hosts.tunnels.start()
     services, enforcement = PolicyServices(), Current[Enforcement]()
-    known = _policy_context(settings, lifeline, role, hosts, services)
+    known = _policy_context(settings, lifeline, role, hosts, services=services, ends=state.ends)
     return Foundation(
         settings=settings,
         lifeline=lifeline,
@@ -159,7 +159,9 @@ def _policy_context(
     lifeline: ControlLifeline,
     role: ActiveRole,
     hosts: SiteHosts,
+    *,
     services: PolicyServices,
+    ends: EndTable,
 ) -> Callable[[], PolicyContext]:
     robot = robot_addresses(settings, role.robot)
     return lambda: services.added_to(
@@ -170,6 +172,8 @@ def _policy_context(
             own=frozenset(lifeline.surroundings.machine),
             site_keys=settings.site_keys,
             blocks=hosts.blocks.reasons,
+            now=ends.system_time(),
+            ends=passed_changes(ends),
         )
     )
 

@@ -132,7 +132,7 @@ class ListenerLimits:
         if peer.here or policy.serves(peer.host):
             return None
         denial = policy.blocked(peer.host)
-        reason = f"no rule of the policy names {peer.text}" if denial is None else denial.reason
+        reason = policy.unnamed(peer.host) if denial is None else denial.reason
         told = reason if denial is None else text_for_caller(denial, policy.tell)
         return partial(self._refuse_unknown, peer, reason, told)
 

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from appliance.control.assembly.policy_gate import (
 from appliance.control.errors import PolicyRefusedError, UnknownThingError
 from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.host_sets import Network
+from appliance.policy.hours import changes_of
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, deprived, may_keep
 from appliance.policy.policy import CurrentPolicy, Policy
@@ -44,6 +46,7 @@ from appliance.telemetry.text_changes import changed_lines
 _REFUSED = "policy file refused"
 _log = structlog.get_logger()
 _SHOWN_NODES = 3
+_UTC = "%Y-%m-%dT%H:%M:%SZ"
 
 
 class PolicyCases(NamedTuple):
@@ -70,6 +73,8 @@ class Policies(Revisions[RevisionRow]):
     refusal = PolicyRefusedError
     outdated = RevisionChangedError
     unconfirmed = EndKind("confirm")
+    changes = EndKind("change of rights", dated=True)
+    """The times at which a right of the policy ends or begins; their names are the times in UTC."""
 
     def __init__(
         self,
@@ -99,6 +104,8 @@ class Policies(Revisions[RevisionRow]):
         self._changed = changed
         self._carried_out = carried_out
         self.policy = policy
+        self._passed: set[str] = set()  # the changes that no clock can undo
+        ends.when_due(self.changes, lambda _times: self.time_passed())
         self._labelled: Policy | None = None  # whose labels are kept
         self._labels: list[tuple[Network, str]] = []
         self.file_refused = store.settings().get(_REFUSED, "")
@@ -169,8 +176,8 @@ class Policies(Revisions[RevisionRow]):
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a given text into force. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        The same text makes no new revision. Messages cite its rules as `revision N:line`, because the file's lines
-        may differ.
+        The same text makes no new revision, but begins rights again that a wrong clock ended. Messages
+        cite its rules as `revision N:line`, because the file's lines may differ.
         """
         return await self.load_with(request, who, None)
 
@@ -179,6 +186,8 @@ class Policies(Revisions[RevisionRow]):
         async with self.changing(request.expected):
             now = self.in_force
             if now.who != DISK and (now.text, now.signature) == given:
+                self.ends.forget(self.changes, *self.ends.names(self.changes))
+                self.time_passed()
                 return self._loaded(self.revision, 0)
             name = f"revision {self.revision + 1}"
             policy, signature = await self._prepared(lambda: given, name, who, cases)
@@ -194,6 +203,14 @@ class Policies(Revisions[RevisionRow]):
 
     def decide_again(self) -> int:
         return self._enforce(self.current)
+
+    def time_passed(self) -> None:
+        """End and begin the rights with a time. Call it also after each step of the system clock."""
+        if not self.policy:
+            return
+        self._expect_changes(self.current)
+        if self.known.complete(self.current).closed.keys() != self.current.closed.keys():
+            self._enforce(self.current)
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
         async with self.changing(request.expected):
@@ -333,7 +350,10 @@ class Policies(Revisions[RevisionRow]):
         known = self.known
         lost = _losses(known.complete(policy), self.policy(), self._live()) if self.policy else []
         earlier = {"policy": self.policy().text} if self.policy else {}
-        self._put_in_force(row, within)
+        with self.store.database.together():
+            self._put_in_force(row, within)
+            self.ends.forget(self.changes, *self.ends.names(self.changes))
+            self._expect_changes(policy)
         revoked = self._enforce(policy)
         self._trail.happened(
             "policy loaded",
@@ -351,9 +371,52 @@ class Policies(Revisions[RevisionRow]):
 
     def _enforce(self, policy: Policy) -> int:
         before = self.policy() if self.policy else None
+        self._expect_changes(policy)
         self.policy.set(self.known.complete(policy))
         self._trail.revision = self.revision
-        return 0 if before is None else self._changed(before, self.policy())
+        if before is None:
+            return 0
+        now, same = self.policy(), before.text == policy.text
+        closed, was = _closed(now), _closed(before)
+        ended, began = sorted(closed.keys() - was.keys()), sorted(was.keys() - closed.keys())
+        if not same or not (ended or began):
+            return self._changed(before, now)
+        count, revoked = len(list(self._live())), self._changed(before, now)
+        words = {"ended": ended, "began": began}
+        self._trail.happened(
+            "rights changed",
+            "; ".join(f"{word}: {_some(some)}" for word, some in words.items() if some),
+            ended=ended[:100],
+            began=began[:100],
+            why=sorted({closed[word] for word in ended})[:100],
+            revoked=revoked,
+            restored=len(list(self._live())) - count + revoked,
+        )
+        return revoked
+
+    def _expect_changes(self, policy: Policy) -> None:
+        """Set the ends at which rights change next.
+
+        One that has passed by any clock stays so until a policy is loaded: no clock that is set back begins its right
+        again.
+        """
+        now = self.known.now
+        if now is None:  # rights with a time grant nothing until the clock is set
+            return
+        wanted = {
+            f"{datetime.fromtimestamp(change, UTC):{_UTC}}": change
+            for change in changes_of(policy.times, now)
+        }
+        known = set(self.ends.names(self.changes))
+        self._passed &= known
+        self.ends.forget(self.changes, *known.difference(wanted))
+        for name, change in wanted.items():
+            if name not in known and change > now:
+                self.ends.set(self.changes, name, change - now)
+            elif name in known - self._passed and self.ends.passed(self.changes, name):
+                self._passed.add(name)
+                self.ends.forget(self.changes, name)
+                self.ends.set(self.changes, name, 0.0)
 
     def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
         warnings = [*lost, *map(str, self.current.warnings)]
@@ -361,6 +424,18 @@ class Policies(Revisions[RevisionRow]):
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who=UNCONFIRMED)
+
+
+def passed_changes(ends: EndTable) -> dict[float, bool]:
+    """Return whether each of the expected changes of rights has passed; the keys are seconds since the epoch."""
+    kind = Policies.changes
+    return {datetime.fromisoformat(name).timestamp(): ends.passed(kind, name) for name in ends.names(kind)}
+
+
+def _closed(policy: Policy) -> dict[str, str]:
+    """Return the rights that grant nothing now, with their lines and reasons."""
+    words = ((policy.times[atom], closed) for atom, closed in policy.closed.items())
+    return {f"{time.text} (line {time.line})": closed.why for time, closed in words}
 
 
 def _losses(policy: Policy, before: Policy, live: Iterable[LiveRight]) -> list[str]:

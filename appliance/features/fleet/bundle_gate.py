@@ -38,7 +38,6 @@ from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
 from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.commands import COMMANDS
-from appliance.policy.judgement import PolicyContext
 from appliance.policy.keys import Key
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
@@ -64,7 +63,7 @@ class LostRights:
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
         self._names = {category: tuple(dict.fromkeys(_names(old, new, category))) for category in Category}
-        self._before, self._after = map(PolicyContext().complete, (old, new))
+        self._before, self._after = old.plain(), new.plain()
         self._lost: dict[tuple[str, str], bool] = {}  # by the networks that both policies name
 
     def took_from(self, host: Address) -> bool:

@@ -38,7 +38,7 @@ from appliance.formats.machine_report import (
     read_records,
 )
 from appliance.formats.report_words import page, report_lines
-from appliance.policy.judgement import PolicyContext
+from appliance.policy.judgement import PolicyContext, ends_of
 from appliance.policy.model import Category, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
@@ -250,6 +250,8 @@ class _Live(msgspec.Struct):
             {name: address_of(address) for name, address in text.hosts.items()},
             [ipaddress.ip_network(place) for place in text.robot],
             own=[ipaddress.ip_address(address) for address in text.own],
+            now=text.now,
+            ends=ends_of(text.ended, text.lasting),
         )
         try:
             compiled = known.compiled(text.text, text.file)

@@ -261,10 +261,13 @@ _GRANTED = (
 )
 
 
-def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
+def granted(
+    record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False, until: str = ""
+) -> Granted:
     """Return the change that would allow a denied request, or raise `UngrantableError`.
 
-    With `whole_tool`, the change also grants all other rights that the stock tool of the record needs.
+    `until` is the end of the right, as for `grant`. With `whole_tool`, the change also grants all other rights that the
+    stock tool of the record needs.
     """
     known, asked = PolicyContext.of(msgspec.structs.asdict(current)), asked_of(record)
     tool = stock_tool(asked.request.caller_id)
@@ -274,8 +277,8 @@ def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = Fal
                 f"{asked.request.caller_id or 'the caller'} is not a stock tool of ROS: leave out --tool"
             )
         asked = asked.with_tool(tool)
-    found = grant(current.text, current.file, known, asked)
-    needs = [] if tool is None else grant(found.text, current.file, known, asked.with_tool(tool)).added
+    found = grant(current.text, current.file, known, asked, until)
+    needs = () if tool is None else grant(found.text, current.file, known, asked.with_tool(tool), until).added
     return Granted(
         revision=current.revision,
         reason=record.reason,
@@ -317,7 +320,9 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Policy
     known = PolicyContext.of(msgspec.structs.asdict(current))
     try:
         known = (
-            replace(known, site_keys=()) if cases else PolicyContext(known.hosts, known.robot, own=known.own)
+            replace(known, site_keys=())
+            if cases
+            else replace(known, cases=None, cases_error=None, site_keys=())
         )
         return judge(text, file, known)
     except PolicyError as error:

@@ -9,10 +9,13 @@ import ipaddress
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Self
 
+from appliance.base.durations import seconds_of
 from appliance.features.policy_tools.learn import ROBOT
 from appliance.features.policy_tools.stock_tools import StockTool, key_of, stock_tool
+from appliance.policy.hours import UNTIL, host_units, instant
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
@@ -71,10 +74,15 @@ class GrantedText:
         return list(difflib.unified_diff(old, new, file, f"{file} (granted)", lineterm=""))
 
 
-def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> GrantedText:
-    """Grant a request. Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy."""
+def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest, until: str = "") -> GrantedText:
+    """Grant a request, until a date of the policy or for a time such as `7d`, or without an end.
+
+    Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
+    """
     policy = known.compiled(text, file)
     word = _word(text, known, policy, asked.request.host)
+    if until:
+        word = f"{word} {UNTIL} {_date(until, known, policy)}"
     block = replace(policy, blocks=known.blocks).blocked(asked.request.host)
     if block is not None:
         raise UngrantableError(f"no line of a policy grants it: {block.reason}")
@@ -117,6 +125,23 @@ def _word(text: str, known: PolicyContext, policy: Policy, host: Address) -> str
     return ROBOT if any(place.num_addresses == 1 and host in place for place in policy.robot) else str(host)
 
 
+def _date(until: str, known: PolicyContext, policy: Policy) -> str:
+    if known.now is None:
+        raise UngrantableError("the appliance's clock is not set, so a right cannot get an end")
+    seconds = seconds_of(until)
+    try:
+        if seconds is not None:
+            end = datetime.fromtimestamp(known.now + max(60.0, seconds), policy.zone)
+            until = f"{end:%Y-%m-%dT%H:%M}"
+        if instant(until, policy.zone) <= known.now:
+            raise UngrantableError(f"{until} has passed")
+    except (ValueError, OverflowError) as error:
+        raise UngrantableError(
+            f"{error} (in the zone of the policy, {policy.zone}), or a time such as 7d"
+        ) from None
+    return until
+
+
 def _sections(text: str) -> list[SectionText]:
     return read(text, Findings(""))
 
@@ -147,7 +172,8 @@ def _changed(policy: Policy, text: str, right: Right, word: str, wide: str = "")
         return _with_word(text, entry, word)
     holders = [] if section is None or rule is None else _holders(section, rule.key)
     asking = holders.index(ASK) if ASK in holders else len(holders)
-    words = dict.fromkeys([*holders[:asking], word, *holders[asking:]])
+    plain = [holder for holder in holders[:asking] if holder.split()[0] != word.split(maxsplit=1)[0]]
+    words = dict.fromkeys([*plain, word, *holders[asking:]])
     return _with_line(text, section, name, f"{written} = {' '.join(words)}")
 
 
@@ -169,19 +195,28 @@ def _entry(section: SectionText, key: str) -> Entry | None:
 
 def _holders(section: SectionText, key: str) -> list[str]:
     entry = _entry(section, key)
-    return [] if entry is None else [word.text for word in entry.values]
+    return [] if entry is None else [" ".join(map(_text, unit)) for unit in host_units(entry.values)]
 
 
 def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
     lines = text.split("\n")
     line = lines[entry.key.line - 1]
     plain = [*itertools.takewhile(lambda value: value.text != ASK, entry.values)]
+    for unit in host_units(plain):
+        if unit[0].text == word.split(maxsplit=1)[0]:  # the host has the right at another time
+            whole = " ".join(f"{line[: unit[0].column - 1]}{word}{line[_end(unit[-1]) :]}".split())
+            lines[entry.key.line - 1] = f"{line[: unit[0].column - 1]}{word}{line[_end(unit[-1]) :]}"
+            return "\n".join(lines), whole.partition("#")[0].partition(";")[0].rstrip()
     last: Word | None = plain[-1] if plain else None
-    end = line.index("=") + 1 if last is None else last.column - 1 + len(last.text)
+    end = line.index("=") + 1 if last is None else _end(last)
     comma = "," if last is not None and "," in line[:end] else ""
     rule = f"{line[:end]}{comma} {word}"
     lines[entry.key.line - 1] = rule + line[end:]
     return "\n".join(lines), " ".join(f"{rule} {' '.join(map(_text, entry.values[len(plain) :]))}".split())
+
+
+def _end(word: Word) -> int:
+    return word.column - 1 + len(word.text)
 
 
 def _text(word: Word) -> str:

@@ -1,6 +1,7 @@
 """The commands `rosrv policy grant` and `rosrv audit why`."""
 
 import shlex
+from datetime import UTC
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -21,10 +22,12 @@ from appliance.cli.connection.admin_client import NotRunningError, RestProblemEr
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.features.policy_tools.explanations import asks_policy, explained, granted
 from appliance.features.policy_tools.grant import UngrantableError
 from appliance.features.policy_tools.live_verbs import say_loaded
+from appliance.policy.hours import instant
 from rosmop.tool.terminal import printable, say
 
 
@@ -81,6 +84,17 @@ def grant(
         bool,
         typer.Option("--tool", help="Grant everything that the denied stock tool (such as rostopic) needs"),
     ] = False,
+    until: Annotated[
+        str,
+        typer.Option(
+            "--until",
+            metavar="TIME",
+            help="End of the right, in the policy's zone: 2026-12-05 (that day included), or 2026-12-05T18:00",
+        ),
+    ] = "",
+    for_time: Annotated[
+        str, typer.Option("--for", metavar="DURATION", help="End of the right, from now: 2h, 7d")
+    ] = "",
     load: Annotated[bool, typer.Option("--load", help="Bring the changed policy into force")] = False,
     confirm_within: ConfirmWithin = None,
 ) -> None:
@@ -96,7 +110,7 @@ def grant(
     within = seconds_within(confirm_within, "policy")
     if within is not None and not load:
         raise usage_error("--confirm-within needs --load")
-    found = _granted(appliance, record, tool=tool)
+    found = _granted(appliance, record, tool=tool, until=_end(until, for_time))
     if appliance.as_json:
         say_json(found)
     else:
@@ -117,6 +131,20 @@ def grant(
             say_json(body)
         else:
             say_loaded(body)
+
+
+def _end(until: str, for_time: str) -> str:
+    if until and for_time:
+        raise usage_error("give --until or --for, not both", "rosrv policy")
+    if for_time:
+        bounded_span("--for", for_time, "1m", "520w", "rosrv policy")
+    if until:
+        try:
+            instant(until, UTC)
+        except ValueError:
+            text = f"--until: {until!r} is not a valid time: write 2026-12-05, or 2026-12-05T18:00"
+            raise usage_error(text, "rosrv policy") from None
+    return until or for_time
 
 
 def _with_ends_of(file: Path, text: str) -> bytes:
@@ -141,15 +169,15 @@ def _show(found: Granted, record: str) -> None:
         say(f"{found.tool} needs {more} to work: rosrv policy grant {shlex.quote(record)} --tool", "yellow")
 
 
-def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
+def _granted(appliance: Appliance, record: str, *, tool: bool, until: str) -> Granted:
     if appliance.place is not None:
-        return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool), Granted)
+        return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool, until=until), Granted)
 
     with Errors():
         found = _entry(appliance, record).record
         known = appliance.ask_or_exit(PolicyWanted())
         try:
-            return granted(found, known, whole_tool=tool)
+            return granted(found, known, whole_tool=tool, until=until)
         except UngrantableError as error:
             fail(str(error), 1)
 
@@ -165,14 +193,15 @@ def _unknown(record: str) -> NoReturn:
     fail(f"no record in the log has the id {record!a}; list them: rosrv audit search", 1)
 
 
-def _over_rest(appliance: Appliance, record: str, what: str, *, tool: bool = False) -> dict[str, object]:
+def _over_rest(
+    appliance: Appliance, record: str, what: str, *, tool: bool = False, until: str = ""
+) -> dict[str, object]:
     if not ID_OR_SEQUENCE.fullmatch(record):
         _unknown(record)
     with Errors():
         try:
-            return appliance.rest.call(
-                "GET", f"/v1/audit/{record}/{what}", params={"tool": "1"} if tool else None
-            )
+            params = ({"tool": "1"} if tool else {}) | ({"until": until} if until else {})
+            return appliance.rest.call("GET", f"/v1/audit/{record}/{what}", params=params or None)
         except RestProblemError as problem:
             if problem.status == 404:
                 _unknown(record)

@@ -30,7 +30,7 @@ from appliance.cli.durations import time_given
 from appliance.features.policy_tools.learn import Observation
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
-from appliance.policy.judgement import PolicyContext, approvals_of
+from appliance.policy.judgement import PolicyContext, approvals_of, ends_of
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
@@ -146,7 +146,7 @@ def read_text(file: Path) -> str:
 def known_of(
     robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
 ) -> PolicyContext:
-    known = running or PolicyContext()
+    known = running or PolicyContext(now=clock.wall())
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
@@ -189,6 +189,8 @@ def context_of(body: PolicyInForce) -> PolicyContext:
         holders={group: ipaddress.ip_address(host) for group, host in body.holders.items()},
         approved=approvals_of(body.approved),
         own=[ipaddress.ip_address(address) for address in body.own],
+        now=body.now,
+        ends=ends_of(body.ended, body.lasting),
     )
 
 

@@ -82,6 +82,7 @@ class RuleUsed(msgspec.Struct, frozen=True):
     used: Annotated[int, doc("number of uses")]
     unused_hosts: Annotated[list[str], doc("without a use")]
     unknown_hosts: Annotated[list[str], doc("perhaps without a use")]
+    ended_hosts: Annotated[list[str], doc("whose right has ended, used or not")] = []
 
 
 class PolicyUses(msgspec.Struct, frozen=True):

@@ -11,8 +11,10 @@ from typing import Annotated, NamedTuple
 
 import typer
 
+from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.base.owner_access import is_named_there
+from appliance.base.timestamps import local_minute
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, by_host, say_json, say_row
@@ -32,6 +34,7 @@ from appliance.features.policy_tools.policy_input import (
 from appliance.policy.actions import BadWordError, check_resource, find_host
 from appliance.policy.authority import AuthorityGroup, Claim
 from appliance.policy.host_sets import Atom
+from appliance.policy.hours import changes_of
 from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.live_rights import Ending
 from appliance.policy.model import Address, Category, Decision, Request, Rule
@@ -39,7 +42,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.policy.rights import needs_node, rights_of
 from appliance.policy.sections import DECIDERS
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import printable, refused, say
 
 # List the rights of one host: the rules that grant it something. No I/O.
 
@@ -59,6 +62,9 @@ class HostRight(NamedTuple):
     asks: bool
     """Whether each request needs an approval."""
     text: str
+    time: str = ""
+    """When the host has the right, or why not now, or empty if it always has it."""
+    closed: bool = False
 
 
 class GroupPart(NamedTuple):
@@ -103,17 +109,19 @@ def _part(group: AuthorityGroup, atoms: frozenset[Atom]) -> GroupPart:
 
 def rights_of_host(policy: Policy, host: Address) -> Iterator[HostRight]:
     """Yield the rules in the order of the sections. Only the most specific key of a name decides on it."""
-    atoms = policy.atoms_of(host)
+    standing = policy.standing(host)
     for decider in DECIDERS:
         if decider.extension and decider.categories[0] not in policy.present:
             text = f"[{decider.name}]: everything, because there is no such section"
             yield HostRight(decider.name, None, asks=False, text=text)
-        for category in decider.categories:
-            for rule in policy.rules(category):
-                if rule.grants(atoms):
-                    yield HostRight(decider.name, rule.rule, asks=False, text=rule.place)
-                elif rule.asks(atoms):
-                    yield HostRight(decider.name, rule.rule, asks=True, text=f"{rule.place}: {APPROVAL}")
+        for rule in (rule for category in decider.categories for rule in policy.rules(category)):
+            closed = not rule.grants(standing.atoms) and not rule.asks(standing.atoms)
+            if closed and rule.hosts.isdisjoint(standing.ever):
+                continue
+            time = (policy.closed_to if closed else policy.open_to)(host, rule.hosts)
+            asks = not rule.grants(standing.ever if closed else standing.atoms)
+            text = ": ".join([rule.place, *[time] * bool(time), *[APPROVAL] * asks])
+            yield HostRight(decider.name, rule.rule, asks, text, time, closed)
 
 
 _File = Annotated[Path, typer.Argument(readable=False, metavar="FILE", help="The policy", show_default=False)]
@@ -146,8 +154,27 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
             f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
             "red" if errors else "green",
         )
+    if not errors:
+        _say_times(known_of(robot, enrolled).compiled(read_text(file), str(file)), as_json=appliance.as_json)
     _say_endings(impact.ends, appliance)
     raise typer.Exit(1 if errors else 0)
+
+
+def _say_times(policy: Policy, *, as_json: bool) -> None:
+    """Print when each right with a time ends, or begins next."""
+    now = clock.wall()
+    for atom, time in policy.times.items():
+        closed = policy.closed.get(atom)
+        next_change = min((one for one in changes_of({atom: time}, now) if one > now), default=None)
+        begins = closed is not None and next_change is not None and next_change != time.until
+        ends = closed is None and next_change is not None
+        if as_json:
+            moments = {"begins": next_change if begins else None, "ends": next_change if ends else None}
+            say_json({"right": time.text, "line": time.line, **moments})
+        else:
+            verb = "ends" if ends else "begins" if begins else "has ended"
+            moment = f" {local_minute(next_change)}" if next_change is not None and (ends or begins) else ""
+            say(printable(f"line {time.line}: {time.text}: {verb}{moment}"), "dim" if closed else "")
 
 
 def _say_endings(endings: list[Ending], appliance: Appliance) -> None:
@@ -194,7 +221,7 @@ def _impact(
 
 
 def _allowing(policy: Policy, request: Request) -> Iterator[str]:
-    known = PolicyContext(policy.enrolled, policy.robot, blocks=policy.blocks)
+    known = PolicyContext(policy.enrolled, policy.robot, blocks=policy.blocks, now=clock.wall())
     try:
         found = grant_of(policy.text, policy.file, known, DecidedRequest(request, rights_of(request)))
     except UngrantableError as error:
@@ -340,16 +367,18 @@ def _list_rights(appliance: Appliance, policy: Policy, host: str) -> int:
     for right in rights:
         if appliance.as_json:
             place = asdict(right.rule) if right.rule is not None else None
-            verdict = "ask" if right.asks else "allow"
-            say_json({"host": str(address), "section": right.section, "rule": place, "decision": verdict})
+            verdict = "deny" if right.closed else "ask" if right.asks else "allow"
+            fields = {"section": right.section, "rule": place, "decision": verdict}
+            say_json({"host": str(address), **fields, **({"time": right.time} if right.time else {})})
         else:
-            say(right.text, "yellow" if right.asks else "")
+            say(right.text, "dim" if right.closed else "yellow" if right.asks else "")
+    held = any(not right.closed for right in rights)
     if not appliance.as_json:
-        if not rights:
-            say(f"no rule grants {address} anything", "red")
+        if not held:
+            say(f"no rule grants {address} anything{' now' if rights else ''}", "red")
         if address in policy.blocks:
             say(f"whatever the rules say: {address} is {policy.blocks[address]}", "yellow")
-    return 0 if rights else 1
+    return 0 if held else 1
 
 
 def _explanation_fields(explanation: DecisionExplanation) -> dict[str, object]:

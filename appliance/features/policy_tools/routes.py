@@ -83,6 +83,7 @@ def policy_uses(
                 row.used,
                 list(row.unused),
                 list(row.unknown),
+                list(row.ended),
             )
             for row in uses.rules(period.unnamed, removed=removed)
         ],
@@ -207,7 +208,18 @@ def _of_records(services: Services) -> Routes:
             return await asyncio.to_thread(explained, record, known, in_full, words)
 
     @router.get("/{record_id}/grant", responses=UNKNOWN | _NO_GRANT)
-    async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
+    async def grant_of_record(
+        record_id: OneRecord,
+        bearer: Viewer,
+        *,
+        tool: bool = False,
+        until: Annotated[
+            str,
+            Query(
+                max_length=32, description="end of the right: a date in the policy's zone, or 7d (from now)"
+            ),
+        ] = "",
+    ) -> Granted:
         """Return the smallest change of the policy in force that grants the denied request of this record.
 
         With `tool`, the change also grants all other rights that the stock tool of the record (such as rostopic)
@@ -217,7 +229,9 @@ def _of_records(services: Services) -> Routes:
         known = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging.turn(bearer):
             try:
-                return await asyncio.to_thread(granted, shown.entry.record, known, whole_tool=tool)
+                return await asyncio.to_thread(
+                    granted, shown.entry.record, known, whole_tool=tool, until=until
+                )
             except UngrantableError as error:
                 raise ProblemError(409, "not-by-a-policy", str(error)) from None
 

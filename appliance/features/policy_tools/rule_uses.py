@@ -23,13 +23,17 @@ SEVERAL = "*"
 
 @dataclass(frozen=True, slots=True)
 class RuleUse:
-    """A rule that grants something. `unused` and `unknown` are the words of hosts that did not use it, or perhaps."""
+    """A rule that grants something. `unused` and `unknown` are the words of hosts that did not use it, or perhaps.
+
+    `ended` are the words of hosts whose rights have ended, used or not.
+    """
 
     rule: Rule
     category: Category
     used: int
     unused: tuple[str, ...]
     unknown: tuple[str, ...]
+    ended: tuple[str, ...] = ()
 
     @property
     def state(self) -> State:
@@ -43,6 +47,10 @@ class RuleUses:
     policy: Policy
     _counts: dict[Rule, int] = field(default_factory=dict)
     _atoms: dict[Rule, set[Atom]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._ended = {word for word, closed in self.policy.closed.items() if closed.for_good}
+        self.policy = self.policy.at_any_time()  # as the recorded requests were decided, each in its time
 
     def add(self, observation: Observation, count: int) -> None:
         try:
@@ -88,4 +96,5 @@ class RuleUses:
         unseen = [(word, atom) for word, atom in rule.words if atom not in seen]
         unknown = tuple(word for word, atom in unseen if removed or atom in perhaps)
         unused = tuple(word for word, _ in unseen if word not in unknown)
-        return RuleUse(rule.rule, category, self._counts.get(rule.rule, 0), unused, unknown)
+        ended = tuple(word for word, atom in rule.words if atom in self._ended)
+        return RuleUse(rule.rule, category, self._counts.get(rule.rule, 0), unused, unknown, ended)

@@ -23,7 +23,8 @@ def list_unused(
     ] = "30d",
     everything: Annotated[bool, typer.Option("--all", help="Also list the used rules")] = False,
 ) -> None:
-    """List the rules of the policy in force, and the hosts in them, that were not used since the time of --since.
+    """List the rules of the policy in force, and the hosts in them, that were not used since the time of --since, and
+    the rights whose date has passed.
 
     Registrations of running nodes count as uses. A rule or host is `unknown` instead of `unused` if a use may be
     among removed records, or among records that only count a host's requests.
@@ -37,7 +38,7 @@ def list_unused(
     uses.add_live(live_now(appliance))
     rows = list(uses.rules(period.unnamed, removed=period.removed))
     for row in rows:
-        if everything or row.state != "used":
+        if everything or row.state != "used" or row.ended:
             _say_row(row, as_json=appliance.as_json)
     if not appliance.as_json:
         unused, unknown = (sum(row.state == state for row in rows) for state in ("unused", "unknown"))
@@ -56,8 +57,10 @@ def _say_row(row: RuleUse, *, as_json: bool) -> None:
         rule = row.rule
         place = {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line}
         hosts = {"unused_hosts": list(row.unused), "unknown_hosts": list(row.unknown)}
-        say_json({**place, "state": row.state, "used": row.used, **hosts})
+        say_json({**place, "state": row.state, "used": row.used, **hosts, "ended_hosts": list(row.ended)})
         return
+    if row.ended:
+        say(printable(f"{row.rule}: ended: {', '.join(row.ended)}"), "yellow")
     if row.state == "used":
         say(printable(f"{row.rule}: used {row.used}x"))
     if row.unused:

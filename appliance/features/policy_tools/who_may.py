@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from appliance.policy.host_sets import Network
-from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Address, Category, Decision, Request, word_of
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, decide_right, rights_of
@@ -42,7 +41,7 @@ def who_may(policy: Policy, category: Category, resource: str, node: str = "") -
     the holders of groups are ignored.
 
     """
-    policy = PolicyContext().complete(policy)
+    policy = policy.plain()
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
     inside = [
         (network, _only_in(policy, network, networks[place:]))

@@ -4,6 +4,7 @@ import ipaddress
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from appliance.channel.admin import (
     PolicyRollback,
     PolicyWanted,
 )
-from appliance.control.assembly.policies import Policies, RevisionChangedError
+from appliance.control.assembly.policies import Policies, RevisionChangedError, passed_changes
 from appliance.control.errors import PolicyRefusedError
 from appliance.policy import judgement
 from appliance.policy.judgement import PolicyContext
@@ -31,7 +32,7 @@ from tests.support.control_parts import OPEN, Records
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
-from tests.support.virtual_clock import ShiftedClock, let_time_pass
+from tests.support.virtual_clock import ShiftedClock, let_time_pass, set_wall
 
 pytestmark = pytest.mark.anyio
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
@@ -50,6 +51,7 @@ class Appliance:
         self.state.mkdir()
         self.file = directory / "policy.ini"
         self.file.write_text(OPEN)
+        self.behind = 0.0  # the seconds by which the system clock is not set
 
     @contextlib.contextmanager
     def started(
@@ -66,12 +68,14 @@ class Appliance:
     ) -> Iterator[Policies]:
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
-        self.ends = ends_of(store, self.state)
+        self.ends = ends_of(store, self.state, behind=lambda: self.behind)
         policies = Policies(
             self.file, store, self.ends, self.records, CurrentPolicy(), live=live, changed=changed,
             carried_out=at_once,
             known=lambda: PolicyContext(
-                hosts(), blocks=blocks(), holders=holders(), approved=approved(), site_keys=site_keys
+                hosts(), blocks=blocks(), holders=holders(), approved=approved(), site_keys=site_keys,
+                now=self.ends.system_time(),
+                ends=passed_changes(self.ends),
             ),
         )  # fmt: skip
         policies.start(restarted=restarted)
@@ -486,3 +490,56 @@ def test_a_policy_keeps_what_was_known_when_it_came_into_force() -> None:
     assert (len(policy.blocks), list(policy.holders or ())) == (1, ["base"])
     assert not policy.decide(Request(address_of("10.0.0.7"), "/n", Category.PUBLISH, "/x")).allowed
     assert policy.decide(Request(host, "/n", Category.PUBLISH, "/x")).allowed
+
+
+async def test_rights_end_and_begin_with_a_record_each_and_a_reload_begins_an_ended_one(
+    tmp_path: Path,
+) -> None:
+    """The text stays as it is: there is no revision. A clock that was wrong ends a right until the policy is loaded."""
+    appliance, host = Appliance(tmp_path), ipaddress.ip_address("10.0.0.7")
+    night = "/x = 10.0.0.7 during night, 10.0.0.8 during night\n/y = 10.0.0.7 until 2026-12-01"
+    rights = OPEN.replace("[Publishers]", f"[Publishers]\n{night}")
+    appliance.file.write_text(f"{rights}\n[Hours]\nnight = 22:00-06:00\n")
+    lines = [
+        number
+        for number, text in enumerate(appliance.file.read_text().split("\n"), 1)
+        if text[:2] in ("/x", "/y")
+    ]
+    set_wall(datetime(2026, 12, 1, 21, 59, 50, tzinfo=UTC).timestamp())
+
+    def told() -> list[str]:
+        found = [one.reason for one in appliance.records.records if one.event == "rights changed"]
+        appliance.records.clear()
+        return found
+
+    with appliance.started() as policies:
+
+        def granted() -> str:
+            asked = (Request(host, "/n", Category.PUBLISH, name) for name in ("/x", "/y"))
+            return "".join(one.resource[1] for one in asked if policies.current.decide(one).allowed)
+
+        assert granted() == "y"
+        await asyncio.sleep(11.0)
+        x, y = lines
+        both = f"10.0.0.7 during night (line {x}), 10.0.0.8 during night (line {x})"
+        assert (granted(), told()) == ("xy", [f"began: {both}"])
+        set_wall(datetime(2026, 12, 2, 12, tzinfo=UTC).timestamp())
+        await asyncio.sleep(6.0)
+        assert granted() == ""
+        assert told() == [
+            f"ended: 10.0.0.7 during night (line {x}), 10.0.0.7 until 2026-12-01 (line {y}),"
+            f" 10.0.0.8 during night (line {x})"
+        ]
+        set_wall(datetime(2026, 12, 1, 22, 1, tzinfo=UTC).timestamp())
+        policies.time_passed()
+        assert granted() == "x"
+        set_wall(1000.0)
+        appliance.behind = 1e9
+        policies.time_passed()
+        assert granted() == ""
+        appliance.behind = 0.0
+        set_wall(datetime(2026, 12, 1, 22, 1, tzinfo=UTC).timestamp())
+        policies.time_passed()
+        assert (granted(), policies.revision) == ("x", 1)
+        await policies.reload(PolicyReload(), "operator")
+        assert granted() == "xy"

@@ -248,3 +248,49 @@ def test_a_grant_to_a_host_behind_ask_needs_no_approval() -> None:
     wanted = Request(AGENT, "/it", Category.PUBLISH, "/cmd_vel")
     granted = grant(ASKS, "site.ini", PolicyContext(), DecidedRequest(wanted, rights_of(wanted)))
     assert "/cmd_vel = operator agent-1, ask agent-1" in granted.text
+
+
+NOW = replace(KNOWN, now=1_796_040_000.0)  # 2026-11-30 12:00 in UTC
+
+
+@pytest.mark.parametrize(
+    ("before", "until", "after"),
+    [
+        (
+            "/x = 10.0.0.1 until 2027-01-01, 10.0.0.2  # two",
+            "7d",
+            "/x = 10.0.0.1 until 2027-01-01, 10.0.0.2, 10.0.0.9 until 2026-12-07T12:00  # two",
+        ),
+        (
+            "/x = 10.0.0.9 until 2026-11-20, 10.0.0.2  # two",
+            "2026-12-05",
+            "/x = 10.0.0.9 until 2026-12-05, 10.0.0.2  # two",
+        ),
+        ("/x = 10.0.0.9 until 2026-11-20, 10.0.0.2", "", "/x = 10.0.0.9, 10.0.0.2"),
+        (
+            "/x* = 10.0.0.1 until 2027-01-01, 10.0.0.2 until 2027-01-01, ask 10.0.0.3",
+            "2h",
+            "/x = 10.0.0.1 until 2027-01-01 10.0.0.2 until 2027-01-01 10.0.0.9 until 2026-11-30T14:00 ask 10.0.0.3",
+        ),
+    ],
+)
+def test_a_right_with_a_time_is_written_and_the_times_of_others_are_kept(
+    before: str, until: str, after: str
+) -> None:
+    text = f"[Nodes]\ndefault = *\n[Publishers]\n{before}\n[Subscribers]\n"
+    found = grant(text, "p.ini", NOW, asked(str(HOST), "/it", "publish", "/x", {}), until)
+    assert after in found.text.splitlines()
+    assert decide_right(NOW.compiled(found.text, "p.ini"), Right(request(Category.PUBLISH, "/x"))).allowed
+
+
+@pytest.mark.parametrize(
+    ("known", "until", "expected"),
+    [
+        (NOW, "2026-11-01", "has passed"),
+        (NOW, "soon", "or a time such as 7d"),
+        (KNOWN, "7d", "clock is not set"),
+    ],
+)
+def test_a_right_gets_no_end_that_is_none(known: PolicyContext, until: str, expected: str) -> None:
+    with pytest.raises(UngrantableError, match=expected):
+        grant(BASE, "p.ini", known, asked(str(HOST), "/it", "publish", "/x", {}), until)

@@ -1,3 +1,5 @@
+import json
+from functools import partial
 from typing import Any
 
 import pytest
@@ -84,3 +86,34 @@ def test_a_host_without_rights_has_none_listed(shown: Any) -> None:
 def test_the_rank_or_claim_of_a_host_in_each_group_is_listed(shown: Any, name: str, parts: list[str]) -> None:
     lines = shown(name)[1][-2:]
     assert all(part in line for part, line in zip(parts, lines, strict=True)), lines
+
+
+def _same(policy: PolicyInForce, _request: object) -> PolicyInForce:
+    return policy
+
+
+def test_a_right_with_a_time_is_listed_with_it(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (
+        "[Hours]\nnight = 22:00-06:00\n[Nodes]\ndefault = *\n[Publishers]\n/a = 10.0.0.5 until 2026-12-05\n"
+        "/b = 10.0.0.5 during night\n/c = ask 10.0.0.5 until 2026-12-05\n[Subscribers]\n[Services]\n[Clients]\n"
+        "[Parameters]\n[Commands]\ngetPid = *\n"
+    )
+    for now, status, expected in (
+        (1_796_040_000.0, 0, ["/a allow until 2026-12-05", "/b deny its right during night", "/c ask until"]),
+        (
+            1_797_080_000.0,
+            0,
+            ["/a deny its right until 2026-12-05 has ended", "/b deny its right", "/c deny its right"],
+        ),
+        (None, 0, ["/a deny its right until 2026-12-05 waits", "/b deny its right", "/c deny its right"]),
+    ):
+        policy = example(PolicyInForce, text=text, file="site.ini", now=now)
+        with pytest.raises(typer.Exit) as left:
+            policy_verbs.show_host.function(call_of(partial(_same, policy), as_json=True), "10.0.0.5")
+        rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        shown = [
+            f"{row['rule']['key']} {row['decision']} {row.get('time', '')}" for row in rows if row.get("rule")
+        ]
+        assert left.value.exit_code == status
+        for row, start in zip([one for one in shown if one.startswith("/")], expected, strict=True):
+            assert row.startswith(start)

@@ -81,3 +81,13 @@ def test_a_host_whose_requests_are_only_counted_is_unknown_and_others_are_not() 
     assert (row.unknown, row.unused) == (("joystick",), ("robot",))
     assert found["Publishers /scan"].state == "unused"
     assert found["Subscribers /scan"].state == "unknown"
+
+
+def test_a_right_that_has_ended_is_named_used_or_not() -> None:
+    """Its use counts: the request was decided in its time."""
+    text = "[Nodes]\ndefault = *\n[Publishers]\n/a = 10.0.0.5 until 2026-12-05, 10.0.0.6 until 2026-12-05\n"
+    uses = RuleUses(compile_policy(text, file="p.ini", now=1_797_040_000.0))
+    uses.add(Observation(Request(JOYSTICK, "/it", Category.PUBLISH, "/a"), "registerPublisher", ""), 3)
+    row = rows(uses)["Publishers /a"]
+    assert (row.used, row.unused) == (3, ("10.0.0.6 until 2026-12-05",))
+    assert row.ended == ("10.0.0.5 until 2026-12-05", "10.0.0.6 until 2026-12-05")

@@ -5,6 +5,7 @@ import { get } from "../rest.js";
 // By section: its words before "=", the live names before "=", and its words after "=".
 const SECTIONS = /** @type {Record<string, {keys?: string[], names?: "nodes" | "topics" | "services", values?: string[]}>} */ ({
   Groups: {},
+  Hours: { keys: ["zone"] },
   Ports: { keys: ["range"] },
   Monitor: { keys: ["topic", "service"] },
   Nodes: { keys: ["default"], names: "nodes" },
@@ -57,8 +58,9 @@ async function keysOf(/** @type {{keys?: string[], names?: "nodes" | "topics" | 
 async function valuesOf(/** @type {string} */ section, /** @type {{values?: string[]}} */ { values }, /** @type {string} */ key, /** @type {string} */ text) {
   if (section === "Options") return [...named(OPTIONS[key] ?? [], "option"), ...named(key === "audit-only" ? Object.keys(SECTIONS) : [], "section")];
   if (section === "Monitor") return key === "topic" ? named((await live()).topics, "topic") : named((await live()).services, "service");
-  if (section === "Ports") return [];
-  return [...named(values ?? [], section === "Limits" ? "limit" : "option"), ...named(["robot", ...groupsOf(text)], "group"), ...named((await live()).hosts, "host")];
+  if (section === "Ports" || section === "Hours") return [];
+  const times = section === "Limits" ? [] : ["until", "during", ...namesIn(text, "hours").filter((one) => one !== "zone")];
+  return [...named(values ?? [], section === "Limits" ? "limit" : "option"), ...named(times, "time"), ...named(["robot", ...namesIn(text, "groups")], "group"), ...named((await live()).hosts, "host")];
 }
 
 /** The section at the end of a text, as `SECTIONS` spells it. */
@@ -67,15 +69,15 @@ function sectionOf(/** @type {string} */ before) {
   return Object.keys(SECTIONS).find((one) => one.toLowerCase() === name) ?? "";
 }
 
-/** The names of the groups that a text defines. */
-function groupsOf(/** @type {string} */ text) {
+/** The names that a section of a text defines. */
+function namesIn(/** @type {string} */ text, /** @type {string} */ wanted) {
   const found = new Set();
   let section = "";
   for (const line of text.split("\n")) {
     const head = /^\s*\[([^\]]*)\]/.exec(line);
     const key = /^\s*([^\s=#;[]+)\s*=/.exec(line);
     if (head) section = head[1].trim().toLowerCase();
-    else if (key && section === "groups") found.add(key[1]);
+    else if (key && section === wanted) found.add(key[1]);
   }
   return [...found];
 }

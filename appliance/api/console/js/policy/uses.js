@@ -24,8 +24,8 @@ export function Uses({ pick }) {
   const rows = value.rules.toSorted((/** @type {any} */ one, /** @type {any} */ other) => ORDER.indexOf(one.state) - ORDER.indexOf(other.state));
   return html`<p class="panel-body muted small">Recorded requests since <${Moment} at=${value.since} />, and registrations of now. Before you remove a rule, think of what happens once a year.${!value.whole && " Older records are removed, or too many to read here: what was not seen is unknown."}</p>
     <div class="table-wrap tall"><table class="table"><thead><tr><th>Rule</th><th>Use</th><th>Hosts without a use</th></tr></thead><tbody>
-    ${rows.map((/** @type {any} */ { rule, state, used, unused_hosts, unknown_hosts }) => html`<tr key=${`${rule.file}:${rule.line}`}>
+    ${rows.map((/** @type {any} */ { rule, state, used, unused_hosts, unknown_hosts, ended_hosts = [] }) => html`<tr key=${`${rule.file}:${rule.line}`}>
       <td>${rule.section} ${pick ? html`<button class="button small plain" onClick=${() => pick({ line: rule.line, column: 1 })}><${Given} value=${rule.key} mono /></button>` : html`<${Given} value=${rule.key} mono />`}</td>
       <td><${Badge} word=${state} tone=${TONES[state]} />${used > 0 && html` <span class="muted small">${counted(used, "use")}</span>`}</td>
-      <td>${unused_hosts.length > 0 && html`<${Given} value=${unused_hosts.join(" ")} most=${200} mono />`}${unknown_hosts.length > 0 && html`<div class="muted small">unknown: <${Given} value=${unknown_hosts.join(" ")} most=${200} mono /></div>`}</td></tr>`)}</tbody></table></div>`;
+      <td>${unused_hosts.length > 0 && html`<${Given} value=${unused_hosts.join(" ")} most=${200} mono />`}${unknown_hosts.length > 0 && html`<div class="muted small">unknown: <${Given} value=${unknown_hosts.join(" ")} most=${200} mono /></div>`}${ended_hosts.length > 0 && html`<div class="muted small">ended: <${Given} value=${ended_hosts.join(", ")} most=${200} mono /></div>`}</td></tr>`)}</tbody></table></div>`;
 }
