@@ -11,13 +11,45 @@ from appliance.base.counted import counted
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
-from appliance.features.views import states_of
+from appliance.features.view import AlarmKind
+from appliance.features.views import STATES, states_of
 
 Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]
 SWITCHED_OFF = "monitor-off:"
 """Begins the kinds of alarms for monitors that an order or a file disabled, or put into shadow mode."""
-_Condition = tuple[Severity, str, About, str]
+_Condition = tuple[str, About, str]
+_CORE_KINDS = {
+    "starting": AlarmKind("warning", "wait: RVMaster started a few seconds ago; what stays is then named"),
+    "audit-failed": AlarmKind("alarm", "free or repair the disk: requests may be denied"),
+    "audit-replaced": AlarmKind("alarm", "find the earlier log, or set it aside"),
+    "probe": AlarmKind("alarm", "hide the ROS master: no node is served"),
+    "hold-lapsed": AlarmKind("alarm", "order such a start again"),
+    "rules-removed": AlarmKind("alarm", "find the program that removes rules; it ends after an hour"),
+    "relay": AlarmKind("alarm", "read why it is away: its topics carry nothing"),
+    "process-failing": AlarmKind("alarm", "read what it printed last"),
+    "rosmaster": AlarmKind("warning", "wait: calls wait also"),
+    "audit-degraded": AlarmKind("warning", "check the disk and the load"),
+    "forgotten": AlarmKind("alarm", "enable the protection again, or remove it"),
+    "monitor-off": AlarmKind("warning", "enable it again, unless it should be off"),
+    "policy-unconfirmed": AlarmKind("warning", "confirm it, or let it roll back"),
+    "policy-audit-only": AlarmKind("warning", "enforce the sections when they are learnt"),
+    "policy-refused": AlarmKind("alarm", "correct the file: the next start may need it"),
+    "policy-differs": AlarmKind("notice", "somebody changed one of them on purpose"),
+    "monitor-held": AlarmKind("alarm", "resume it: its topics wait for a person"),
+    "monitor-left-out": AlarmKind("alarm", "load it: nothing guards its topics"),
+    "monitor-failing": AlarmKind("alarm", "correct it: its messages are dropped"),
+    "monitors-refused": AlarmKind("alarm", "load others: without earlier ones, all topics are blocked"),
+    "monitors-unconfirmed": AlarmKind("warning", "confirm them, or let them roll back"),
+    "monitor-unconfirmed": AlarmKind("warning", "confirm it, or let it return to shadow mode"),
+    "monitors-differ": AlarmKind("notice", "somebody changed one of them on purpose"),
+    "ipsec": AlarmKind("warning", "do what the line says"),
+    "hosts-blocked": AlarmKind("notice", "somebody blocked them on purpose"),
+    "denials": AlarmKind("warning", "see who was denied what; it ends after a minute"),
+    "drops": AlarmKind("warning", "see which messages were dropped; it ends after a minute"),
+}
+ALARM_KINDS = _CORE_KINDS | {name: kind for view in STATES for name, kind in view.kinds.items()}
+"""Every kind of alarm: what follows a colon in `Alarm.kind` is not part of its name here."""
 _ORDER = ("alarm", "warning", "notice")
 
 
@@ -40,33 +72,34 @@ class AlarmList(msgspec.Struct, frozen=True):
 
 def open_alarms(status: Status) -> list[Alarm]:
     found = [*_system(status), *_policy(status), *_monitors(status)]
-    found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
+    found += [("ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)
     for view, state in states_of(status):
-        found += [(one.severity, one.kind, one.about, one.text) for one in view.alarms(state)]
-    alarms = (
-        Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
-    )
+        found += [(one.kind, one.about, one.text) for one in view.alarms(state)]
+    alarms = (_alarm(kind, about, text) for kind, about, text in found)
     return sorted(_handled(status, alarms), key=lambda alarm: _ORDER.index(alarm.severity))
+
+
+def _alarm(kind: str, about: About, text: str) -> Alarm:
+    return Alarm(kind=kind, severity=ALARM_KINDS[kind.partition(":")[0]].severity, text=text, about=about)
 
 
 def activity(status: Status) -> list[Alarm]:
     """Return notices of the last minute's denials and drops, which are not faults of the appliance."""
     recent = status.last_minute
     found = [
-        Alarm(
-            kind=f"drops:{name}",
-            severity="warning",
-            text=f"{name} dropped {drops} {'message' if drops == 1 else 'messages'} in the last minute;"
+        _alarm(
+            f"drops:{name}",
+            "monitors",
+            f"{name} dropped {drops} {'message' if drops == 1 else 'messages'} in the last minute;"
             " rosrv audit search --event 'message dropped' --since 1m",
-            about="monitors",
         )
         for name, drops in sorted(recent.drops.items())
     ]
     if recent.denials >= recent.attention_at:
         most = f" ({recent.most_denied})" if recent.most_denied else ""
         text = f"{counted(recent.denials, 'denial')} in the last minute{most}; rosrv audit summary --since 1m"
-        found.insert(0, Alarm(kind="denials", severity="warning", text=text, about="audit"))
+        found.insert(0, _alarm("denials", "audit", text))
     return list(_handled(status, found))
 
 
@@ -86,26 +119,28 @@ def _handled(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
 def _system(status: Status) -> Iterator[_Condition]:
     audit = status.audit
     if audit.failed is not None:
-        yield "alarm", "audit-failed", "audit", f"the audit log cannot be written: {audit.failed}"
+        yield "audit-failed", "audit", f"the audit log cannot be written: {audit.failed}"
     if audit.replaced is not None:
-        yield "alarm", "audit-replaced", "audit", audit.replaced
+        yield "audit-replaced", "audit", audit.replaced
     if probe_failed(status):
         text = f"the ROS master is not hidden: {status.probe}; nodes are not served"
-        yield "alarm", "probe", "system", text
+        yield "probe", "system", text
     if status.firewall.hold_lapsed:
-        yield "alarm", "hold-lapsed", "system", status.firewall.hold_lapsed
+        yield "hold-lapsed", "system", status.firewall.hold_lapsed
     if status.firewall.removed:
-        yield "alarm", "rules-removed", "system", status.firewall.removed
-    relay = no_relay(status.relay)
-    if relay is not None:
-        yield "alarm", "relay", "system", f"{relay}, until it is back"
+        yield "rules-removed", "system", status.firewall.removed
+    relay, rebuilt = no_relay(status.relay), status.rosmaster != "reachable"
+    if status.starting and (relay is not None or rebuilt):
+        yield "starting", "system", "starting: calls and messages wait"
+    elif relay is not None:
+        yield "relay", "system", f"{relay}, until it is back"
     for process in status.processes:
         if process.failing:
-            yield "alarm", "process-failing", "system", _failing(process)
-    if status.rosmaster != "reachable":
-        yield "warning", "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
+            yield "process-failing", "system", _failing(process)
+    if rebuilt and not status.starting:
+        yield "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
     if audit.degraded is not None:
-        yield "warning", "audit-degraded", "audit", f"the audit log is behind: {audit.degraded}"
+        yield "audit-degraded", "audit", f"the audit log is behind: {audit.degraded}"
 
 
 def _policy(status: Status) -> Iterator[_Condition]:
@@ -113,13 +148,12 @@ def _policy(status: Status) -> Iterator[_Condition]:
     for off in status.switched_off:
         if off.forgotten:
             text = f"{off.what} since {_moment(off.since)}: {off.again}"
-            yield "alarm", f"forgotten:{off.name}", off.about, text
+            yield f"forgotten:{off.name}", off.about, text
         elif off.about == "monitors":
             end = "without an end" if off.until is None else f"until {_moment(off.until)}"
-            yield "warning", f"{SWITCHED_OFF}{off.name}", "monitors", f"{off.what}, {end}: {off.again}"
+            yield f"{SWITCHED_OFF}{off.name}", "monitors", f"{off.what}, {end}: {off.again}"
     if policy.confirm_by is not None:
         yield (
-            "warning",
             "policy-unconfirmed",
             "policy",
             _rolls_back("the policy rolls", policy.confirm_by, "policy"),
@@ -127,13 +161,13 @@ def _policy(status: Status) -> Iterator[_Condition]:
     if policy.audit_only:
         sections = "], [".join(policy.audit_only)
         text = f"the policy denies nothing by [{sections}]; denials are only recorded (audit-only)"
-        yield "warning", "policy-audit-only", "policy", text
+        yield "policy-audit-only", "policy", text
     if policy.file_refused:
         text = f"revision {policy.revision} stays in force, {policy.file} is rejected: {policy.file_refused}"
-        yield "alarm", "policy-refused", "policy", text
+        yield "policy-refused", "policy", text
     elif policy.differs_from_file:
         text = f"revision {policy.revision} differs from {policy.file}"
-        yield "notice", "policy-differs", "policy", text
+        yield "policy-differs", "policy", text
 
 
 def _monitors(status: Status) -> Iterator[_Condition]:
@@ -141,24 +175,24 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     for name in monitors.held:
         why = monitors.why_held.get(name, "a relay was restarted")
         text = f"topics are held ({name}: {why}): rosrv monitor resume {name}"
-        yield "alarm", f"monitor-held:{name}", "monitors", text
+        yield f"monitor-held:{name}", "monitors", text
     for file, error in monitors.left_out.items():
         text = f"{file} is left out, so nothing guards its topics: {error}: rosrv monitor load {file}"
-        yield "alarm", f"monitor-left-out:{file}", "monitors", text
+        yield f"monitor-left-out:{file}", "monitors", text
     for name in monitors.failing:
         text = f"monitors fail: {name}; its messages are dropped"
-        yield "alarm", f"monitor-failing:{name}", "monitors", text
+        yield f"monitor-failing:{name}", "monitors", text
     for line in monitors.refused:
-        yield "warning", "monitors-refused", "monitors", f"the relay rejected the specifications: {line}"
+        yield "monitors-refused", "monitors", f"the relay rejected the specifications: {line}"
     if monitors.confirm_by is not None:
         text = _rolls_back("the specifications roll", monitors.confirm_by, "monitor")
-        yield "warning", "monitors-unconfirmed", "monitors", text
+        yield "monitors-unconfirmed", "monitors", text
     for name, deadline in monitors.unconfirmed.items():
         text = f"{name} returns to shadow mode at {_moment(deadline)} unless confirmed: rosrv monitor confirm"
-        yield "warning", f"monitor-unconfirmed:{name}", "monitors", text
+        yield f"monitor-unconfirmed:{name}", "monitors", text
     if monitors.differs_from_folder:
         text = f"revision {monitors.revision} of the specifications differs from their folder"
-        yield "notice", "monitors-differ", "monitors", text
+        yield "monitors-differ", "monitors", text
 
 
 def _blocks(blocks: BlocksState) -> Iterator[_Condition]:
@@ -166,7 +200,7 @@ def _blocks(blocks: BlocksState) -> Iterator[_Condition]:
         count = "1 host is blocked" if blocks.hosts == 1 else f"{blocks.hosts} hosts are blocked"
         which = "the first block ends" if blocks.hosts > 1 else "the block ends"
         end = "without an end" if blocks.first_end is None else f"{which} at {_moment(blocks.first_end)}"
-        yield "warning", "hosts-blocked", "hosts", f"{count}, {end}: rosrv host blocks"
+        yield "hosts-blocked", "hosts", f"{count}, {end}: rosrv host blocks"
 
 
 def _failing(process: ProcessInfo) -> str:

@@ -35,6 +35,7 @@ from appliance.features.views import pair_view, passive_status, states_of
 from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
 
+_NOTICES = ("hosts-blocked", "not-carried")
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
 _MOST_TROUBLES = 5
@@ -98,28 +99,30 @@ def _shown(answer: AdminAnswer[A], view: Callable[[A], StatusView]) -> AdminAnsw
 
 
 def _view(body: Status, appliance: Appliance) -> StatusView:
-    troubles = list(troubles_of(body))
+    alarms = troubles_of(body)
+    troubles = [alarm.text for alarm in alarms]
     attention = [alarm.text for alarm in (*activity(body), *open_alarms(body)) if _is_attention(alarm, body)]
     fields = {**in_full(body), "troubles": troubles, "attention": attention}
     host_in_words = str if appliance.as_json or not body.ipsec.ports else appliance.host_in_words
-    screen = StatusScreen(body, troubles, attention, host_in_words)
+    screen = StatusScreen(body, alarms, attention, host_in_words)
     return StatusView(1 if troubles else 0, screen, fields)
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Return whether an alarm has no effect on the exit status: recent denials and drops, monitors that were
-    switched off, and silenced alarms.
+    """Return whether an alarm that has no effect on the exit status is printed: recent denials and drops, monitors
+    that were switched off, silenced alarms, and notices that no other line has.
     """
     return (
         alarm in activity(body)
         or alarm.kind.startswith(SWITCHED_OFF)
-        or (alarm.severity == "notice" and alarm.handled != "")
+        or (alarm.severity == "notice" and (alarm.handled != "" or alarm.kind.startswith(_NOTICES)))
     )
 
 
-def troubles_of(body: Status) -> list[str]:
+def troubles_of(body: Status) -> list[Alarm]:
+    """Return the conditions that need a person, now or soon; the exit status is 1 while there is one."""
     return [
-        alarm.text
+        alarm
         for alarm in open_alarms(body)
         if alarm.severity != "notice"
         and alarm.kind != "policy-audit-only"
@@ -129,16 +132,17 @@ def troubles_of(body: Status) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class StatusScreen:
-    """Prints a status: problems come first, then recent denials and drops."""
+    """Prints a status: problems come first, in red those that need a person now, then recent denials and drops."""
 
     body: Status
-    troubles: list[str]
+    troubles: list[Alarm]
     attention: list[str]
     host_in_words: HostInWords
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
-        for trouble in map(in_local_zone, shortened(self.troubles, _MOST_TROUBLES)):
-            yield Text(f"! {trouble}", style=_RED)
+        grave = sum(alarm.severity == "alarm" for alarm in self.troubles)  # they come first
+        for place, trouble in enumerate(shortened([alarm.text for alarm in self.troubles], _MOST_TROUBLES)):
+            yield Text(f"! {in_local_zone(trouble)}", style=_RED if place < grave else _YELLOW)
         for line in map(in_local_zone, shortened(self.attention, _MOST_TROUBLES)):
             yield Text(f"attention: {line}", style=_YELLOW)
         yield _grid(self.body, self.host_in_words)

@@ -1,5 +1,6 @@
 """Define what a feature adds to views of commands and pages, without settings: `rosrv status` must start fast."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,19 @@ Pieces = Sequence[tuple[str, str]]
 """The pieces of a text, each with its style on a terminal; an empty style is that of other text."""
 
 
-class Trouble(NamedTuple):
-    """A condition that needs attention; `text` has the reason and the remedy, `about` is as in `Alarm`."""
+class AlarmKind(NamedTuple):
+    """Whether a kind of condition needs a person now (`alarm`), soon (`warning`) or not (`notice`), and for what."""
 
     severity: Literal["alarm", "warning", "notice"]
+    remedy: str
+    """What the person does, or why none needs to, for the reference."""
+
+
+class Trouble(NamedTuple):
+    """A condition that holds now; `kind` is a name of `kinds`, or one with `:` and what it is about. `text` has the
+    reason and the remedy, `about` is as in `Alarm`.
+    """
+
     kind: str
     text: str
     about: Literal["system", "monitors", "audit"] = "system"
@@ -40,6 +50,8 @@ class StateView(Generic[S]):
     before: str = ""
     """The name of the field that follows, or empty if the field is the last."""
     required: bool = False
+    kinds: Mapping[str, AlarmKind] = dataclasses.field(default_factory=dict)
+    """The kinds of `alarms`."""
     alarms: Callable[[S], Iterable[Trouble]] = lambda _state: ()
     metrics: tuple[Metric, ...] = ()
     samples: Callable[[S], Mapping[str, Samples]] = lambda _state: {}

@@ -10,6 +10,7 @@ import msgspec
 from appliance.channel.answers.field_docs import doc
 from appliance.features.adopt.view import ADOPT_VIEW
 from appliance.features.approvals.view import APPROVALS_VIEW
+from appliance.features.authority.view import AUTHORITY_VIEW
 from appliance.features.doors.view import DOORS_VIEW
 from appliance.features.fleet.view import FLEET_VIEW
 from appliance.features.guards.view import GUARDS_VIEW
@@ -20,7 +21,7 @@ from appliance.features.view import FeatureView, PairView, StateView, no_passive
 
 VIEWS: tuple[FeatureView, ...] = (
     SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW, APPROVALS_VIEW, GUARDS_VIEW,
-    ADOPT_VIEW,
+    ADOPT_VIEW, AUTHORITY_VIEW,
 )  # fmt: skip
 T = TypeVar("T")
 STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)

@@ -63,6 +63,8 @@ class StoppedTopic(msgspec.Struct, frozen=True):
     node: str = ""
     record: str = ""
     """The record of its begin."""
+    publisher: tuple[str, str] = ("", "")
+    """Host and node of the topic's only publisher, if a timer led to the stop."""
 
 
 @dataclass(slots=True)
@@ -199,7 +201,9 @@ class Stops:
         allowance = self._allowances.setdefault(key, _Allowance(STOPS, LONG_QUIET, STOPS, now))
         first = int(event.detail.get("first_time") or event.time)
         cause, count = str(event.detail.get("cause", "")), event.count or 1
-        found = StoppedTopic(*key, first, last, count, cause, event.host, event.caller_id)
+        found = StoppedTopic(
+            *key, first, last, count, cause, event.host, event.caller_id, publisher=_only(event)
+        )
         self._going[key] = _Going(found, now, QUIET if allowance.take(now) else LONG_QUIET)
         self.last[event.monitor] = found
         return found
@@ -215,6 +219,11 @@ class Stops:
         if stops:
             self._keep(self.going())
         return stops
+
+
+def _only(event: MonitorEvent) -> tuple[str, str]:
+    publishers = event.detail.get("publishers", ())
+    return (str(publishers[0]["host"]), str(publishers[0]["node"])) if len(publishers) == 1 else ("", "")
 
 
 def _counted(

@@ -263,6 +263,7 @@ class Status(msgspec.Struct, frozen=True):
     handled_alarms: Annotated[
         list[HandledAlarm], doc("alarms that an operator acknowledged or silenced")
     ] = []
+    starting: Annotated[bool, doc("RVMaster started less than ten seconds ago")] = False
     new_state: Annotated[
         NewState | None, doc("the state directory, if it is younger than a day, otherwise null")
     ] = None

@@ -10,7 +10,7 @@ import msgspec
 from msgspec.structs import asdict
 
 import appliance
-from appliance.base.clock import wall
+from appliance.base.clock import now, wall
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import (
     Connection,
@@ -226,6 +226,7 @@ def by_resource(
     return sums
 
 
+_START_SECONDS = 10.0
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
@@ -249,6 +250,7 @@ class Queries:
     new_state: Callable[[], NewState | None]
     name: str = ""
     started: float = field(default_factory=wall)
+    began: float = field(default_factory=now)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
         return self.present()
@@ -323,6 +325,7 @@ class Queries:
             clock=self.clock(),
             switched_off=self.switched_off(),
             blocks=self.blocks(),
+            starting=now() - self.began < _START_SECONDS,
             new_state=self.new_state(),
             last_minute=MinuteState(
                 sum(meter.denied.counts().values()), meter.dropped.counts(), most_denied=meter.most_denied()

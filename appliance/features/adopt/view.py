@@ -6,7 +6,7 @@ from typing import Any
 from appliance.base.counted import counted
 from appliance.base.metric import gauge
 from appliance.features.adopt.adopt_answers import AdoptState
-from appliance.features.view import FeatureView, Samples, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, Samples, StateView, Trouble
 
 _METRICS = (
     gauge(
@@ -20,7 +20,7 @@ _METRICS = (
 def _alarms(state: AdoptState) -> Iterator[Trouble]:
     if state.obstacle:
         what = "adopted" if state.wanted else "given back"
-        yield Trouble("alarm", "adoption", f"the robot's graph is not {what}: {state.obstacle}")
+        yield Trouble("adoption", f"the robot's graph is not {what}: {state.obstacle}")
 
 
 def _samples(state: AdoptState) -> dict[str, Samples]:
@@ -47,6 +47,11 @@ ADOPT_VIEW = FeatureView(
             AdoptState,
             "the adoption of a running robot's graph, or null without one",
             before="handled_alarms",
+            kinds={
+                "adoption": AlarmKind(
+                    "alarm", "correct what keeps the graph from being adopted or given back"
+                )
+            },
             alarms=_alarms,
             metrics=_METRICS,
             samples=_samples,

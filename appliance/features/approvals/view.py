@@ -8,7 +8,7 @@ import msgspec
 from appliance.base.counted import counted
 from appliance.base.metric import gauge
 from appliance.channel.answers.field_docs import doc
-from appliance.features.view import FeatureView, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, StateView, Trouble
 
 _METRICS = (
     gauge("rosrv_approvals_waiting", "calls that wait for an operator's approval"),
@@ -39,10 +39,10 @@ def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
             f"no operator answered {counted(state.unanswered, 'call')} in time, in the last ten minutes:"
             " rosrv approve"
         )
-        yield Trouble("warning", "approval-unanswered", text)
+        yield Trouble("approval-unanswered", text)
     if state.unsent:
         text = f"the web hook did not get {counted(state.unsent, 'waiting call')}: {state.unsent_why}"
-        yield Trouble("warning", "approval-hook", text)
+        yield Trouble("approval-hook", text)
 
 
 def _line(state: ApprovalCounts) -> tuple[str, str]:
@@ -60,6 +60,12 @@ APPROVALS_VIEW = FeatureView(
             "approvals",
             ApprovalCounts,
             "calls that wait for an operator's approval, and approvals",
+            kinds={
+                "approval-unanswered": AlarmKind(
+                    "warning", "see that somebody answers; it ends after ten minutes"
+                ),
+                "approval-hook": AlarmKind("warning", "repair the receiver of the web hook"),
+            },
             alarms=_alarms,
             line=_line,
             metrics=_METRICS,

@@ -53,4 +53,5 @@ async def begin(core: Core) -> ControlPart:
             "the stop of drivers that were lost": ranked.stop_lost,
             "the stop of what was commanded before groups ended": at_start,
         },
+        lambda: {"authority": orders.unheard()},
     )

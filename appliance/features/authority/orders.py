@@ -16,6 +16,7 @@ from appliance.control.errors import SenselessError, UnavailableError, UnknownTh
 from appliance.control.motion_stop import StopAfter
 from appliance.features.authority import requests
 from appliance.features.authority.ranked_groups import RankedGroups
+from appliance.features.authority.view import AuthorityState, NotCarried, UnheardGroup
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.authority import AuthorityGroup, Claim
@@ -140,6 +141,7 @@ class GroupHolders:
 
 
 CHECK_SECONDS = 0.25
+_MOST_NAMED = 20  # hosts without an effect
 
 
 class DriveOrders:
@@ -433,7 +435,42 @@ class DriveOrders:
             group.release_after,
             None if left is None else round(max(0.0, left), 1),
             [str(host) for host in self._groups.waiting(group, now)],
+            not_carried=self._not_carried(group),
         )
+
+    def _not_carried(self, group: AuthorityGroup) -> list[NotCarried]:
+        """Return the hosts that publish to the group while nothing of theirs is carried."""
+        policy, found = self._policy(), dict[tuple[str, Address], list[str]]()
+        for topic in sorted(group.names):
+            for host, node in self._signs.publishers(topic):
+                if not (
+                    self._ranked.hears(group, host, node) if group.ranks else policy.may_command(topic, host)
+                ):
+                    found.setdefault((topic, host), []).append(node)
+        return [
+            NotCarried(str(host), topic, sorted(nodes), self._order(group, host))
+            for (topic, host), nodes in list(found.items())[:_MOST_NAMED]
+        ]
+
+    def _order(self, group: AuthorityGroup, host: Address) -> str:
+        if group.ranks:
+            return f"rosrv drive free {group.name}"
+        if self._groups.holder(group.name) is not None:
+            return ""
+        if self._claim(group, host) is Claim.ASK:
+            return f"rosrv drive free {group.name} --to {host}"
+        return f"rosrv drive assign {group.name} --host {host}"
+
+    def unheard(self) -> AuthorityState | None:
+        """Return the groups that no host commands while some would; null without groups."""
+        groups = self._policy().authority
+        states = [self._state(groups[name]) for name in sorted(groups)] if groups else []
+        unheard = [
+            UnheardGroup(state.group, state.why or f"no host holds {state.group}", state.not_carried)
+            for state in states
+            if any(one.order for one in state.not_carried)
+        ]
+        return AuthorityState(unheard) if groups else None
 
     def _ranked_state(self, group: AuthorityGroup) -> requests.GroupState:
         driver = self._ranked.driver(group)
@@ -449,4 +486,5 @@ class DriveOrders:
             driver.node if driver.holder else "",
             driver.standing,
             driver.why(group),
+            self._not_carried(group),
         )

@@ -103,6 +103,15 @@ class RankedGroups:
     def driver(self, group: AuthorityGroup) -> RankedDriver:
         return self._drivers.get(group.topic, RankedDriver(_UNKNOWN))
 
+    def hears(self, group: AuthorityGroup, host: Address, node: str) -> bool:
+        """Return whether a node may move the group, unless one of a higher rank does: after a loss or a start, lower
+        ranks wait for a person.
+        """
+        driver = self.driver(group)
+        rank = group.rank(self._policy().atoms_of(host), node)
+        last = driver.report.rank if driver.standing == "lost" else 0
+        return driver.standing in ("moving", "free") or (rank is not None and rank <= last)
+
     async def free(self, group: AuthorityGroup, who: str) -> None:
         """Hand a group back, so that all its ranks may move. Raises `SenselessError` or `UnavailableError`."""
         driver = self.driver(group)

@@ -7,6 +7,7 @@ import msgspec
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_operation import parameter, rest
+from appliance.features.authority.view import NotCarried
 
 _NO_GROUP = {404: "The policy has no such group in [Authority].", 422: "The host may not."}
 GroupName = Annotated[str, parameter("name of the group", min_length=1, max_length=64, examples=["base"])]
@@ -47,6 +48,9 @@ class GroupState(msgspec.Struct, frozen=True):
         doc("of a group with a rank: `moving`, `free`, `lost` after a motion, or `unknown` after a start"),
     ] = ""
     why: Annotated[str, doc("why this node drives, or whom lower ranks wait for")] = ""
+    not_carried: Annotated[
+        list[NotCarried], doc("the hosts whose messages are not carried now, at most 20, by topic")
+    ] = []
 
 
 class GroupStates(msgspec.Struct, frozen=True):

@@ -1,6 +1,7 @@
 """The commands `rosrv drive status|assign|free|ask`."""
 
 import ipaddress
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -107,6 +108,7 @@ def _show(appliance: Appliance, one: GroupState) -> None:
         why = " ".join(shown(word) if _is_address(word) else word for word in one.why.split(" "))
         say_row([f"{one.group}: {one.standing}{since}: {why}"])
         say_row([f"  rank: {' > '.join(one.ranks)}"])
+        _show_not_carried(shown, one)
         return
     held = (
         f"held by {shown(one.holder)}, {one.left_seconds:g} s left without a message"
@@ -117,6 +119,14 @@ def _show(appliance: Appliance, one: GroupState) -> None:
     if one.waiting:
         parts = [f"{parts[0]};", f"waiting: {', '.join(map(shown, one.waiting))}"]
     say_row(parts, gap=" ")
+    _show_not_carried(shown, one)
+
+
+def _show_not_carried(shown: Callable[[str], str], group: GroupState) -> None:
+    for one in group.not_carried:
+        nodes = f"{one.nodes[0]}{f' and {len(one.nodes) - 1} more' if len(one.nodes) > 1 else ''}"
+        order = f": {one.order}" if one.order else ""
+        say_row([f"  not carried: messages of {shown(one.host)} ({nodes}) to {one.topic}{order}"])
 
 
 def _is_address(word: str) -> bool:

@@ -8,7 +8,7 @@ import msgspec
 from appliance.base.counted import counted
 from appliance.base.metric import Metric, counter, gauge
 from appliance.channel.answers.field_docs import doc
-from appliance.features.view import FeatureView, Samples, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, Samples, StateView, Trouble
 
 LATELY_SECONDS = 600.0
 _MANY_RESTARTS = 3  # within `LATELY_SECONDS`
@@ -63,7 +63,7 @@ _METRICS: Mapping[str, Metric] = {
 def _alarms(state: DoorsState) -> Iterator[Trouble]:
     down = [f"{one.name} ({one.trouble})" for one in state.doors if one.trouble]
     if down:
-        yield Trouble("warning", "doors-down", f"doors do not serve: {_listed(down)}; see rosrv door list")
+        yield Trouble("doors-down", f"doors do not serve: {_listed(down)}; see rosrv door list")
     dying = [
         f"{one.name} ({counted(one.restarts_lately, 'time')})"
         for one in state.doors
@@ -71,9 +71,7 @@ def _alarms(state: DoorsState) -> Iterator[Trouble]:
     ]
     if dying:
         text = f"processes of doors keep ending, in the last ten minutes of {_listed(dying)}"
-        yield Trouble(
-            "warning", "doors-restarting", f"{text}; see rosrv audit search --event 'door failed' --since 10m"
-        )
+        yield Trouble("doors-restarting", f"{text}; see rosrv audit search --event 'door failed' --since 10m")
     full = [
         f"{one.name} ({one.connections} of {one.limit})"
         for one in state.doors
@@ -82,7 +80,6 @@ def _alarms(state: DoorsState) -> Iterator[Trouble]:
     if full:
         text = f"doors have been at their limit of connections for a minute: {_listed(full)}"
         yield Trouble(
-            "warning",
             "doors-full",
             f"{text}; rosrv door list shows who is connected, doors.connections is the limit",
         )
@@ -119,6 +116,11 @@ DOORS_VIEW = FeatureView(
             DoorsState,
             "the doors, or null if there are none",
             before="handled_alarms",
+            kinds={
+                "doors-down": AlarmKind("warning", "correct why the door does not serve"),
+                "doors-restarting": AlarmKind("warning", "read why its process ends"),
+                "doors-full": AlarmKind("warning", "see who is connected, or raise the limit"),
+            },
             alarms=_alarms,
             metrics=tuple(_METRICS.values()),
             samples=_samples,

@@ -9,7 +9,7 @@ from appliance.base import clock
 from appliance.base.metric import counter, gauge
 from appliance.base.timestamps import age
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.features.view import FeatureView, Pieces, Samples, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, Pieces, Samples, StateView, Trouble
 from appliance.forwarding.forwarding_state import ForwardingState, samples_of
 
 
@@ -58,22 +58,22 @@ _BUNDLE_METRICS = (
 def _collector_alarms(state: ForwardingState) -> Iterator[Trouble]:
     if state.trouble:
         where = f"the audit log is not collected by {state.to}, {state.behind} sealed records wait"
-        yield Trouble("warning", "audit-not-collected", f"{where}: {state.trouble}", "audit")
+        yield Trouble("audit-not-collected", f"{where}: {state.trouble}", "audit")
 
 
 def _bundle_alarms(bundles: BundlesState) -> Iterator[Trouble]:
     if bundles.refused:
         stays = f"{bundles.in_force} stays" if bundles.in_force else "no bundle is"
         text = f"{bundles.refused} is refused, {stays} in force: {bundles.reason.splitlines()[0]}"
-        yield Trouble("warning", "bundle-refused", text)
+        yield Trouble("bundle-refused", text)
     if bundles.rejected:
         text = f"the collector {bundles.collector} serves bundles that are not accepted: {bundles.trouble}"
-        yield Trouble("alarm", "bundles-rejected", text)
+        yield Trouble("bundles-rejected", text)
     elif bundles.trouble:
-        yield Trouble("warning", "bundles-not-polled", f"no new bundles: {bundles.trouble}")
+        yield Trouble("bundles-not-polled", f"no new bundles: {bundles.trouble}")
     if bundles.changed:
         text = f"{bundles.in_force} is in force, but was changed on this robot since"
-        yield Trouble("notice", "bundle-changed", text)
+        yield Trouble("bundle-changed", text)
 
 
 def _bundle_samples(bundles: BundlesState) -> dict[str, Samples]:
@@ -109,6 +109,9 @@ FLEET_VIEW = FeatureView(
             ForwardingState,
             "segments pushed to the collector, or null if none is configured",
             part="audit",
+            kinds={
+                "audit-not-collected": AlarmKind("warning", "repair the collector; records wait on the disk")
+            },
             alarms=_collector_alarms,
             metrics=_COLLECTOR_METRICS,
             samples=lambda state: samples_of("collector", state),
@@ -119,6 +122,12 @@ FLEET_VIEW = FeatureView(
             BundlesState,
             "the bundles of the fleet, or null if none are configured",
             before="handled_alarms",
+            kinds={
+                "bundle-refused": AlarmKind("warning", "correct the bundle; the last one stays in force"),
+                "bundles-rejected": AlarmKind("alarm", "find out who serves them: they are not of the fleet"),
+                "bundles-not-polled": AlarmKind("warning", "repair the collector"),
+                "bundle-changed": AlarmKind("notice", "somebody changed it here on purpose"),
+            },
             alarms=_bundle_alarms,
             metrics=_BUNDLE_METRICS,
             samples=_bundle_samples,

@@ -45,6 +45,11 @@ class LastStop(msgspec.Struct, frozen=True):
     host: Annotated[str, doc("the host of the message that led to it, or empty if a timer did")]
     node: Annotated[str, doc("the node of that message")]
     record: Annotated[str, doc("the audit record `stop begun`")]
+    publisher_host: Annotated[
+        str,
+        doc("if a timer led to it: the host of the only publisher, or empty if there were several or none"),
+    ] = ""
+    publisher_node: Annotated[str, doc("the node of that publisher")] = ""
 
 
 class GuardRow(msgspec.Struct, frozen=True):

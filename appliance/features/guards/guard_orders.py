@@ -474,7 +474,16 @@ class GuardOrders:
         if stop is None:
             return None
         until = None if stops.goes_on(name) else stop.until / 1e9
-        return LastStop(stop.since / 1e9, until, stop.count, stop.cause, stop.host, stop.node, stop.record)
+        return LastStop(
+            stop.since / 1e9,
+            until,
+            stop.count,
+            stop.cause,
+            stop.host,
+            stop.node,
+            stop.record,
+            *stop.publisher,
+        )
 
     def _state(self, name: str) -> str:
         monitors = self._monitors

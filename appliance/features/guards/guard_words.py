@@ -56,5 +56,6 @@ def _last_stop(row: GuardRow) -> str:
     if stop is None:
         return ""
     when = f"since {moment(stop.since)}" if stop.until is None else f"last until {moment(stop.until)}"
-    who = f" ({stop.node} on {stop.host})" if stop.node else ""
+    node, host = stop.node or stop.publisher_node, stop.host or stop.publisher_host
+    who = f" ({node} on {host})" if node else ""
     return f", {when}{f': {stop.cause}' if stop.cause else ''}{who}"

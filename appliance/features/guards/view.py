@@ -6,8 +6,11 @@ from typing import Annotated
 
 import msgspec
 
+from appliance.base import clock
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.features.view import FeatureView, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, Pieces, StateView, Trouble
+
+_BEGINS_SECONDS = 10.0
 
 
 class ActingGuard(msgspec.Struct, frozen=True):
@@ -72,7 +75,7 @@ def _since(guard: ActingGuard) -> str:
 def _alarms(state: GuardsState) -> Iterator[Trouble]:
     for guard in state.acting:
         text = f"the guard {_since(guard)}: rosrv audit search --category monitor --text {guard.name}"
-        yield Trouble("notice", f"guard-acts:{guard.name}", text)
+        yield Trouble(f"guard-acts:{guard.name}", text)
     for name, idle in state.never_enabled.items():
         why = "because neither an operator nor its file brought it into force"
         text = (
@@ -80,7 +83,7 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
             if idle == "off"
             else f"the guard {name} only records (shadow mode), {why}: rosrv monitor enforce {name}"
         )
-        yield Trouble("warning", f"guard-off:{name}", text, "monitors")
+        yield Trouble(f"guard-off:{name}", text, "monitors")
     for old in state.older:
         remedy = (
             f"its text was also edited, so compare it with the preset, then remove it and make it again: rosrv guard"
@@ -89,28 +92,50 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
             else f"rosrv guard upgrade {old.name} --when-standing"
         )
         text = f"the guard {old.name} has {old.preset} {old.version}; the present version is {old.present}: {remedy}"
-        yield Trouble("warning", f"guard-older:{old.name}", text, "monitors")
+        yield Trouble(f"guard-older:{old.name}", text, "monitors")
     for name, text in state.former.items():
-        yield Trouble("warning", f"guard-older:{name}", text, "monitors")
+        yield Trouble(f"guard-older:{name}", text, "monitors")
     for one in state.bypassed:
         text = (
             f"{one.node} takes {one.topic} from {', '.join(one.publishers)}, past its guards: end that process, and"
             f" run rosrv protect --strict on {one.host}"
         )
-        yield Trouble("alarm", f"guard-bypassed:{one.topic}", text)
+        yield Trouble(f"guard-bypassed:{one.topic}", text)
     for sentence in state.elsewhere:
         text = f"{sentence}: measure whether the driver then stops it, with rosrv guard check-driver TOPIC --by TOPIC"
-        yield Trouble("warning", f"guard-elsewhere:{sentence.partition(':')[0]}", text)
+        yield Trouble(f"guard-elsewhere:{sentence.partition(':')[0]}", text)
     for node in state.unanswered:
         text = f"{node} does not answer getBusInfo: whether it takes commands past its guards is unknown"
-        yield Trouble("notice", f"guard-unanswered:{node}", text)
+        yield Trouble(f"guard-unanswered:{node}", text)
 
 
-def _line(state: GuardsState) -> tuple[str, str]:
-    return "guards", "; ".join([f"{state.loaded} loaded", *map(_since, state.acting)])
+def _line(state: GuardsState) -> tuple[str, Pieces]:
+    """Return the guards; a stop is red in its first seconds, when somebody drives, and not while it holds the robot."""
+    now = clock.wall()
+    acting = [
+        (f"; {_since(guard)}", "bold red" if 0 <= now - guard.since < _BEGINS_SECONDS else "")
+        for guard in state.acting
+    ]
+    return "guards", [(f"{state.loaded} loaded", ""), *acting]
 
 
 GUARDS_VIEW = FeatureView(
     "guards",
-    (StateView("guards", GuardsState, "the guards, or null if none is loaded", alarms=_alarms, line=_line),),
+    (
+        StateView(
+            "guards",
+            GuardsState,
+            "the guards, or null if none is loaded",
+            kinds={
+                "guard-acts": AlarmKind("notice", "it does its work: a parked robot may be held for days"),
+                "guard-off": AlarmKind("warning", "bring it into force, or remove it"),
+                "guard-older": AlarmKind("warning", "upgrade it when the robot stands"),
+                "guard-bypassed": AlarmKind("alarm", "end the process that commands past the guard"),
+                "guard-elsewhere": AlarmKind("warning", "measure whether the driver stops the base"),
+                "guard-unanswered": AlarmKind("notice", "its node does not answer now"),
+            },
+            alarms=_alarms,
+            line=_line,
+        ),
+    ),
 )

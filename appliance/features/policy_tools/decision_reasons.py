@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from appliance.policy import commands
+from appliance.policy.authority import Claim
 from appliance.policy.model import Category, Decision, Request, Rule, text_for_caller
 from appliance.policy.policy import CompiledRule, Policy
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope
@@ -46,6 +47,8 @@ class DecisionExplanation:
     limit: str = ""
     """The limit of the request, with its line in `[Limits]`."""
     blocked: bool = False
+    carried: str = ""
+    """Whether `[Authority]` lets the messages of an allowed publisher through now; empty if no group has its topic."""
 
     @property
     def allowed(self) -> bool:
@@ -92,7 +95,8 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
         namespace = None
     told = None if decision.allowed or decision.asks else text_for_caller(decision, policy.tell)
     limit = _limit(policy, request) if decision.allowed else ""
-    return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit, blocked)
+    carried = _carried(policy, request) if decision.allowed else ""
+    return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit, blocked, carried)
 
 
 def render(explanation: DecisionExplanation) -> Iterator[str]:
@@ -107,6 +111,8 @@ def render(explanation: DecisionExplanation) -> Iterator[str]:
         yield from ("  " + line for line in _render_one(other))
     if explanation.also:
         yield f"together: {_VERDICTS[explanation.together]}"
+    if explanation.carried:
+        yield explanation.carried
 
 
 def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
@@ -126,6 +132,25 @@ def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
         yield f"  but denied if it has parameters below it: {explanation.namespace.reason}"
     for lost in explanation.lost:
         yield f"  overruled: {lost.rule}, which would {'allow' if lost.grants else 'deny'}: {lost.why}"
+
+
+def _carried(policy: Policy, request: Request) -> str:
+    group = policy.commanded(request.resource) if request.category is Category.PUBLISH else None
+    if group is None:
+        return ""
+    if group.ranks:
+        return f"its messages are carried while it moves and no higher rank does: rosrv drive status {group.name}"
+    if policy.holders is None:
+        return f"its messages are carried only while it holds {group.name}"
+    if policy.may_command(request.resource, request.host):
+        return f"its messages are carried now: it holds {group.name}"
+    holder, claim = policy.holder(group), group.claim(policy.atoms_of(request.host))
+    if holder is not None and claim is not Claim.OVERRIDE:
+        order = f"ask {group.name} --host"
+    else:
+        order = f"free {group.name} --to" if claim is Claim.ASK else f"assign {group.name} --host"
+    why = f"{holder or 'no host'} holds {group.name}: rosrv drive {order} {request.host}"
+    return f"but none of its messages is carried now, because {why}"
 
 
 def _limit(policy: Policy, request: Request) -> str:

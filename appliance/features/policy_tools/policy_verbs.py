@@ -311,7 +311,8 @@ def explain_request(
         say_json(_explanation_fields(explanation))
     else:
         for line in render(explanation):
-            say(line, "green" if explanation.allowed else "red")
+            but = line is explanation.carried and line.startswith("but ")
+            say(line, "yellow" if but else "green" if explanation.allowed else "red")
         if explanation.together == "deny" and not explanation.blocked:
             for line in _allowing(policy, request):
                 say(line)
@@ -400,6 +401,8 @@ def _explanation_fields(explanation: DecisionExplanation) -> dict[str, object]:
     }
     if explanation.limit:
         fields["limit"] = explanation.limit
+    if explanation.carried:
+        fields["carried"] = explanation.carried
     for word, also in (("node", explanation.node), ("command", explanation.command)):
         if also is not None:
             fields[word] = _explanation_fields(also)

@@ -261,6 +261,7 @@ def _explained(found: DecisionExplanation) -> Explained:
         told=found.told,
         through=list(found.through),
         limit=found.limit,
+        carried=found.carried,
         lost=[
             LostRule(
                 rule=RuleText(**asdict(rule.rule)), would="allow" if rule.grants else "deny", why=rule.why

@@ -7,7 +7,7 @@ import msgspec
 
 from appliance.base.metric import gauge
 from appliance.channel.answers.field_docs import doc
-from appliance.features.view import FeatureView, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, StateView, Trouble
 
 
 class RecorderState(msgspec.Struct, frozen=True):
@@ -28,7 +28,7 @@ _METRICS = (
 
 def _alarms(state: RecorderState) -> Iterator[Trouble]:
     if not state.running:
-        yield Trouble("warning", "recorder", "the flight recorder is not running: nothing is recorded")
+        yield Trouble("recorder", "the flight recorder is not running: nothing is recorded")
 
 
 def _line(state: RecorderState) -> tuple[str, str]:
@@ -45,6 +45,7 @@ RECORDER_VIEW = FeatureView(
             RecorderState,
             "the flight recorder, or null if nothing is recorded",
             before="switched_off",
+            kinds={"recorder": AlarmKind("warning", "read why the recorder does not run")},
             alarms=_alarms,
             metrics=_METRICS,
             samples=lambda state: {

@@ -202,13 +202,13 @@ def running(appliance: Appliance) -> Iterator[SelftestFinding]:
 
 
 def _status(status: Status) -> Iterator[SelftestFinding]:
-    off = [alarm.text for alarm in open_alarms(status)
+    off = [alarm for alarm in open_alarms(status)
            if alarm.severity == "warning" and alarm.kind.startswith((SWITCHED_OFF, _GUARD_OFF))]  # fmt: skip
-    for text in off:
-        yield warn("monitors", text, "rosrv monitor list")
-    troubles = [trouble for trouble in troubles_of(status) if trouble not in off]
-    for trouble in troubles:
-        yield fail("status", trouble, "rosrv status")
+    for alarm in off:
+        yield warn("monitors", alarm.text, "rosrv monitor list")
+    troubles = [alarm for alarm in troubles_of(status) if alarm not in off]
+    for alarm in troubles:
+        yield fail("status", alarm.text, "rosrv status")
     if not troubles:
         probe = status.probe or "not run yet"
         hidden = "no firewall" if status.isolation == "none" else f"probe of the ROS master {probe}"

@@ -38,7 +38,7 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
             f"both appliances claim to be active: this one does, but the witness names {holder}, and the robot admits"
             f" only {holder}; stop this appliance, then start it again"
         )
-        yield Trouble("alarm", "both-active", text)
+        yield Trouble("both-active", text)
     if state.obstacle and (state.obstacle != UNCHECKED or seconds >= patience):
         yield _unready(state)
     if other.refusal and seconds >= patience:
@@ -64,13 +64,13 @@ def present_troubles(state: StandbyState) -> Iterator[Trouble]:
         other = state.other
         name, address = (state.name, state.address) if state.role == "active" else (other.name, other.address)
         text = f"the active appliance {name} ({address}) does not serve the robot: {state.not_serving}"
-        yield Trouble("alarm", "not-serving", text)
+        yield Trouble("not-serving", text)
     if state.witness.follower_trouble and not is_silent(state.witness):
         text = (
             f"a computer that follows the witness reports: {state.witness.follower_trouble}; check its load there, and"
             " journalctl -u rosrv-witness-follow"
         )
-        yield Trouble("warning", "follower-trouble", text)
+        yield Trouble("follower-trouble", text)
 
 
 def both_active(state: StandbyState) -> bool:
@@ -109,7 +109,7 @@ def _away(state: StandbyState, seconds: float) -> Trouble:
             f"the active appliance {other.name} ({other.address}) has not been connected for {away}, so its changes"
             f" since then are missing here{why}; {check}"
         )
-    return Trouble("warning", "standby-away", text)
+    return Trouble("standby-away", text)
 
 
 def _refusing(state: StandbyState) -> Trouble:
@@ -121,7 +121,7 @@ def _refusing(state: StandbyState) -> Trouble:
     )
     if MISFIT in text:
         text += f"; if the version of {name} is older (rosrv --version), upgrade it: until then there is no standby"
-    return Trouble("alarm", "standby-refuses", text)
+    return Trouble("standby-refuses", text)
 
 
 def _unready(state: StandbyState) -> Trouble:
@@ -129,9 +129,9 @@ def _unready(state: StandbyState) -> Trouble:
     name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
     text = f"the standby {name} ({address}) cannot take over: {state.obstacle}"
     if state.obstacle == UNCHECKED:
-        return Trouble("warning", "standby-unchecked", text)
+        return Trouble("standby-unchecked", text)
     text += f"; once this is corrected, {name} notices it within seconds"
-    return Trouble("alarm", "standby-unready", text)
+    return Trouble("standby-unready", text)
 
 
 def _behind(state: StandbyState, seconds: float) -> Trouble:
@@ -139,7 +139,7 @@ def _behind(state: StandbyState, seconds: float) -> Trouble:
     text = f"the standby {other.name} has been {lag_of(other)} for {lasting(seconds)}, {remedy}"
     if state.role == "standby":
         text = f"the standby {state.name} ({state.address}) lacks changes of {other.name}, {remedy}"
-    return Trouble("warning", "standby-behind", text)
+    return Trouble("standby-behind", text)
 
 
 def _silent(witness: WitnessSeen) -> Trouble:
@@ -149,7 +149,7 @@ def _silent(witness: WitnessSeen) -> Trouble:
         f"the witness on the robot ({witness.address}) {since}, so the standby cannot take over; check on the robot:"
         " systemctl status rosrv-witness"
     )
-    return Trouble("warning", "witness-silent", text)
+    return Trouble("witness-silent", text)
 
 
 def _refused(witness: WitnessSeen) -> Trouble:
@@ -157,7 +157,7 @@ def _refused(witness: WitnessSeen) -> Trouble:
         f"the witness on the robot ({witness.address}) refuses this appliance, so no takeover is possible:"
         f" {witness.refusal}"
     )
-    return Trouble("alarm", "witness-refuses", text)
+    return Trouble("witness-refuses", text)
 
 
 def _blind(state: StandbyState) -> Trouble:
@@ -166,7 +166,7 @@ def _blind(state: StandbyState) -> Trouble:
         f"the witness on the robot ({witness.address}) has not answered the standby {other.name} ({other.address}) for"
         f" {lasting(other.witness_seconds or 0)}, so the standby cannot take over; check the network between both"
     )
-    return Trouble("alarm", "standby-blind", text)
+    return Trouble("standby-blind", text)
 
 
 def _unsaved(witness: WitnessSeen) -> Trouble:
@@ -174,4 +174,4 @@ def _unsaved(witness: WitnessSeen) -> Trouble:
         f"the witness on the robot ({witness.address}) could not carry out a takeover: {witness.trouble}; correct"
         " that on the robot"
     )
-    return Trouble("alarm", "witness-disk", text)
+    return Trouble("witness-disk", text)

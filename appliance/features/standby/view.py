@@ -13,7 +13,7 @@ from appliance.features.standby.summary import (
     present_troubles,
     standby_troubles,
 )
-from appliance.features.view import FeatureView, Pieces, Samples, StateView
+from appliance.features.view import AlarmKind, FeatureView, Pieces, Samples, StateView
 
 # Write the state of two appliances in one line.
 
@@ -118,6 +118,22 @@ STANDBY_VIEW = FeatureView(
             StandbyState,
             "this appliance as one of two, or null on a single one",
             before="handled_alarms",
+            kinds={
+                "not-serving": AlarmKind(
+                    "alarm", "correct why the active appliance does not serve the robot"
+                ),
+                "standby-refuses": AlarmKind("alarm", "correct why the standby refuses the changes"),
+                "both-active": AlarmKind("alarm", "stop this appliance, then start it again"),
+                "standby-unready": AlarmKind("alarm", "correct why the standby could not take over"),
+                "standby-unchecked": AlarmKind("warning", "its check takes unusually long"),
+                "standby-away": AlarmKind("warning", "start the other appliance, or repair the network"),
+                "standby-behind": AlarmKind("warning", "check the disk and the load of its machine"),
+                "standby-blind": AlarmKind("alarm", "repair the network between standby and robot"),
+                "witness-silent": AlarmKind("warning", "start the witness on the robot"),
+                "witness-refuses": AlarmKind("alarm", "correct why the witness refuses"),
+                "witness-disk": AlarmKind("alarm", "free the disk of the robot"),
+                "follower-trouble": AlarmKind("warning", "check the load of that computer"),
+            },
             alarms=lambda state: (*standby_troubles(state, PATIENCE_SECONDS), *present_troubles(state)),
             metrics=_METRICS,
             samples=samples_of,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from appliance.base.counted import counted
 from appliance.base.metric import counter, gauge
-from appliance.features.view import FeatureView, StateView, Trouble
+from appliance.features.view import AlarmKind, FeatureView, StateView, Trouble
 from appliance.forwarding.forwarding_state import ForwardingState, samples_of
 
 _METRICS = (
@@ -19,7 +19,7 @@ _METRICS = (
 def _alarms(state: ForwardingState) -> Iterator[Trouble]:
     if state.trouble:
         where = f"the audit log is not forwarded to {state.to}, {counted(state.behind, 'record waits', 'records wait')}"
-        yield Trouble("warning", "audit-not-forwarded", f"{where}: {state.trouble}", "audit")
+        yield Trouble("audit-not-forwarded", f"{where}: {state.trouble}", "audit")
 
 
 SYSLOG_VIEW = FeatureView(
@@ -31,6 +31,9 @@ SYSLOG_VIEW = FeatureView(
             "the forwarding of records, or null if it is not configured",
             part="audit",
             required=True,
+            kinds={
+                "audit-not-forwarded": AlarmKind("warning", "repair the receiver; records wait on the disk")
+            },
             alarms=_alarms,
             metrics=_METRICS,
             samples=lambda state: samples_of("syslog", state),

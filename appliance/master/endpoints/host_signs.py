@@ -10,10 +10,14 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class HostSigns:
-    """A host's signs of life: `live` returns whether it has a live node, `moved` the last publication's time or 0."""
+    """A host's signs of life: `live` returns whether it has a live node, `moved` the last publication's time or 0.
+
+    `publishers` returns the host and the name of each of the robot's nodes that publishes a topic.
+    """
 
     live: Callable[[Address], bool]
     moved: Callable[[Address, frozenset[str]], float]
+    publishers: Callable[[str], list[tuple[Address, str]]] = lambda _topic: []
 
 
 def host_signs(registry: Registry, carried: RelayTraffic) -> HostSigns:
@@ -29,4 +33,8 @@ def host_signs(registry: Registry, carried: RelayTraffic) -> HostSigns:
         )
         return max(times, default=0.0)
 
-    return HostSigns(live, moved)
+    def publishers(topic: str) -> list[tuple[Address, str]]:
+        nodes = registry.registered(Kind.PUBLICATION, topic)
+        return [(node.host, node.name) for node in nodes if not node.own]
+
+    return HostSigns(live, moved, publishers)

@@ -1,8 +1,12 @@
+import ast
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from appliance.channel.alarms import activity, open_alarms
+from appliance.channel import alarms
+from appliance.channel.alarms import ALARM_KINDS, activity, open_alarms
 from appliance.channel.answers.status import Status
 from tests.support.answers import example
 
@@ -43,11 +47,11 @@ def test_a_healthy_appliance_has_none() -> None:
         ("policy.file_refused", "p.ini:1:1: error", "policy-refused", "alarm", "policy"),
         ("monitors.held", ["safeTrigger"], "monitor-held:safeTrigger", "alarm", "monitors"),
         ("monitors.failing", ["logging"], "monitor-failing:logging", "alarm", "monitors"),
-        ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "warning", "monitors"),
+        ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "alarm", "monitors"),
         ("monitors.left_out", {"a.rv": "a.rv:1:1: no"}, "monitor-left-out:a.rv", "alarm", "monitors"),
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
-        ("blocks.hosts", 1, "hosts-blocked", "warning", "hosts"),
+        ("blocks.hosts", 1, "hosts-blocked", "notice", "hosts"),
         (
             "processes",
             [{"role": "charon", "failing": "no /dev/net/tun"}],
@@ -61,6 +65,48 @@ def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severit
     (alarm,) = open_alarms(changed(path, value))
     assert (alarm.kind, alarm.severity, alarm.about) == (kind, severity, about)
     assert len(alarm.text) > 5
+
+
+PACKAGE = Path(alarms.__file__).parents[1]
+
+
+def kinds_in_the_source() -> Iterator[str]:
+    """Yield the kind of each condition that some code makes: of each `Trouble`, and here of each tuple."""
+    for path in PACKAGE.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if "Trouble(" not in text and path.name != "alarms.py":
+            continue
+        for node in ast.walk(ast.parse(text)):
+            match node:
+                case ast.Call(func=ast.Name("Trouble" | "_alarm"), args=[first, *_]):
+                    yield from _kind(first)
+                case ast.Yield(ast.Tuple([first, _, _])) if path.name == "alarms.py":
+                    yield from _kind(first)
+
+
+def _kind(first: ast.expr) -> Iterator[str]:
+    match first:
+        case ast.JoinedStr([ast.Constant(str() as text), *_]) | ast.Constant(str() as text):
+            yield text.partition(":")[0]
+        case ast.JoinedStr([ast.FormattedValue(ast.Name(name)), *_]):
+            yield str(getattr(alarms, name)).partition(":")[0]
+
+
+def test_each_kind_has_its_row_which_says_who_needs_a_person_now() -> None:
+    assert set(kinds_in_the_source()) | {"ipsec"} == set(ALARM_KINDS)
+    page = (PACKAGE.parent / "docs/reference/generated/alarms.md").read_text(encoding="utf-8")
+    for name, kind in ALARM_KINDS.items():
+        assert f"| `{name}` | {kind.severity} | {kind.remedy} |" in page
+
+
+STARTING: dict[str, Any] = {"starting": True, "relay": "away", "rosmaster": "being rebuilt"}
+
+
+def test_the_first_seconds_of_a_start_are_no_failures() -> None:
+    assert [alarm.kind for alarm in open_alarms(example(Status, **GOOD | STARTING))] == ["starting"]
+    assert open_alarms(example(Status, **GOOD | {"starting": True})) == []
+    lasting = open_alarms(example(Status, **GOOD | STARTING | {"starting": False}))
+    assert [alarm.kind for alarm in lasting] == ["relay", "rosmaster"]
 
 
 def test_one_missing_relay_is_not_reported_as_all() -> None:

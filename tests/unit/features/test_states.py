@@ -12,7 +12,7 @@ AUDIT = "lag_records lag_seconds failed on_failure degraded replaced forwarding 
 STATUS = (
     "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
     " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
-    " name standby bundles doors adopt handled_alarms new_state approvals guards"
+    " name standby bundles doors adopt handled_alarms starting new_state approvals guards authority"
 )
 TO: dict[str, Any] = {"to": "tls://log:6514", "behind": 7}
 DOOR = {
@@ -21,6 +21,11 @@ DOOR = {
     "refused_connections": 7, "restarts": 9, "restarts_lately": 3,
 }  # fmt: skip
 BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
+    "authority": (
+        {"unheard": [{"group": "base", "why": "no host holds base", "hosts": [
+            {"host": "10.0.0.5", "topic": "/cmd_vel", "nodes": ["/teleop"], "order": "rosrv drive assign base"}]}]},
+        [("not-carried:base", "notice")],
+    ),
     "forwarding": (TO | {"trouble": "refused"}, [("audit-not-forwarded", "warning")]),
     "collector": (TO | {"trouble": "refused"}, [("audit-not-collected", "warning")]),
     "recorder": ({"running": False}, [("recorder", "warning")]),
@@ -80,7 +85,9 @@ def test_each_state_has_its_alarms_metrics_and_line(view: StateView[Any]) -> Non
     status = msgspec.json.decode(msgspec.json.encode(example(Status, **place)), type=Status)
     [(found, state)] = states_of(status)
     assert found is view
-    assert [(one.kind, one.severity) for one in view.alarms(state)] == alarms
+    assert [
+        (one.kind, view.kinds[one.kind.partition(":")[0]].severity) for one in view.alarms(state)
+    ] == alarms
     assert set(view.samples(state)) == {metric.name for metric in view.metrics}
     assert view.line is not None
     assert str(view.line(state)[1])

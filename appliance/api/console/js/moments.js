@@ -48,6 +48,13 @@ export function clock(seconds, span) {
   return CLOCK.format(new Date(seconds * 1000)) + (part ? (seconds % 1).toFixed(3).slice(1, part + 2) : "");
 }
 
+const NOW = 60; // seconds in which a person may still act on what happened
+
+/** Whether something happened a moment ago, so that it may be red. @param {string | number} at @param {number | null} now the appliance's time in seconds @param {number} [within] seconds */
+export function isNow(at, now, within = NOW) {
+  return now !== null && now - dateOf(at).getTime() / 1000 < within;
+}
+
 /** A duration in its two largest units. @param {number} seconds */
 export function lasting(seconds) {
   const units = /** @type {[string, number][]} */ ([["d", 86_400], ["h", 3600], ["min", 60], ["s", 1]]);

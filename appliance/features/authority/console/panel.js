@@ -11,7 +11,7 @@ import { Host, Sentence, useHosts } from "#console/parts/host.js";
 import { Empty, Failure, Loading } from "#console/parts/notice.js";
 import { done, failed } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
-import { isSilent, isStuck, useGroups } from "./situation.js";
+import { isSilent, isStuck, NotCarried, useGroups } from "./situation.js";
 
 const VERBS = { assign: "Assign", free: "Free", ask: "Ask" }; // as those of `rosrv drive`
 
@@ -29,7 +29,7 @@ function Group(/** @type {{group: any, again: () => void}} */ { group, again }) 
   const button = (/** @type {keyof typeof VERBS} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${VERBS[verb]}…</${Button}>`;
   return html`<tr data-group=${group.group}>
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
-    <td data-label=${group.ranks.length ? "Driver" : "Holder"}><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> ${group.held_seconds !== null && html`<span class="nowrap">for ${lasting(group.held_seconds)}</span>: `}<${Sentence} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
+    <td data-label=${group.ranks.length ? "Driver" : "Holder"}><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> ${group.held_seconds !== null && html`<span class="nowrap">for ${lasting(group.held_seconds)}</span>: `}<${Sentence} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}${group.not_carried.map((/** @type {any} */ one) => html`<div key=${`${one.host} ${one.topic}`} class="muted small"><${NotCarried} one=${one} /></div>`)}</div></td>
     ${group.ranks.length ? html`<td></td>` : html`<td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>`}
     <td><div class="row row-end">${group.ranks.length ? button("free", { disabled: !isStuck(group), why: "No lower rank waits for a person" }) : html`${button("assign", { tone: group.holder ? "" : "primary" })}${button("free", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;

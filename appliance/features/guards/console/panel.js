@@ -3,6 +3,7 @@
 import { html, useState } from "#console/html.js";
 import { Moment } from "#console/moments.js";
 import { counted } from "#console/numbers.js";
+import { useApplianceTime } from "#console/parts/ago.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
@@ -19,11 +20,12 @@ import { CheckDriver } from "./driver.js";
 import { Area } from "./area.js";
 import { margins } from "./margins.js";
 import { Margins } from "./meter.js";
+import { begins, Held } from "./situation.js";
 import { useGuards } from "./state.js";
 import { Suggest } from "./suggest.js";
 import { SetValues } from "./values.js";
 
-const TONES = { free: "allow", stopping: "warn", withholding: "warn", holding: "deny", shadow: "note", off: "" };
+const TONES = { free: "allow", stopping: "deny", withholding: "", holding: "deny", shadow: "note", off: "" };
 const WITHIN = /** @type {[string, string][]} */ ([["60", "unless confirmed within 1 minute"], ["300", "unless confirmed within 5 minutes"], ["3600", "unless confirmed within an hour"], ["", "never"]]);
 const WATCHED = 6; // topics that are watched at once: control answers eight queries at a time
 
@@ -52,6 +54,7 @@ export function Guards() {
 function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, seen: Record<string, any[]>}} */ { guard, guards, seen }) {
   const [open, setOpen] = useState("");
   const close = () => setOpen("");
+  const now = useApplianceTime();
   const preset = guards.body.presets.find((/** @type {any} */ one) => one.preset === guard.preset);
   const path = `/v1/monitors/${encodeURIComponent(guard.name)}`;
   const turn = (/** @type {string} */ said, /** @type {string} */ more, /** @type {any} */ json) => guards.order(`${guard.name} ${said}`, more, "PATCH", path, { json });
@@ -59,7 +62,7 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
   return html`<tr data-guard=${guard.name}>
     <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(guard.name)}`}><strong><${Given} value=${guard.name} most=${60} /></strong></${Link}><div class="muted small">${guard.preset === guard.name ? "" : `${guard.preset}: `}${preset?.what}</div>
       ${guard.origin !== "current" && html`<div class="small"><${Badge} word=${guard.origin} tone="warn" /> ${guard.origin === "older" ? `the text of ${guard.preset} ${guard.version}; the present version is ${preset?.version}` : "not the text of the preset"}</div>`}</td>
-    <td data-label="State"><span><${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />${guard.why_held && html`<div class="small muted"><${Given} value=${guard.why_held} most=${200} /></div>`}
+    <td data-label="State"><span>${guard.state === "stopping" && guard.last_stop && !begins(guard, now) ? html`<${Held} guard=${guard} />` : html`<${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />`}${guard.why_held && html`<div class="small muted"><${Given} value=${guard.why_held} most=${200} /></div>`}
       ${guard.off_until && html`<div class="small muted">until <${Moment} at=${guard.off_until} /></div>`}${guard.confirm_by && html`<div class="small muted">returns to shadow mode at <${Moment} at=${guard.confirm_by} />, unless confirmed</div>`}
       <div><${Button} small tone="plain" role="operator" title="The guard's variables, such as the position that it has; the audit log records it" onClick=${() => setOpen("values")}>Values…</${Button}></div></span></td>
     <td data-label="Guards"><span><${Given} value=${guard.topics.command} mono most=${60} />${guard.topics.by && html`<div class="small muted">by <${Given} value=${guard.topics.by} mono most=${60} /></div>`}</span></td>

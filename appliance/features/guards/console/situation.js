@@ -5,12 +5,13 @@ import { Ago, useApplianceTime } from "#console/parts/ago.js";
 import { Fact } from "#console/parts/fact.js";
 import { Given } from "#console/parts/given.js";
 import { Host } from "#console/parts/host.js";
-import { dateOf } from "#console/moments.js";
+import { dateOf, isNow, Moment } from "#console/moments.js";
 import { counted } from "#console/numbers.js";
 import { useGuards } from "./state.js";
 
 const ACTS = /** @type {Record<string, string>} */ ({ stopping: "stops", withholding: "withholds", holding: "holds" });
 const LATELY = 900; // seconds in which a stop that has ended is news
+const BEGINS = 10; // seconds in which a stop is red: then the robot is held
 const MOST = 2; // guards by name
 const VALUES = /^\w+ = /;
 
@@ -22,15 +23,27 @@ export function Stops() {
   const lately = rows.filter((/** @type {any} */ one) => one.last_stop?.until && now !== null && now - secondsOf(one.last_stop.until) < LATELY)
     .sort((/** @type {any} */ one, /** @type {any} */ other) => secondsOf(other.last_stop.until) - secondsOf(one.last_stop.until));
   const idle = rows.filter((/** @type {any} */ one) => one.state === "off" || one.state === "shadow");
-  if (acting.length) return html`<${Fact} name="Stops" to="/console/robot" tone="deny">${acting.slice(0, MOST).map((/** @type {any} */ one) => html`<${Acting} key=${one.name} guard=${one} />`)}${acting.length > MOST && html`<div class="muted">and ${acting.length - MOST} more</div>`}</${Fact}>`;
-  if (lately.length) return html`<${Fact} name="Stops" to="/console/robot" tone="warn"><${Stopped} guard=${lately[0]} /></${Fact}>`;
+  if (acting.length) return html`<${Fact} name="Stops" to="/console/robot" tone=${acting.some((/** @type {any} */ one) => one.state === "holding" || begins(one, now)) ? "deny" : ""}>${acting.slice(0, MOST).map((/** @type {any} */ one) => html`<${Acting} key=${one.name} guard=${one} now=${now} />`)}${acting.length > MOST && html`<div class="muted">and ${acting.length - MOST} more</div>`}</${Fact}>`;
+  if (lately.length) return html`<${Fact} name="Stops" to="/console/robot" tone=${isNow(lately[0].last_stop.until, now) ? "warn" : ""}><${Stopped} guard=${lately[0]} /></${Fact}>`;
   const said = error && !body ? "not known" : !body ? "…" : !rows.length ? "no guard is loaded" : `nothing: ${counted(rows.length - idle.length, "guard")} on watch`;
   return html`<${Fact} name="Stops" to="/console/robot" tone=${idle.length ? "warn" : ""}>${said}${idle.length > 0 && html`, <${Given} value=${idle[0].name} most=${40} /> ${idle[0].state === "off" ? "is off" : "only records"}${idle.length > 1 && ` and ${idle.length - 1} more`}`}</${Fact}>`;
 }
 
-function Acting(/** @type {{guard: any}} */ { guard }) {
+/** Whether the stop of a guard that acts has just begun. @param {any} guard @param {number | null} now */
+export function begins({ state, last_stop }, now) {
+  return state === "stopping" && last_stop !== null && isNow(last_stop.since, now, BEGINS);
+}
+
+/** Since when a guard holds the robot, and who drove. */
+export function Held(/** @type {{guard: any}} */ { guard: { name, last_stop } }) {
+  const [host, node] = last_stop.host ? [last_stop.host, last_stop.node] : [last_stop.publisher_host, last_stop.publisher_node];
+  return html`<span class="muted">held by</span> <${Given} value=${name} most=${40} /> <span class="muted">since</span> <${Moment} at=${last_stop.since} />${host && html` (<${Host} value=${host} /> <${Given} value=${node} most=${60} mono />)`}`;
+}
+
+function Acting(/** @type {{guard: any, now: number | null}} */ { guard, now }) {
   const { name, state, topics, why_held, last_stop } = guard;
   const why = state === "holding" ? why_held : words(last_stop?.cause);
+  if (state === "stopping" && last_stop && !begins(guard, now)) return html`<div><${Held} guard=${guard} />${why && html`<div class="muted small"><${Given} value=${why} most=${120} /></div>`}</div>`;
   return html`<div><${Given} value=${name} most=${40} /> <span class="muted">${ACTS[state]}</span> <${Given} value=${topics.command} mono most=${60} />${state !== "holding" && last_stop && html`<${From} stop=${last_stop} /> <${Ago} at=${last_stop.since} lasts />`}${why && html`<div class="muted small"><${Given} value=${why} most=${120} /></div>`}</div>`;
 }
 

@@ -71,7 +71,7 @@ def test_a_blocked_host_is_silent_until_it_is_unblocked(appliance: Appliance, ro
     assert explained.returncode == 1
     assert f"denied: {TABLET} is blocked by operator until " in explained.stdout
     assert f"answer to the host: {TABLET} is blocked by an operator\n" in explained.stdout
-    assert any("1 host is blocked, the block ends at" in line for line in appliance.status()["troubles"])
+    assert any("1 host is blocked, the block ends at" in line for line in appliance.status()["attention"])
 
     assert "4 registrations returned" in appliance.rosrv("host", "unblock", TABLET).stdout
     robot.hears("/stranger")

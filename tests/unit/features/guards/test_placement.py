@@ -130,7 +130,7 @@ def test_the_status_has_an_alarm_a_warning_and_a_notice() -> None:
         [BypassedGuard("/cmd_vel", "/base", "10.0.0.5", [THEIRS])], ["/base"],
     )  # fmt: skip
     [view] = GUARDS_VIEW.states
-    assert [(one.severity, one.kind, one.text) for one in view.alarms(state)] == [
+    assert [(view.kinds[one.kind.partition(":")[0]].severity, one.kind, one.text) for one in view.alarms(state)] == [
         ("alarm", "guard-bypassed:/cmd_vel",
          f"/base takes /cmd_vel from {THEIRS}, past its guards: end that process, and run rosrv protect --strict on"
          " 10.0.0.5"),

@@ -1,10 +1,12 @@
 /** Present alarms, and the last day's alarms that were not reviewed in this browser. */
 
 import { html, useState } from "../html.js";
-import { inOwnZone, Moment } from "../moments.js";
+import { inOwnZone, isNow, Moment } from "../moments.js";
+import { useApplianceTime } from "../parts/ago.js";
 import { Badge } from "../parts/badge.js";
 import { CopyCommand } from "../parts/copy.js";
 import { Given } from "../parts/given.js";
+import { Sentence } from "../parts/host.js";
 import { Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
 
@@ -21,6 +23,7 @@ export function placeOf(alarm) {
 
 export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ { alarms, incidents }) {
   const [seen, setSeen] = useState(reviewed());
+  const now = useApplianceTime();
   const open = (incidents ?? []).filter((one) => one.sequence > seen);
   const review = () => {
     const last = Math.max(seen, ...open.map((one) => one.sequence));
@@ -35,10 +38,16 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
     ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? null
       : html`<ul class="alarm-list">${alarms.toSorted((one, other) => ORDER.indexOf(one.severity) - ORDER.indexOf(other.severity)).map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
-          <${Link} to=${placeOf(one)} class="alarm-text"><${Given} value=${inOwnZone(one.text)} most=${300} /></${Link}><${CopyCommand} text=${one.text} /></li>`)}
-        ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} />
+          <${Link} to=${placeOf(one)} class="alarm-text"><${Told} text=${inOwnZone(one.text)} /></${Link}><${CopyCommand} text=${one.text} /></li>`)}
+        ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} tone=${isNow(one.time, now) ? "deny" : ""} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}
         ${open.length > MOST && html`<li class="alarm"><${Link} to="/console/audit?severity=alarm&since=1d">${open.length - MOST} more in the last day</${Link}></li>`}</ul>`}</section>`;
+}
+
+/** An alarm's text with the names of its hosts; a command at its end stays as it can be typed. */
+function Told(/** @type {{text: string}} */ { text }) {
+  const at = text.indexOf(": rosrv ");
+  return html`<${Sentence} value=${at < 0 ? text : text.slice(0, at)} most=${300} />${at >= 0 && html`<${Given} value=${text.slice(at)} most=${200} />`}`;
 }
 
 function reviewed() {

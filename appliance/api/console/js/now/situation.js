@@ -3,6 +3,7 @@
 import { byHostAndKind, grouped, othersOf, shownOf } from "../audit/rows.js";
 import { html } from "../html.js";
 import { isHeld, isSelftest } from "../graph/model.js";
+import { isNow } from "../moments.js";
 import { notable } from "../notable.js";
 import { Ago, useApplianceTime } from "../parts/ago.js";
 import { requested } from "../parts/badge.js";
@@ -11,8 +12,6 @@ import { FeatureParts } from "../parts/features.js";
 import { Given } from "../parts/given.js";
 import { Host } from "../parts/host.js";
 import { useStore } from "../store.js";
-
-const LATELY = 900; // seconds in which a denial is news
 
 export function Situation() {
   return html`<section class="situation" aria-label="Situation"><${FeatureParts} place="situation" /><${Denied} /></section>`;
@@ -25,6 +24,5 @@ function Denied() {
   if (!row) return html`<${Fact} name="Denied" to="/console/audit?decision=deny&since=1d">${denials === null ? "…" : "nothing in the last day"}</${Fact}>`;
   const one = shownOf(row);
   const others = othersOf(row);
-  const fresh = now !== null && now - Date.parse(row.last.time) / 1000 < LATELY;
-  return html`<${Fact} name="Denied" to=${`/console/audit/${one.id}`} tone=${fresh ? "deny" : ""}><${Host} value=${one.host} none="no address" /> <span class="muted">${requested(one)}</span> <${Given} value=${one.resource || one.event} most=${60} mono />${others > 0 && html` <span class="muted">and ${others} more</span>`}, <${Ago} at=${row.last.time} /></${Fact}>`;
+  return html`<${Fact} name="Denied" to=${`/console/audit/${one.id}`} tone=${isNow(row.last.time, now) ? "deny" : ""}><${Host} value=${one.host} none="no address" /> <span class="muted">${requested(one)}</span> <${Given} value=${one.resource || one.event} most=${60} mono />${others > 0 && html` <span class="muted">and ${others} more</span>`}, <${Ago} at=${row.last.time} /></${Fact}>`;
 }

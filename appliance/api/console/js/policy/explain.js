@@ -46,7 +46,7 @@ export function Explain({ query, pick }) {
 
 function Explained(/** @type {{found: any, pick: (place: any) => void}} */ { found, pick }) {
   return html`<div class="stack" role="status" data-explained>
-    <div class="stack-tight"><div class="row"><${Badge} word=${found.decision} /><strong>${found.allowed ? "The request is allowed" : "The request is denied"}</strong></div><p><${Given} value=${found.reason} most=${600} /></p></div>
+    <div class="stack-tight"><div class="row"><${Badge} word=${found.decision} /><strong>${found.allowed ? "The request is allowed" : "The request is denied"}</strong></div><p><${Given} value=${found.reason} most=${600} /></p>${found.carried && html`<p><${Given} value=${found.carried} most=${300} /></p>`}</div>
     <dl class="facts"><dt>Rule</dt><dd>${found.rule ? html`<${Place} rule=${found.rule} pick=${pick} />` : html`<span class="muted">no rule applies</span>`}</dd>
       ${found.through.length > 0 && html`<dt>Matched text</dt><dd><${Given} value=${found.through.join(" → ")} mono /></dd>`}
       ${found.limit && html`<dt>Limit</dt><dd><${Given} value=${found.limit} most=${300} /></dd>`}</dl>
