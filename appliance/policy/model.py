@@ -2,7 +2,7 @@
 
 import enum
 import ipaddress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
@@ -149,10 +149,21 @@ class Decision:
 
 
 class CallHold(NamedTuple):
-    """The answer to a call that needs an approval: its text, and whether it waits for an operator."""
+    """The answer to a call that needs an approval: its text, and whether it waits for an operator.
+
+    `again` adds for the caller when it may ask again. The record leaves it out, so that repeated calls have equal ones.
+    """
 
     text: str
     waits: bool
+    again: str = ""
+
+    def of(self, decision: Decision) -> Decision:
+        """Return the decision of the held call."""
+        told = f"{self.text}{self.again}: {decision.told or decision.reason}" if self.again else None
+        return replace(
+            decision, allowed=False, held=self.waits, reason=f"{self.text}: {decision.reason}", told=told
+        )
 
 
 TELLS = ("rule", "full", "id")

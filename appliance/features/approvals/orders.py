@@ -113,9 +113,7 @@ class ApprovalOrders:
             self._end(entry, reason)
             approved = False
         if entry is None or not approved:
-            hold = self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size)
-            reason = f"{hold.text}: {decision.reason}"
-            return replace(decision, allowed=False, held=hold.waits, reason=reason)
+            return self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size).of(decision)
         if entry.once:
             self._table.end(entry)
             self._record("approval used", entry, f"used approval {entry.number}")
@@ -142,8 +140,8 @@ class ApprovalOrders:
             self._record("approval wanted", entry, f"waits for approval {entry.number}")
         left = max(1, round(self._table.seconds_left(entry)))
         if entry.state is ApprovalState.REFUSED:
-            refused = f"an operator refused approval {entry.number}; ask again in {left} s"
-            return CallHold(refused, waits=False)
+            refused = f"an operator refused approval {entry.number}"
+            return CallHold(refused, waits=False, again=f"; ask again in {left} s")
         text = f"held for approval {entry.number}; ask the operator, then repeat; expires in {left} s"
         return CallHold(text, waits=True)
 

@@ -5,6 +5,7 @@ or a takeover, each group is free.
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from weakref import WeakValueDictionary
@@ -28,7 +29,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 #
 # 1. `free` and `hold` are separate steps, so that the caller can cut the earlier holder off in between.
 # 2. The first waiting host that may take the group is next. A host that may only ask never is, and gives its place to
-#    one that may take it if all are taken.
+#    one that may take it if all are taken. Otherwise the policy's host with the most waiting addresses gives one up.
 
 WAITING_SECONDS = 60.0
 MOST_WAITING = 16
@@ -45,15 +46,18 @@ class Holding:
     """The time when the host last took the group again."""
     lost: bool = False
     """Whether a policy since then gave the host no claim; it loses the group at the next check."""
-    had_node: bool = False
-    """Whether the host has had a live node; otherwise the end of its nodes does not end the authority."""
+    has_node: bool = False
+    """Whether the host had a live node at the last check."""
+    moved: float = 0.0
+    """The time of its last message to the group, also of a node that has ended since."""
 
 
 class GroupHolders:
     """The holders and waiting hosts of all groups."""
 
-    def __init__(self, claim_of: ClaimOf) -> None:
+    def __init__(self, claim_of: ClaimOf, share_of: Callable[[Address], str] = str) -> None:
         self._claim_of = claim_of
+        self._share_of = share_of
         self._held: dict[str, Holding] = {}
         self._waiting: dict[str, dict[Address, float]] = {}
 
@@ -89,12 +93,26 @@ class GroupHolders:
     def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
         waiting = self.waiting(group, now)
         if host not in waiting and len(waiting) >= MOST_WAITING:
+            asks = self._claim_of(group, host) is Claim.ASK
             asking = [one for one in waiting if self._claim_of(group, one) is Claim.ASK]
-            if not asking or self._claim_of(group, host) is Claim.ASK:
+            out = (
+                asking[-1]
+                if asking and not asks
+                else self._beyond_its_share(asking if asks else waiting, host)
+            )
+            if out is None:
                 return False
-            del self._waiting[group.name][asking[-1]]
+            del self._waiting[group.name][out]
         self._waiting[group.name][host] = now
         return True
+
+    def _beyond_its_share(self, waiting: list[Address], host: Address) -> Address | None:
+        """Return the last address of the policy's host that has the most, if another one has fewer even with `host`."""
+        shares = Counter(map(self._share_of, waiting))
+        most, number = max(shares.items(), key=lambda item: item[1], default=("", 0))
+        if shares[self._share_of(host)] + 1 >= number:
+            return None
+        return next(one for one in reversed(waiting) if self._share_of(one) == most)
 
     def free(self, group: str) -> Holding | None:
         return self._held.pop(group, None)
@@ -112,19 +130,26 @@ class GroupHolders:
         `moved` is the time of its last message to the group.
         """
         holding = self._held.get(group.name)
-        return None if holding is None else max(holding.renewed, moved) + group.release_after - now
+        if holding is None:
+            return None
+        return max(holding.renewed, holding.moved, moved) + group.release_after - now
 
-    def loss(self, group: AuthorityGroup, now: float, *, moved: float, live: bool) -> str:
-        """Return why the holder loses the group, or an empty string. `live` is whether it has a live node."""
+    def lost_nodes(self, group: str, *, live: bool) -> bool:
+        """Return whether the holder had a live node until now. It keeps the group for a node that comes back."""
+        holding = self._held.get(group)
+        if holding is None:
+            return False
+        self._held[group] = replace(holding, has_node=live)
+        return holding.has_node and not live
+
+    def loss(self, group: AuthorityGroup, now: float, *, moved: float) -> str:
+        """Return why the holder loses the group, or an empty string."""
         holding = self._held.get(group.name)
         if holding is None:
             return ""
         if holding.lost or self._claim_of(group, holding.host) is None:
             return "the policy no longer lets it hold the group"
-        if live and not holding.had_node:
-            self._held[group.name] = replace(holding, had_node=True)
-        if holding.had_node and not live:
-            return "its nodes ended"
+        self._held[group.name] = replace(holding, moved=max(moved, holding.moved))
         left = self.seconds_left(group, now, moved)
         return f"it was silent for {group.release_after:g} s" if left is not None and left <= 0 else ""
 
@@ -171,7 +196,7 @@ class DriveOrders:
         self._decide_again = decide_again
         self._carried_out = carried_out
         self._relays_ready = relays_ready
-        self._groups = GroupHolders(self._claim)
+        self._groups = GroupHolders(self._claim, lambda host: self._policy().counted_as(host))
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def holders(self) -> dict[str, Address]:
@@ -280,9 +305,12 @@ class DriveOrders:
                 if self._next(group) is not None:
                     await self._hand_over(group, None, "it waited for the group", "")
                 return
-            live, moved = self._signs.live(held.host), self._signs.moved(held.host, group.names)
-            if loss := self._groups.loss(group, clock.now(), moved=moved, live=live):
+            moved = self._signs.moved(held.host, group.names)
+            ended = self._groups.lost_nodes(group.name, live=self._signs.live(held.host))
+            if loss := self._groups.loss(group, clock.now(), moved=moved):
                 await self._hand_over(group, None, loss, "", stop=True)
+            elif ended:
+                await self._stop(str(held.host), group.names, f"{group.name}: its nodes ended")
 
     def _turn(self, group: AuthorityGroup) -> asyncio.Lock:
         return self._turns.setdefault(group.name, asyncio.Lock())

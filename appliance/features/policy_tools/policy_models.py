@@ -121,7 +121,7 @@ class Explained(msgspec.Struct, frozen=True, kw_only=True):
     ]
     carried: Annotated[
         str, doc("whether [Authority] lets messages to this topic through now, or empty if no group has it")
-    ]
+    ] = ""
     lost: Annotated[list[LostRule], doc("matching rules that are overruled")]
     node: Annotated["Explained | None", doc("the node name that the host gives, if the action needs a node")]
     command: Annotated[

@@ -12,7 +12,7 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import structlog
@@ -285,8 +285,7 @@ class Execution:
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
         request, call = attempt.request, attempt.call
         if decision.asks is not None and not decision.allowed:
-            hold = self.hold_call(decision.asks)
-            decision = replace(decision, held=hold.waits, reason=f"{hold.text}: {decision.reason}")
+            decision = self.hold_call(decision.asks).of(decision)
         record = self.trail.decided(
             attempt.caller.asker,
             call.name,

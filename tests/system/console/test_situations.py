@@ -75,9 +75,11 @@ def windows(opened: Callable[..., Reader]) -> list[Reader]:
     return [opened(width=width, height=height) for width, height in SIZES]
 
 
-def advertise(appliance: Appliance, address: str, topic: str) -> str:
+def advertise(
+    appliance: Appliance, address: str, topic: str, *, node: str = "/agent", kind: str = "std_msgs/String"
+) -> str:
     """Register a publisher from an address of the loopback; return the answer."""
-    call = ("/agent", topic, "std_msgs/String", f"http://{address}:40404/")
+    call = (node, topic, kind, f"http://{address}:40404/")
     place = str(urllib.parse.urlsplit(appliance.master_uri).netloc)
     with contextlib.closing(http.client.HTTPConnection(place, source_address=(address, 0))) as connection:
         connection.request(

@@ -14,6 +14,9 @@ def guest(number: int) -> IPv4Address:
     return IPv4Address("10.9.0.0") + number
 
 
+MANY = {guest(number) for number in range(MOST_WAITING + 1)}
+
+
 def test_hosts_that_may_only_ask_keep_no_driver_from_waiting() -> None:
     groups = GroupHolders(lambda _group, host: DRIVERS.get(host, Claim.ASK))
     for number in range(MOST_WAITING):
@@ -25,6 +28,18 @@ def test_hosts_that_may_only_ask_keep_no_driver_from_waiting() -> None:
     assert len(waiting) == MOST_WAITING
     assert waiting[:14] == [guest(number) for number in range(14)] and set(waiting[14:]) == set(DRIVERS)
     assert groups.successor(GROUP, 0.0) == next(iter(DRIVERS))
+
+
+def test_many_addresses_of_a_host_leave_places_to_others() -> None:
+    groups = GroupHolders(
+        lambda _group, _host: Claim.TAKE, lambda host: "many" if host in MANY else str(host)
+    )
+    for host in sorted(MANY)[:MOST_WAITING]:
+        assert groups.wait(GROUP, host, 0.0)
+    drivers = list(DRIVERS)
+    assert all(groups.wait(GROUP, driver, 0.0) for driver in drivers)
+    assert not groups.wait(GROUP, guest(MOST_WAITING), 0.0), "it has the most"
+    assert groups.waiting(GROUP, 0.0) == [*sorted(MANY)[:14], *drivers]
 
 
 def test_drivers_wait_in_their_order_and_take_no_place_of_one_another() -> None:
