@@ -35,6 +35,7 @@ from appliance.backup.contents import (
     trouble_with,
 )
 from appliance.base import clock
+from appliance.base.full_disk import is_full
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 
@@ -43,6 +44,7 @@ _HEADER, _HASH = 8, 32  # bytes, of the signer's memory
 _FORMAT = tarfile.GNU_FORMAT  # this format stores even the size of a large database in a single header
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe does not block
+_NO_RIGHTS = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_AUTH}
 _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/operating.md)"
 
 
@@ -108,18 +110,22 @@ def _back_up(state: Path, file: Path, seen: Seen) -> list[str]:
     except BaseException as error:  # also Ctrl-C and signals
         file.unlink()
         if isinstance(error, (OSError, sqlite3.Error)):
-            reason = f"{error}; {_ADVICE}"
-            if _is_full(error):
-                reason = f"{file.absolute().parent}: the disk is full; free space there, or write the file elsewhere"
+            beside = file.absolute().parent
+            if is_full(error, beside):
+                reason = f"{beside}: the disk is full; free space there, or write the file elsewhere"
+            elif is_full(error, state):
+                reason = f"{state}: the disk is full; free space there"
+            else:
+                reason = f"{error}; {_ADVICE}" if _lacks_rights(error) else str(error)
             raise BackupError(f"the backup was not made: {reason}") from error
         raise
     return names
 
 
-def _is_full(error: OSError | sqlite3.Error) -> bool:
+def _lacks_rights(error: OSError | sqlite3.Error) -> bool:
     if isinstance(error, OSError):
-        return error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-    return getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+        return isinstance(error, PermissionError)
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in _NO_RIGHTS
 
 
 def _write(state: Path, archive: tarfile.TarFile, beside: Path, seen: Seen) -> list[str]:

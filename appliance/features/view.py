@@ -24,7 +24,7 @@ class AlarmKind(NamedTuple):
 
     severity: Literal["alarm", "warning", "notice"]
     remedy: str
-    """What the person does, or why none needs to, for the reference."""
+    """The remedy, or why none is needed, for the reference."""
 
 
 class Trouble(NamedTuple):

@@ -23,6 +23,7 @@ import msgspec
 import structlog
 
 from appliance.base.engine_thread import Drive, EngineThread
+from appliance.base.full_disk import reason_of
 from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import (
     Change,
@@ -126,7 +127,7 @@ class Database:
             self._ahead = WriteAhead(path.with_suffix(".ahead"))
             self._number = self._catch_up()  # of the last change
         except sqlite3.Error as error:
-            raise StoreError(f"{path}: {error}; {_advice(error)}") from error
+            raise StoreError(f"{path}: {reason_of(error, path.parent)}; {_advice(error)}") from error
         except (OSError, ValueError, ChangeError) as error:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._feeds: tuple[ChangeFeed, ...] = ()
@@ -235,7 +236,7 @@ class Database:
             copy.execute("PRAGMA journal_mode=OFF")  # the source's mode was copied with it
         except sqlite3.Error as error:
             copy.close()
-            raise StoreError(f"{path}: {error}; {_advice(error)}") from error
+            raise StoreError(f"{path}: {reason_of(error, path.parent)}; {_advice(error)}") from error
         finally:
             path.unlink(missing_ok=True)
         return copy
@@ -353,7 +354,7 @@ class Database:
             self._execute(statements, self.history, last)
         except sqlite3.Error as error:
             self._roll_back()
-            self._failing = f"{self._path}: {error}"
+            self._failing = f"{self._path}: {reason_of(error, self._path.parent)}"
             self._fail(self._failing)
             return False
         self._failing = ""

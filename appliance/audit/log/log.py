@@ -31,6 +31,7 @@ from appliance.audit.log.signatures import CheckpointSigner, RemovalSigner, Sign
 from appliance.base.clock import now, wall_ns
 from appliance.base.counted import counted
 from appliance.base.engine_thread import Drive, EngineThread
+from appliance.base.full_disk import reason_of
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
 from appliance.signing.signed_logs import OtherLog
@@ -437,7 +438,7 @@ class AuditLog:
 
     def _fail(self, error: Exception) -> None:
         known = isinstance(error, WRITE_ERRORS)
-        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        reason = reason_of(error, self.path.parent) if known else f"{type(error).__name__}: {error}"
         if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
             # This process is in the list because its own connection is still open.
             others = [pid for pid in holders(self.path) if pid != os.getpid()]

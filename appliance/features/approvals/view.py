@@ -62,7 +62,7 @@ APPROVALS_VIEW = FeatureView(
             "calls that wait for an operator's approval, and approvals",
             kinds={
                 "approval-unanswered": AlarmKind(
-                    "warning", "see that somebody answers; it ends after ten minutes"
+                    "warning", "see that an operator answers; it ends after ten minutes"
                 ),
                 "approval-hook": AlarmKind("warning", "repair the receiver of the web hook"),
             },

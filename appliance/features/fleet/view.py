@@ -126,7 +126,7 @@ FLEET_VIEW = FeatureView(
                 "bundle-refused": AlarmKind("warning", "correct the bundle; the last one stays in force"),
                 "bundles-rejected": AlarmKind("alarm", "find out who serves them: they are not of the fleet"),
                 "bundles-not-polled": AlarmKind("warning", "repair the collector"),
-                "bundle-changed": AlarmKind("notice", "somebody changed it here on purpose"),
+                "bundle-changed": AlarmKind("notice", "an operator changed it here on purpose"),
             },
             alarms=_bundle_alarms,
             metrics=_BUNDLE_METRICS,

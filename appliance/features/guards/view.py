@@ -110,7 +110,7 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
 
 
 def _line(state: GuardsState) -> tuple[str, Pieces]:
-    """Return the guards; a stop is red in its first seconds, when somebody drives, and not while it holds the robot."""
+    """Return the guards; a stop is red in its first seconds only: later it holds a robot that stands."""
     now = clock.wall()
     acting = [
         (f"; {_since(guard)}", "bold red" if 0 <= now - guard.since < _BEGINS_SECONDS else "")

@@ -145,11 +145,12 @@ def _carried(policy: Policy, request: Request) -> str:
     if policy.may_command(request.resource, request.host):
         return f"its messages are carried now: it holds {group.name}"
     holder, claim = policy.holder(group), group.claim(policy.atoms_of(request.host))
+    order = f"rosrv drive assign {group.name} --host {request.host}"
     if holder is not None and claim is not Claim.OVERRIDE:
-        order = f"ask {group.name} --host"
-    else:
-        order = f"free {group.name} --to" if claim is Claim.ASK else f"assign {group.name} --host"
-    why = f"{holder or 'no host'} holds {group.name}: rosrv drive {order} {request.host}"
+        order = f"rosrv drive ask {group.name} --host {request.host}"
+    elif claim is Claim.ASK:
+        order = f"rosrv drive free {group.name} --to {request.host}"
+    why = f"{holder or 'no host'} holds {group.name}: {order}"
     return f"but none of its messages is carried now, because {why}"
 
 

@@ -102,7 +102,7 @@ def test_each_kind_has_its_row_which_says_who_needs_a_person_now() -> None:
 STARTING: dict[str, Any] = {"starting": True, "relay": "away", "rosmaster": "being rebuilt"}
 
 
-def test_the_first_seconds_of_a_start_are_no_failures() -> None:
+def test_the_first_seconds_of_a_start_fail_nothing() -> None:
     assert [alarm.kind for alarm in open_alarms(example(Status, **GOOD | STARTING))] == ["starting"]
     assert open_alarms(example(Status, **GOOD | {"starting": True})) == []
     lasting = open_alarms(example(Status, **GOOD | STARTING | {"starting": False}))

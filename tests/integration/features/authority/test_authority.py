@@ -34,7 +34,7 @@ lease base = 3s
 class Site(NamedTuple):
     appliance: Appliance
     listener: Process
-    pilot: Process
+    pilot_node: Process
     boss: Process
     tablet: RosSession
 
@@ -73,8 +73,20 @@ def site(lab: Lab, robot: Host, tmp_path: Path) -> Iterator[Site]:
 
 
 def test_one_host_at_a_time_is_heard(site: Site) -> None:
+    eventually(
+        lambda: {PILOT, BOSS} == {one.host for one in site.state().not_carried}, "both publish in vain"
+    )
+    [notice] = [line for line in site.appliance.status()["attention"] if "not carried" in line]
+    assert (
+        f"{PILOT} (/pilot) to /chatter" in notice and "no host holds base: rosrv drive assign base" in notice
+    )
+    assert f"not carried: messages of {PILOT} (/pilot) to /chatter" in site.drive("status")
+    assert f"because no host holds base: rosrv drive assign base --host {PILOT}\n" in site.explained()
     assert site.drive("take", "base", "--host", PILOT).startswith(f"base: held by {PILOT}")
     assert site.heard("/pilot") == {"/pilot"}
+    site.pilot_node.kill()
+    site.tablet.talker("rospy", "/chatter", name="pilot")
+    assert site.heard("/pilot") == {"/pilot"}, "a node that restarts within the lease has its group"
     site.drive("take", "base", "--host", BOSS)
     assert site.heard("/boss") == {"/boss"}
     assert f"{BOSS} holds base" in site.drive("take", "base", "--host", PILOT, check=False)
