@@ -12,6 +12,7 @@ import msgspec
 
 from appliance.audit.log.columns import plain_record
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
+from appliance.base.counted import counted
 
 Key = tuple[str | int | None, ...]
 KIND, UNKNOWN, HOST, ALL_UNKNOWN, ALL = "kind", "unknown host", "host", "unknown hosts", "all"
@@ -176,15 +177,34 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     if recovered:
         detail["recovered"] = True
     passed = state.folds or state.decision == "ask"
-    what = "further record{} of a host beyond its quota" if passed else "further denial{} of many kinds"
+    if exact:
+        reason = state.reason
+    elif passed:
+        reason = counted(
+            state.count,
+            "further record of a host beyond its quota",
+            "further records of a host beyond its quota",
+        )
+    elif state.scope == UNKNOWN and state.decision == "deny":
+        reason = _denied_most(state)
+    else:
+        reason = counted(state.count, "further denial of many kinds", "further denials of many kinds")
     return AuditRecord(
         id=record_id, time=time, event="repetitions folded" if passed else "denials folded", severity=state.severity,
         decision=state.decision, host=None if state.scope in (ALL_UNKNOWN, ALL) else state.host,
         caller_id=state.caller_id if exact else None, category=state.category if exact else None,
         resource=state.resource if exact else None, rule=state.rule if exact else None, revision=state.revision,
-        reason=state.reason if exact else f"{state.count} {what.format('' if state.count == 1 else 's')}",
+        reason=reason,
         duration_us=None, detail=detail, unknown=state.scope in (UNKNOWN, ALL_UNKNOWN),
     )  # fmt: skip
+
+
+def _denied_most(state: FoldState) -> str:
+    """Return what an unknown host was denied most; all requests of a kind have the same call and category."""
+    resources = state.tallies.get("resources", {})
+    most = max(resources, key=lambda name: resources[name], default="")
+    asked = " ".join(filter(None, (state.category, most))) or "requests"
+    return f"{state.host} was denied {asked}{' and more' if len(resources) > 1 else ''}, {counted(state.count, 'time')}"
 
 
 def repetitions(detail: dict[str, object]) -> int:

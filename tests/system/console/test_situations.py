@@ -145,6 +145,12 @@ def test_a_guards_stop(appliance: Appliance, windows: list[Reader], tmp_path: Pa
         eventually(lambda: any(",0.3," in str(event.get("text")) for event in base.events), "it drives")
         driver.kill()
         see(windows, lambda page: fact(page, "Stops"), re.compile(r"deadman stop(s|ped) /cmd_vel.* \d+ s"))
+        see(windows, lambda page: fact(page, "Stops"), re.compile(r"held by deadman since \d+:\d+.*127"))
+        for reader in windows:
+            expect(fact(reader.page, "Stops")).not_to_have_class(re.compile("deny"))
+            page = reader.go("robot")
+            expect(page.locator("[data-guard=deadman]")).to_contain_text("held by deadman since")
+            expect(page.locator(".badge.deny, .fact.deny")).to_have_count(0)
 
 
 def test_a_waiting_call_is_decided_by_one_click_on_any_page(

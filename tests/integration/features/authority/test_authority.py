@@ -82,14 +82,14 @@ def test_one_host_at_a_time_is_heard(site: Site) -> None:
     )
     assert f"not carried: messages of {PILOT} (/pilot) to /chatter" in site.drive("status")
     assert f"because no host holds base: rosrv drive assign base --host {PILOT}\n" in site.explained()
-    assert site.drive("take", "base", "--host", PILOT).startswith(f"base: held by {PILOT}")
+    assert site.drive("assign", "base", "--host", PILOT).startswith(f"base: held by {PILOT}")
     assert site.heard("/pilot") == {"/pilot"}
     site.pilot_node.kill()
     site.tablet.talker("rospy", "/chatter", name="pilot")
     assert site.heard("/pilot") == {"/pilot"}, "a node that restarts within the lease has its group"
-    site.drive("take", "base", "--host", BOSS)
+    site.drive("assign", "base", "--host", BOSS)
     assert site.heard("/boss") == {"/boss"}
-    assert f"{BOSS} holds base" in site.drive("take", "base", "--host", PILOT, check=False)
+    assert f"{BOSS} holds base" in site.drive("assign", "base", "--host", PILOT, check=False)
     answer = site.tablet.run("rosservice", "call", "/rosrv/drive/take").stdout
     assert "success: False" in answer
     site.drive("ask", "base", "--host", PILOT)

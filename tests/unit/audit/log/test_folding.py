@@ -8,7 +8,7 @@ import pytest
 from appliance.audit.log.columns import LARGEST_DETAIL
 from appliance.audit.log.folding import FoldSettings, RecordFolder
 from appliance.audit.log.record import AuditRecord, RuleReference
-from appliance.audit.log.repetition import HOST, FoldState, new_state, summary
+from appliance.audit.log.repetition import HOST, UNKNOWN, FoldState, new_state, summary
 from appliance.quotas.pool import Bounds
 
 _numbers = itertools.count(1)
@@ -114,6 +114,10 @@ def test_the_reason_of_a_summary_counts_in_english() -> None:
         "1 further record of a host beyond its quota",
         "2 further records of a host beyond its quota",
     ]
+    state = new_state(denial(), UNKNOWN)
+    for _ in range(900):
+        state.count_in(denial())
+    assert summary(state, "s", 1).reason == "10.0.0.1 was denied publish /a, 900 times"
 
 
 def test_a_summary_has_no_author_if_none_is_known() -> None:
