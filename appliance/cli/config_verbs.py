@@ -33,18 +33,23 @@ _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
     """Report every error in the configuration file and the environment variables. Exit status: 0 valid, 1 errors.
 
-    A state directory that this version cannot continue is also an error. Guards of releases before 0.4 are named.
+    A state directory that this version cannot continue is also an error. Guards of releases before 0.4, and REST for
+    other machines without `api_names`, are named.
 
     Example: rosrv config check appliance.yaml
     """
     try:
-        _check_state(resolve(file or config, os.environ, {}))
+        settings = resolve(file or config, os.environ, {})
+        _check_state(settings)
     except ConfigError as error:
         if not as_json:
             raise
         for mistake in error.mistakes:
             _print(json.dumps({"place": mistake.place, "text": mistake.text}))
         raise typer.Exit(1) from error
+    if settings.api_networks and not (settings.rest_names or settings.ipsec.endpoint):
+        text = "other machines may connect, but only by address or this machine's own name: list the name that they use"
+        typer.echo(f"rosrv: api_names: {text}", err=True)
     if not as_json:
         _print("The configuration is valid.")
 

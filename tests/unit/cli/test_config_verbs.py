@@ -17,6 +17,30 @@ def test_the_schema_accepts_only_known_keys(tmp_path: Path, monkeypatch: pytest.
     assert not schema.is_valid({"listn": "x"})
 
 
+NO_NAMES = (
+    "rosrv: api_names: other machines may connect, but only by address or this machine's own name: list the name that"
+    " they use"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("api_networks: [10.0.0.0/24]\n", [NO_NAMES]),
+        ("api_networks: [10.0.0.0/24]\napi_names: [lift-7]\n", []),
+        ("api_networks: [10.0.0.0/24]\nname: lift-7\n", []),
+        ("{}\n", []),
+    ],
+)  # fmt: skip
+def test_rest_for_other_machines_without_a_name_is_named(
+    text: str, named: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "appliance.yaml").write_text(text)
+    done = rosrv("config", "check")
+    assert (done.returncode, done.stderr.splitlines()) == (0, named)
+
+
 def test_guards_of_before_0_4_are_named_in_the_folder_and_in_the_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
