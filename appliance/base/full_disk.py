@@ -29,4 +29,4 @@ def is_full(error: BaseException, folder: Path) -> bool:
 
 def reason_of(error: BaseException, folder: Path) -> str:
     """Return an error's text, which names a full disk."""
-    return f"the disk of {folder} is full ({error})" if is_full(error, folder) else str(error)
+    return f"{error}: the disk of {folder} is full" if is_full(error, folder) else str(error)

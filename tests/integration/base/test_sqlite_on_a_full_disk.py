@@ -21,4 +21,4 @@ def test_a_database_that_cannot_be_opened_on_a_full_disk_says_so(tmp_path: Path)
         ):
             database.execute("SELECT * FROM t").fetchall()
         with filled(state):
-            assert reason_of(found.value, state).startswith(f"the disk of {state} is full (")
+            assert reason_of(found.value, state).endswith(f": the disk of {state} is full")

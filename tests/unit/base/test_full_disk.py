@@ -37,4 +37,4 @@ def test_a_full_disk_is_called_that(
 ) -> None:
     monkeypatch.setattr(os, "statvfs", lambda _folder: disk)
     assert is_full(error, Path("/state")) is full
-    assert reason_of(error, Path("/state")).startswith("the disk of /state is full") is full
+    assert reason_of(error, Path("/state")).endswith(": the disk of /state is full") is full

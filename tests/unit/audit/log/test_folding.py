@@ -117,7 +117,7 @@ def test_the_reason_of_a_summary_counts_in_english() -> None:
     state = new_state(denial(), UNKNOWN)
     for _ in range(900):
         state.count_in(denial())
-    assert summary(state, "s", 1).reason == "10.0.0.1 was denied publish /a, 900 times"
+    assert summary(state, "s", 1).reason == "10.0.0.1 was denied call /a, 900 times"
 
 
 def test_a_summary_has_no_author_if_none_is_known() -> None:
