@@ -83,20 +83,18 @@ class XmlRpcClient:
         except PeerError as error:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
-    async def refuses(self, seconds: float) -> bool:
-        """Return whether the address refuses connections; a server that is silent for these seconds does not."""
+    async def reaches(self, seconds: float) -> bool:
+        """Return whether the address takes a connection within this time."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(seconds):
                 transport, _protocol = await loop.create_connection(
                     asyncio.Protocol, self.uri.host, self.uri.port
                 )
-        except TimeoutError:
+        except OSError:  # also `TimeoutError`
             return False
-        except OSError:
-            return True
         transport.close()
-        return False
+        return True
 
     async def _written(self, method: str, params: tuple[Value, ...]) -> bytes:
         if weigh(list(params), _OFFLOAD) < _OFFLOAD:

@@ -399,6 +399,7 @@ class ControlParts:
             quota_class=lambda _host: QuotaClass.REGISTERED,
             refusals=2,
             shut_out=lambda: self.shut_out,
+            connects=self.carried.connects,
         )
 
     def _connect_calls(self, rights: ParameterRights) -> None:

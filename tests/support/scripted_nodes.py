@@ -63,8 +63,8 @@ class _Client(XmlRpcClient):
     async def call(self, method: str, *params: Value) -> Value:
         return await self._nodes.answer(self._node, method, params)
 
-    async def refuses(self, seconds: float) -> bool:
-        return self._node.name in self._nodes.gone
+    async def reaches(self, seconds: float) -> bool:
+        return self._node.name not in self._nodes.gone
 
     def close(self) -> None:
         self._nodes.closed.append(self._node.name)

@@ -16,6 +16,9 @@ class Node(msgspec.Struct, frozen=True):
     publishes: Annotated[list[str], doc("topics that it publishes")]
     subscribes: Annotated[list[str], doc("topics that it subscribes to")]
     offers: Annotated[list[str], doc("services that it offers")]
+    uncallable: Annotated[
+        bool, doc("whether it cannot be called, as behind NAT: it hears of no publisher that comes later")
+    ] = False
 
 
 class Flow(msgspec.Struct, frozen=True, kw_only=True):

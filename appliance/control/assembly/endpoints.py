@@ -144,6 +144,7 @@ def _make_liveness(
         quota_class=base.quota_class,
         refusals=_REFUSALS_OF_A_ROBOT if base.role.paired else _REFUSALS,
         shut_out=base.role.in_doubt,
+        connects=core.carried.connects,
     )
 
 

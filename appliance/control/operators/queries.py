@@ -85,6 +85,7 @@ def _node(incarnation: Incarnation) -> Node:
         publishes=sorted(incarnation.resources(Kind.PUBLICATION)),
         subscribes=sorted(incarnation.resources(Kind.SUBSCRIPTION)),
         offers=sorted(incarnation.resources(Kind.SERVICE)),
+        uncallable=incarnation.reached is False,
     )
 
 

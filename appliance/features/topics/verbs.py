@@ -1,7 +1,7 @@
 """The commands `rosrv topic echo|info|publishers`; the last also answers for a time in the past."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
@@ -226,7 +226,7 @@ def info(appliance: Appliance, topic: _Topic) -> None:
     if appliance.as_json:
         say_json(found)
     else:
-        for line in _described(found):
+        for line in _described(found, {node.name for node in body.nodes if node.uncallable}):
             say(line)
 
 
@@ -279,7 +279,10 @@ def _to_seconds(text: str) -> str:
     return re.sub(r"(T\d\d:\d\d:\d\d)\.\d++", r"\1", text)
 
 
-def _described(topic: Topic) -> Iterator[str]:
+_UNCALLABLE = "it cannot be called (NAT), and gets later publishers when it subscribes again"
+
+
+def _described(topic: Topic, uncallable: Collection[str] = ()) -> Iterator[str]:
     yield f"{printable(topic.name)}  {printable(topic.type)}"
     for publisher in topic.publishers:
         rate = f"{publisher.messages_per_second:.1f} Hz, {publisher.bytes_per_second:.0f} bytes/s"
@@ -288,9 +291,10 @@ def _described(topic: Topic) -> Iterator[str]:
     connected = {connection.to for connection in topic.connections}
     for node in topic.subscribers:
         if node in connected or not topic.mediated or all(one.node == node for one in topic.publishers):
-            yield f"  received by {printable(node)}"
+            line = f"  received by {printable(node)}"
         else:
-            yield f"  subscribed by {printable(node)}, which is not connected to a publisher"
+            line = f"  subscribed by {printable(node)}, which is not connected to a publisher"
+        yield f"{line}; {_UNCALLABLE}" if node in uncallable else line
     if topic.mediated and not topic.subscribers:
         yield "  no node subscribes: messages pass the relay only for monitors, so 0.0 Hz need not be silence"
     if not topic.mediated:

@@ -36,7 +36,7 @@ class Caller(NamedTuple):
     """The peer, and the `caller_id` that the peer claims.
 
     `own` marks the appliance's own nodes, which have a separate listener. `target` is the incarnation whose proxy
-    endpoint is called.
+    endpoint is called. `in_multicall`: the call is a part of a multicall.
     """
 
     peer: Peer
@@ -44,6 +44,7 @@ class Caller(NamedTuple):
     arrived: int
     own: bool = False
     target: Incarnation | None = None
+    in_multicall: bool = False
 
     @property
     def asker(self) -> Asker:

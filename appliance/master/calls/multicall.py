@@ -41,6 +41,7 @@ class Multicall:
             why = "system.multicall takes one list of calls"
             self._refused(visit, why)
             return [-1, why, 0]
+        visit = visit._replace(caller=visit.caller._replace(in_multicall=True))
         left: _Parts = deque(params[0])
         results: list[Value] = []
         room = self.parameters.mirror.bytes_limit

@@ -3,9 +3,13 @@
 Each change is stored before it is answered, because a ROS 1 node never registers twice. `Arrivals` finds or makes the
 incarnation of a registering call, by its name, host and API URI.
 
-multimaster_fkie registers the nodes of other machines, which cannot be called at their caller's address. A node on a
-machine with several addresses may also name another host. So the port of such a new node must be open at the caller's
-address, as every node's port is before it registers.
+A URI may name another host than the caller's address: another address of its machine, or one behind NAT, as in a
+container. The caller's address counts. If the node's port is not open there, as every node's port is before it
+registers, no node can call it. It may subscribe and call services, but not publish or offer a service, except
+what the client libraries register for every node: that is answered, and not registered.
+
+multimaster_fkie registers the nodes of other machines, in multicalls, which no client library uses to register. Such
+nodes are refused, because they would be subscribers that never connect.
 """
 
 from collections.abc import Callable
@@ -24,8 +28,13 @@ from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import Answer
 from appliance.policy.model import Address
 from appliance.rpc.server import Handler
+from roswire.names import ROSOUT
 
 _CONNECT_SECONDS = 1.0
+_PATIENT_SECONDS = 3.0  # also after the loss of a packet
+_OF_EVERY_NODE = ("get_loggers", "set_logger_level", "tf2_frames")  # private services of the client libraries
+
+_NOT_REGISTERED = "Because this node cannot be called"
 
 ServeNode = Callable[[Incarnation], Handler]
 """Makes the handler of a node's proxy endpoint."""
@@ -79,15 +88,46 @@ class Arrivals:
             incarnation.calls -= 1
         return incarnation
 
+    async def callable_for(self, caller: Caller, api: ApiUri, resource: str) -> Incarnation | None:
+        """Return the incarnation like `incarnation_for`, for a topic or service for which other nodes call it.
+
+        Return None for what every node registers, if it cannot be called. Also raises `NodeElsewhereError` for others.
+        """
+        incarnation = await self.incarnation_for(caller, api)
+        if incarnation.reached is not False:
+            return incarnation
+        if resource == ROSOUT or resource in {f"{incarnation.name}/{service}" for service in _OF_EVERY_NODE}:
+            return None
+        if await self.liveness.nodes.client(incarnation).reaches(_PATIENT_SECONDS):
+            self.liveness.reached(incarnation)
+            self.liveness.look_at(incarnation)
+            return incarnation
+        if incarnation.evictable:
+            self.graph.forgotten(incarnation)
+        raise NodeElsewhereError(
+            f"{self._elsewhere(caller, incarnation)}: behind NAT, as in a container's own network, a node can "
+            "subscribe and call services, but no node can connect to it. To publish or offer a service, run it with "
+            f"the host's network (docker run --network host), or publish its ports and set ROS_IP={caller.peer.text}, "
+            "or use a tunnel (rosrv host add)"
+        )
+
     async def _check_place(self, caller: Caller, incarnation: Incarnation) -> None:
         if caller.own or incarnation.api.host == caller.peer.text:
             return
-        if await self.liveness.nodes.client(incarnation).refuses(_CONNECT_SECONDS):
+        if await self.liveness.nodes.client(incarnation).reaches(_CONNECT_SECONDS):
+            return
+        if caller.in_multicall:
             raise NodeElsewhereError(
-                f"{caller.peer.text} registers {caller.caller_id} at {incarnation.api_text[:80]}, but has no node on "
-                f"port {incarnation.api.port}: a node registers from its own machine; nodes of other masters "
-                "(multimaster_fkie) cannot be registered here: start them with this master's ROS_MASTER_URI"
+                f"{self._elsewhere(caller, incarnation)}: nodes of other masters (multimaster_fkie) cannot be "
+                "registered here: start them with this master's ROS_MASTER_URI"
             )
+        incarnation.reached = False
+
+    def _elsewhere(self, caller: Caller, incarnation: Incarnation) -> str:
+        return (
+            f"{caller.peer.text} registers {caller.caller_id} at {incarnation.api_text[:80]}, but has no node on "
+            f"port {incarnation.api.port}"
+        )
 
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
         identity = (caller.caller_id, caller.peer.host, api.text)
@@ -138,7 +178,9 @@ class RegistrationCalls:
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
-        node = await self.arrivals.incarnation_for(caller, caller_api)
+        node = await self.arrivals.callable_for(caller, caller_api, topic)
+        if node is None:
+            return [1, f"{_NOT_REGISTERED}, [{topic}] is not registered", []]
         self.graph.registered(node, Kind.PUBLICATION, topic, topic_type)
         hidden = self.relay.hides_publishers(topic)
         subscribers = self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden)
@@ -156,7 +198,9 @@ class RegistrationCalls:
         self, caller: Caller, service: str, service_api: ApiUri, caller_api: ApiUri
     ) -> Answer:
         """`registerService(caller_id, service, service_api, caller_api)`."""
-        node = await self.arrivals.incarnation_for(caller, caller_api)
+        node = await self.arrivals.callable_for(caller, caller_api, service)
+        if node is None:
+            return [1, f"{_NOT_REGISTERED}, [{service}] is not registered", 1]
         port = str(service_api.uri.port)
         self.graph.registered(node, Kind.SERVICE, service, port)
         return [1, f"Registered [{node.name}] as provider of [{service}]", 1]

@@ -5,7 +5,7 @@ address of a live node, and a call that probes or ends a node opens a new connec
 address, because some programs serve several names with one API. The size limit for answers is small, because thousands
 of nodes may answer at once, and each may be compromised.
 
-A slow or dead node does not delay other nodes.
+A slow or dead node does not delay other nodes. A node that cannot be called (`Incarnation.reached`) gets no calls.
 
 If several lists of a topic's publishers wait for a node, it gets only the newest. If a publisher was removed and added
 again since the last one, the node first gets the list without it, because roscpp must see the removal. The two are
@@ -376,7 +376,7 @@ class Delivery:
         self._silent = False
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
-        if self._silent:
+        if self._silent or incarnation.reached is False:
             return
         queue = self._queue(incarnation)
         queue.calls.append(call)
@@ -385,7 +385,7 @@ class Delivery:
 
     def push_unasked(self, incarnation: Incarnation, key: str, call: NodeCall) -> None:
         """Tell a node what it perhaps never asked for; `UnaskedCalls` says how."""
-        if not self._silent:
+        if not self._silent and incarnation.reached is not False:
             self._unasked.push(incarnation, key, call)
 
     def list_of(self, incarnation: Incarnation, topic: str) -> tuple[str, ...] | None:
@@ -394,7 +394,7 @@ class Delivery:
         return None if one is None else one.wanted
 
     def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
-        if self._silent:
+        if self._silent or incarnation.reached is False:
             return
         one = self._list(incarnation, topic)
         one.want(publishers)

@@ -14,6 +14,7 @@ from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Flow
 from appliance.channel.messages import TopicTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.policy.model import Address
 from appliance.policy.rate_limits import LimitRule
 from appliance.store.state_file import PermissionRow
 from appliance.telemetry.audit_trail import AuditTrail
@@ -103,6 +104,12 @@ class RelayTraffic:
             )
             for connection in self.connections.values()
         }
+
+    def connects(self, host: Address, caller_id: str) -> bool:
+        return any(
+            (connection.caller_id, connection.host) == (caller_id, str(host))
+            for connection in self.connections.values()
+        )
 
     @property
     def total(self) -> Traffic:

@@ -115,6 +115,8 @@ class RosGraph:
         self.registry.register(incarnation, kind, resource, detail)
         if new:
             reason = f"{incarnation.name} registered {resource}"
+            if incarnation.reached is False:
+                reason += f"; {incarnation.api_text[:80]} cannot be called, so it hears of no later change"
             self._record("registered", reason, incarnation, kind.value, resource)
 
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:

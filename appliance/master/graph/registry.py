@@ -73,7 +73,8 @@ class Incarnation:
     """One life of a node.
 
     The host part of `api`, the registered URI, is not verified and never used. `told` is the address at which this
-    node reaches the appliance; all URIs for this node use it.
+    node reaches the appliance; all URIs for this node use it. `reached` is False for a node that cannot be called, as
+    behind NAT: it subscribes to what is there, and gets no calls. It is True once a call was answered, else None.
     """
 
     key: str
@@ -85,6 +86,7 @@ class Incarnation:
     outer_port: int
     relay_port: int
     own: bool = False
+    reached: bool | None = None
     life: Life = Life.LIVE
     changed: float = 0.0  # monotonic seconds of the last change of `life`, or of control's start
     touched: float = 0.0  # monotonic seconds of its last registering call
@@ -96,6 +98,10 @@ class Incarnation:
     @property
     def evictable(self) -> bool:
         return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
+
+    @property
+    def only_listens(self) -> bool:
+        return not (self.resources(Kind.PUBLICATION) or self.resources(Kind.SERVICE))
 
     @property
     def of_monitors(self) -> bool:

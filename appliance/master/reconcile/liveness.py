@@ -4,6 +4,9 @@ A node is *lost* if its API refuses connections several times in a row, if anoth
 after `silent` seconds without an answer. It then keeps its registrations as a shadow until its API answers again,
 because a ROS 1 node never registers twice. If a firewall shuts out the appliance for a moment, all nodes of a host
 look lost, so a lost node is checked more often at first.
+
+A node that only subscribes and was never reached, as behind NAT or a firewall, is there while it has a connection to a
+relay. It is forgotten after `silent` seconds without one, because it cannot answer later.
 """
 
 import asyncio
@@ -127,7 +130,7 @@ class Liveness:
     """Checks nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of others.
 
     A node that refuses `refusals` connections in a row is lost, unless the robot's firewalls may shut out this one of
-    two appliances (`shut_out`).
+    two appliances (`shut_out`). `connects` returns whether a name of a host has a connection to a relay.
     """
 
     registry: Registry
@@ -141,6 +144,7 @@ class Liveness:
     quota_class: InitVar[Callable[[Address], QuotaClass]]
     refusals: int
     shut_out: Callable[[], bool]
+    connects: Callable[[Address, str], bool]
 
     def __post_init__(self, quota_class: Callable[[Address], QuotaClass]) -> None:
         self._answered: dict[str, float] = {}
@@ -209,7 +213,13 @@ class Liveness:
             presence = Presence.ANSWERS
         else:
             presence = Presence.ANSWERS
+        if self._only_connects(incarnation):
+            presence = Presence.ANSWERS
         return Probe(incarnation, presence, patience)
+
+    def _only_connects(self, incarnation: Incarnation) -> bool:
+        listens = incarnation.only_listens and not incarnation.reached
+        return listens and self.connects(incarnation.host, incarnation.name)
 
     def revive(self, incarnation: Incarnation) -> None:
         self._answered[incarnation.key] = clock.now()
@@ -235,8 +245,17 @@ class Liveness:
         since = self._answered.setdefault(incarnation.key, now)
         if there:
             self._answered[incarnation.key] = now
+            self.reached(incarnation)
         refused = there is None and not self.shut_out()
-        if incarnation.life is not Life.LIVE:
+        if incarnation.life is Life.LIVE and not there and self._only_connects(incarnation):
+            self._answered[incarnation.key] = now
+            incarnation.reached = False
+        elif incarnation.life is Life.LIVE and incarnation.reached is False:
+            if now - max(since, incarnation.touched) >= self.settings.silent:
+                if incarnation.registrations:
+                    self.graph.lost(incarnation, f"{why}, and it has no connection to a relay")
+                self._forget(incarnation)
+        elif incarnation.life is not Life.LIVE:
             self._look_at_retired(incarnation, answered=bool(there), refused=refused)
         elif refused or (not there and now - since >= self.settings.silent):
             self._lose(incarnation, why)
@@ -244,6 +263,12 @@ class Liveness:
             self._make_up(incarnation)
         elif there is None or self.watchlist.has_missed(incarnation):
             asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
+
+    def reached(self, incarnation: Incarnation) -> None:
+        """Note that a node can be called; its next check makes up for what it missed."""
+        if incarnation.reached is False:
+            self.watchlist.returned(incarnation)
+        incarnation.reached = True
 
     def _make_up(self, incarnation: Incarnation) -> None:
         missed = self.watchlist.to_make_up(incarnation)

@@ -9,6 +9,7 @@ import pytest
 
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.store.state_file import StateStore
+from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 from tests.support.engines import InlineDatabase
 
@@ -62,21 +63,39 @@ async def test_simultaneous_arrivals_do_not_take_each_others_room(
     assert not any(node.calls for node in world.registry.all())
 
 
-async def test_a_node_of_another_machine_is_refused() -> None:
+async def test_a_node_that_cannot_be_called_may_only_listen() -> None:
     world = await ControlParts.begun()
     world.nodes.gone |= {"/far", "/here"}
-    call = ("/t", "std_msgs/String")
-    answer: Any = await world.ask("registerPublisher", "/far", *call, "http://robot2:4000/")
-    assert answer[0] == 0
-    assert (
-        "10.0.0.5 registers /far at http://robot2:4000/, but has no node on port 4000: a node registers"
-        in answer[1]
-    )
-    assert world.records.pairs[-1] == ("deny", "/t")
-    assert world.registry.all() == []
+    call, uri = ("std_msgs/String",), "http://robot2:4000/"
+    await world.ask("registerPublisher", "/voice", "/t", *call, "http://10.0.0.5:4009/")
+    for service in ("/far/get_loggers", "/far/set_logger_level", "/far/tf2_frames"):
+        assert (await world.ask("registerService", "/far", service, "rosrpc://robot2:5/", uri))[0] == 1  # type: ignore[index]
+    assert (await world.ask("registerPublisher", "/far", "/rosout", "rosgraph_msgs/Log", uri))[0] == 1  # type: ignore[index]
+    assert [node.name for node in world.registry.live()] == ["/voice"], "these are not registered"
+    answer: Any = await world.ask("registerSubscriber", "/far", "/t", *call, uri)
+    assert (answer[0], len(answer[2])) == (1, 1)
+    for name, *rest in (("registerPublisher", "/t", *call), ("registerService", "/s", "rosrpc://robot2:5/")):
+        answer = await world.ask(name, "/far", *rest, uri)
+        assert answer[0] == 0
+        assert (
+            "10.0.0.5 registers /far at http://robot2:4000/, but has no node on port 4000: behind"
+            in answer[1]
+        )
+        assert all(way in answer[1] for way in ("--network host", "ROS_IP=10.0.0.5", "a tunnel"))
+        assert world.records.pairs[-1] == ("deny", rest[0])
     # A node with another address of its machine in its URI has its port open; the caller's own address needs no check.
-    for node, uri in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):
-        assert (await world.ask("registerPublisher", node, *call, uri))[0] == 1  # type: ignore[index]  # an answer is a list
+    for node, api in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):
+        assert (await world.ask("registerPublisher", node, "/t", *call, api))[0] == 1  # type: ignore[index]  # an answer is a list
+
+
+@pytest.mark.parametrize("method", ["registerSubscriber", "registerPublisher"])
+async def test_nodes_of_another_master_are_refused(method: str) -> None:
+    world = await ControlParts.begun()
+    world.nodes.gone.add("/far")
+    part: Value = {"methodName": method, "params": ["/far", "/t", "std_msgs/String", "http://robot2:4000/"]}
+    answer: Any = await world.ask("system.multicall", [part])
+    code, text, _value = answer[0][0]
+    assert (code, "multimaster_fkie" in text, world.registry.all()) == (0, True, [])
 
 
 @pytest.mark.parametrize("lost", [False, True])

@@ -62,6 +62,17 @@ class Post:
             self.delivery.push_list(self.incarnation, topic, tuple(publishers))
 
 
+async def test_nothing_waits_for_a_node_that_cannot_be_called() -> None:
+    post = Post()
+    post.incarnation.reached = False
+    post.push("/t", publishers=LONG)
+    post.delivery.push(post.incarnation, NodeCall("paramUpdate", ("/a/", 1)))
+    post.delivery.push_unasked(post.incarnation, "/a", NodeCall("paramUpdate", ("/a/", 1)))
+    post.answers.set()
+    await post.world.settle()
+    assert (post.delivery.waiting, post.heard) == (0, [])
+
+
 async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
     post = Post(queued=Bounds(100_000, 100_000, 0, 0))
     post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)

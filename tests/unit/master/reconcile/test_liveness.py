@@ -4,6 +4,8 @@ import ipaddress
 import pytest
 
 from appliance.base.clock import using
+from appliance.channel import messages
+from appliance.configuration import settings
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reconcile import liveness
 from appliance.master.reconcile.liveness import Presence
@@ -143,3 +145,50 @@ async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
         await asyncio.sleep(1)
     silence.set()
     await world.settle()
+
+
+@pytest.mark.parametrize("kind", [Kind.SUBSCRIPTION, Kind.PUBLICATION])
+async def test_a_node_that_was_never_reached_is_there_while_it_is_connected(
+    monkeypatch: pytest.MonkeyPatch, kind: Kind
+) -> None:
+    monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
+    world = ControlParts(silent=20.0)
+    await world.round()
+    node, voice = world.node("/n"), world.node("/voice", 2)
+    await world.register(voice, Kind.PUBLICATION, "/t")
+    await world.register(node, kind, "/t")
+    world.nodes.gone.add("/n")
+    world.carried.opened(0, messages.ConnectionOpened(1, voice.key, "/t", "topic", str(node.host), "/n"))
+    await world.look(node)
+    if kind is Kind.PUBLICATION:
+        assert node.life is Life.SHADOW, "a publisher must answer"
+        return
+    assert (node.life, node.reached) == (Life.LIVE, False)
+    assert (await world.liveness.probe(node)).presence is Presence.ANSWERS
+    world.carried.lost(0)
+    assert (await world.liveness.probe(node)).presence is Presence.GONE
+    await world.look(node)
+    assert node.life is Life.LIVE, "it may connect again"
+    world.liveness.settings = settings.LivenessSection(silent=0.0)
+    await world.look(node)
+    assert world.lives == [Life.LIVE], "the node is forgotten"
+    assert world.records.pairs[-1][0] == "node lost"
+
+
+@pytest.mark.parametrize("registers", [False, True])
+async def test_a_node_that_answers_later_gets_what_it_missed(registers: bool) -> None:
+    world = ControlParts(silent=20.0)
+    await world.round()
+    node, voice = world.node("/n"), world.node("/voice", 2)
+    await world.register(node, Kind.SUBSCRIPTION, "/t")
+    node.reached = False
+    await world.register(voice, Kind.PUBLICATION, "/t")
+    await world.settle()
+    world.deliveries.told.clear()
+    if registers:
+        assert await world.ask("registerPublisher", "/n", "/more", "std_msgs/String", node.api_text)
+        await world.settle()
+    else:
+        await world.look(node)
+    assert node.reached
+    assert {method for name, method, _given in world.deliveries.told if name == "/n"} == {"publisherUpdate"}
