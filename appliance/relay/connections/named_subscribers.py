@@ -1,8 +1,11 @@
-"""Extra connections that show a publisher the names of its subscribers; only action topics need them.
+"""Extra connections to a publisher: for its subscribers' names, and for its greeting of a new subscriber.
 
-An action client waits until *its server* subscribes to its goals and cancellations, and recognizes the server by the
-`callerid` of the status messages (actionlib, `wait_for_server`). An extra connection opens after the relay has begun
-to serve the subscriber, so the subscriber misses nothing that the publisher sends from then on.
+Only action topics need names. An action client waits until *its server* subscribes to its goals and cancellations, and
+recognizes the server by the `callerid` of the status messages (actionlib, `wait_for_server`). An extra connection opens
+after the relay has begun to serve the subscriber, which so misses nothing that the publisher sends from then on.
+
+Some publishers send a message to each new subscriber alone, from their connect callback (costmap_2d). `Greeting` opens
+a connection for a moment, and returns what comes.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -11,12 +14,16 @@ from functools import partial
 from appliance.relay.connections.served_subscribers import TopicSubscriber
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
+from appliance.relay.transport.memory import HeldBytes
+from appliance.relay.transport.pump import walk
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
-from roswire.tcpros import encode_header
+from roswire.errors import PeerError
+from roswire.tcpros import HeaderParser, encode_header
 
 _GOAL = "ActionGoal"
 _CANCEL = "actionlib_msgs/GoalID"
 _RETRY_SECONDS = 1.0
+_GREETING_SECONDS = 0.1  # after the header, or since the last bytes of an unfinished message
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
@@ -59,7 +66,7 @@ class ActionServers:
 
 
 class NamedSubscribers:
-    """The extra connections to one publisher of one topic. Messages on them are discarded."""
+    """The extra connections to one publisher of one topic. Messages on them are discarded, except greetings."""
 
     def __init__(self, context: RelayContext, topic: str, host: str) -> None:
         self._context = context
@@ -71,6 +78,7 @@ class NamedSubscribers:
         self._streams: dict[str, BufferedSocket] = {}
         self._retry: LoopTimer | None = None
         self._announcing: LoopTimer | None = None
+        self._greeting: Greeting | None = None
 
     def open(self, address: tuple[str, int], accepted: Mapping[str, str]) -> None:
         self._address, self._accepted = address, accepted
@@ -78,6 +86,16 @@ class NamedSubscribers:
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
         if self._address is not None and looks_for_names(type_name) and self._announcing is None:
             self._announcing = self._context.loop.after(0, lambda: self._show(names()))
+
+    def greet(self, fields: Mapping[str, str], greeted: Callable[[bytes], None]) -> None:
+        """Call `greeted` with what comes on one more connection, unless `close` is called before."""
+        if self._greeting is not None:
+            self._greeting.close()
+        if self._address is not None:
+            try:
+                self._greeting = Greeting(self._context, self._host, self._address, fields, greeted)
+            except (OSError, OverflowError):
+                greeted(b"")
 
     def _show(self, names: frozenset[str]) -> None:
         self._announcing = None
@@ -88,6 +106,9 @@ class NamedSubscribers:
 
     def close(self) -> None:
         self._wanted, self._address = frozenset(), None
+        if self._greeting is not None:
+            self._greeting.close()
+            self._greeting = None
         for stream in self._streams.values():
             stream.close()
         self._streams.clear()
@@ -131,3 +152,79 @@ class NamedSubscribers:
     def _try_again(self) -> None:
         if self._retry is None:
             self._retry = self._context.loop.after(_RETRY_SECONDS, self._open_missing)
+
+
+class Greeting:
+    """A connection to a publisher, until it has been silent for a moment; `ended(frames)` is called once after it.
+
+    The memory of the publisher's host counts the frames. Without memory, or after a failure, they are empty. Raises
+    `OSError` or `OverflowError` for an address that cannot be used.
+    """
+
+    def __init__(
+        self,
+        context: RelayContext,
+        host: str,
+        address: tuple[str, int],
+        fields: Mapping[str, str],
+        ended: Callable[[bytes], None],
+    ) -> None:
+        self._context = context
+        sock = begin_connect(*address)
+        self._parser: HeaderParser | None = HeaderParser(context.limits.header_bytes)
+        self._held = HeldBytes(context.memory.frames.of(host))
+        self._data, self._seen = bytearray(), 0
+        self._ended = ended
+        self._timer = context.loop.after(context.limits.connect_seconds, self._fail)
+        self._stream = BufferedSocket(
+            context.loop,
+            sock,
+            self._received,
+            lambda _reason: self._fail(),
+            payer=context.payer(host),
+            opened=lambda: self._stream.send(encode_header(fields)),
+        )
+
+    def close(self) -> None:
+        self._timer.cancel()
+        self._stream.close()
+        self._held.set(0)
+
+    def _received(self, data: bytes) -> None:
+        if not data:
+            self._fail()
+            return
+        if self._parser is not None:
+            try:
+                header = self._parser.feed(data)
+            except PeerError:
+                self._fail()
+                return
+            if header is None:
+                return
+            data, self._parser = self._parser.rest, None
+            self._wait()
+        if self._held.share.refusal(len(data)) or len(self._data) > self._context.limits.message_bytes:
+            self._fail()
+            return
+        self._data += data
+        self._held.set(len(self._data))
+
+    def _wait(self) -> None:
+        self._timer.cancel()
+        self._timer = self._context.loop.after(_GREETING_SECONDS, self._look)
+
+    def _look(self) -> None:
+        whole = walk(memoryview(self._data))[0]
+        if whole < len(self._data) != self._seen:
+            self._seen = len(self._data)
+            self._wait()
+        else:
+            self._end(bytes(self._data[:whole]))
+
+    def _fail(self) -> None:
+        self._end(b"")
+
+    def _end(self, frames: bytes) -> None:
+        self.close()
+        self._ended(frames)

@@ -16,6 +16,11 @@ subscriber makes the relay reconnect to the publisher; the other subscribers the
 command (a message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after
 it was refused.
 
+A publisher may greet each new subscriber with a message, from its connect callback (costmap_2d). For a later subscriber
+of a topic that is quiet, the relay opens an extra connection for a moment, and passes what comes to the newcomers
+alone, through monitors. It does so at most once a second, and once a minute if no greeting came twice in a row. A topic
+that sends within that moment does not greet. A command is never requested in this way.
+
 Messages of a topic with a rank pass while their publisher is heard (`give_rank`). A message that was taken before a
 hand-over, and waits for monitors, does not pass after it; nor does a latched one.
 
@@ -37,9 +42,12 @@ from appliance.relay.connections.startup_replay import APPEARED, LatchReplay, St
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
-from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
+from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version, walk
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 from roswire.tcpros import encode_frame
+
+_QUIET_SECONDS = 1.0  # without a message before a publisher is asked for a greeting
+_UNGREETED_SECONDS = 60.0  # between two requests to a publisher that does not greet
 
 # The last message of a latching publisher, kept in the memory of the publisher's host.
 
@@ -115,6 +123,48 @@ class LatchedMessage:
             self._refused(size)
 
 
+class Newcomers:
+    """The `members` that may need a greeting, each with the number of the next message when it came."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.members: dict[TopicSubscriber, int] = {}
+        self._heard = 0, 0.0  # the number of the next message, and since when it has been that
+        self._not_before = 0.0
+        self._ungreeted = 0  # requests in a row without a greeting
+
+    def heard(self, following: int, now: float) -> None:
+        if following != self._heard[0]:
+            self._heard = following, now
+
+    def due(self, following: int, now: float) -> bool:
+        passed, since = self._heard
+        return (
+            bool(self.members)
+            and following == passed
+            and now >= max(since + _QUIET_SECONDS, self._not_before)
+        )
+
+    def take(self, following: int, now: float) -> Collection[TopicSubscriber]:
+        """Return the members that have got no message since they came; no others are due until `asked`."""
+        members = {member: first for member, first in self.members.items() if first == following}
+        self.members.clear()
+        if members:
+            self._not_before = now + _UNGREETED_SECONDS
+        return members
+
+    def asked(self, now: float, *, greeted: bool) -> None:
+        self._ungreeted = 0 if greeted else self._ungreeted + 1
+        self._not_before = now + (_QUIET_SECONDS if self._ungreeted < 2 else _UNGREETED_SECONDS)
+
+    def wait_on(self, following: int, now: float) -> None:
+        """Let those who came during a greeting wait for the next one."""
+        self._heard = following, now
+        self.members = dict.fromkeys(self.members, following)
+
+
 class Upstream:
     """The connection to the publisher, as its topic uses it. The methods of this base class do nothing."""
 
@@ -131,6 +181,9 @@ class Upstream:
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
         """Report new subscribers; `names` is called after this turn of the loop."""
+
+    def greet(self, greeted: Callable[[bytes], None]) -> None:
+        """Call `greeted` with the frames of one more connection, unless the upstream is lost before."""
 
     def request_latched(self) -> None:
         """Make a latching publisher send its message again."""
@@ -237,6 +290,7 @@ class RelayedTopic:
         self._superseded = False  # whether a guard's stop is the last message
         self._is_command = topic.endswith("/goal")  # no monitor can declare what stops an action
         self._rank: RankedPublication | None = None
+        self._newcomers = Newcomers()
 
     @property
     def point(self) -> ObservationPoint:
@@ -250,12 +304,14 @@ class RelayedTopic:
     def join(self, member: TopicSubscriber) -> None:
         if self._header is None:
             self._waiting[member] = None
-        else:
-            self._serve(member, self._header)
+        elif not self._serve(member, self._header):
+            self._newcomers.members[member] = self.counters.following
+            self._greet()
         self.upstream.connect()
 
     def leave(self, member: TopicSubscriber) -> None:
         self._waiting.pop(member, None)
+        self._newcomers.members.pop(member, None)
         self._served.remove(member)
         self.differs()
         self.announce()
@@ -379,6 +435,7 @@ class RelayedTopic:
         before, self._header = self._header, header
         self.latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
+        self._newcomers.reset()
         if self._rank is not None:
             self._rank.opened(header, self._clock())
         # With a rank, a latched message may be older than a hand-back.
@@ -575,7 +632,39 @@ class RelayedTopic:
                 if member.missed:
                     self._served.deliver(self.latch.batch, member)
         self._served.trim(stalled=True)
+        self._newcomers.heard(self.counters.following, now)
+        self._greet()
         self.upstream.check_stall()
+
+    def _greet(self) -> None:
+        """Ask for a greeting of the served newcomers that have got no message since they came."""
+        following = self.counters.following
+        if not self._newcomers.due(following, self._clock()):
+            return
+        commands = self._is_command or self._superseded or self._rank is not None
+        if self._state is not TopicState.OPEN or self.latch.is_latching or self.flow.limits or commands:
+            self._newcomers.members.clear()
+        elif members := self._newcomers.take(following, self._clock()):
+            self.upstream.greet(lambda frames: self._greeted(members, following, frames))
+
+    def _greeted(self, members: Collection[TopicSubscriber], before: int, frames: bytes) -> None:
+        is_stream = self.counters.following != before  # a message for all, which came over both connections
+        self._newcomers.asked(self._clock(), greeted=bool(frames) or is_stream)
+        if is_stream or not frames:
+            return
+        batch = Batch(memoryview(frames), walk(memoryview(frames))[1], None, owned=True)
+        batch.first = before
+        self.counters.add(batch.messages, len(frames))
+        self._reported = False
+        self._newcomers.wait_on(self.counters.following, self._clock())
+        if self._stream is not None:
+            self._stream.write(batch.view, batch.messages, before)
+        through = self._monitoring.through
+        passing = batch if through is None else through(batch)
+        if passing is not None:
+            for member in self._served.row:
+                if member in members:
+                    self._served.deliver(passing, member)
 
     def traffic(self) -> TopicTraffic | None:
         if self._reported and not self.counters.messages and not self._served.dropped:
@@ -596,9 +685,11 @@ class RelayedTopic:
         self._reported = True
         return row
 
-    def _serve(self, member: TopicSubscriber, header: Mapping[str, str]) -> None:
+    def _serve(self, member: TopicSubscriber, header: Mapping[str, str]) -> bool:
+        """Return whether the subscriber has ended, or has got an earlier message."""
+        given = True
         if not member.greet(header):
-            return
+            return given
         self._served.add(member)
         self.differs()
         self.announce()
@@ -608,10 +699,13 @@ class RelayedTopic:
         elif self.latch.is_refused:
             if self.latch.is_asked_again and not self._is_command:
                 self.upstream.request_latched()
-        elif self._startup_replay.keeps:
-            for batch in self._startup_replay.give(member.caller_id, self._clock()):
+        else:
+            batches = self._startup_replay.give(member.caller_id, self._clock())
+            for batch in batches:
                 self._served.deliver(batch, member)
+            given = bool(batches)
         self.relieve()
+        return given
 
     def _forget_header(self) -> None:
         if self._state is TopicState.LOST and not self._served and not self._superseded:

@@ -27,6 +27,7 @@ from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, encode_header
 
 _CALLER_ID = "/rosrv"
+_NEWCOMER_ID = "/rosrv_newcomer"  # another one: rospy drops an earlier connection of the same name
 _REASON = 1000  # most characters of a reported error; a publisher chooses the text in its header
 
 
@@ -149,6 +150,9 @@ class PublisherConnection(Upstream):
             self._drop_connection()
             self.ask()
 
+    def greet(self, greeted: Callable[[bytes], None]) -> None:
+        self._named_subscribers.greet({**self._fields, "callerid": _NEWCOMER_ID}, greeted)
+
     def recheck(self) -> None:
         """Disconnect a publisher that the specifications now reject, or retry a rejected one.
 
@@ -164,15 +168,18 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def _connected(self) -> None:
-        fields = {
+        if self._attempt is not None:
+            self.state = UpstreamState.GREETING
+            self._attempt.stream.send(encode_header(self._fields))
+
+    @property
+    def _fields(self) -> dict[str, str]:
+        return {
             "callerid": _CALLER_ID,
             "topic": self._topic.topic,
             **self._headers.fields,
             "tcp_nodelay": "1",
         }
-        if self._attempt is not None:
-            self.state = UpstreamState.GREETING
-            self._attempt.stream.send(encode_header(fields))
 
     def _header_received(self, data: bytes) -> None:
         attempt = self._attempt

@@ -1,12 +1,14 @@
+import contextlib
 import socket
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.relay.connections.named_subscribers import NamedSubscribers, looks_for_names
+from appliance.relay.connections.named_subscribers import Greeting, NamedSubscribers, looks_for_names
 from appliance.relay.loop import EventLoop
-from roswire.tcpros import HeaderParser
+from appliance.relay.relay_limits import MIB, RelayLimits
+from roswire.tcpros import HeaderParser, encode_frame, encode_header
 from tests.unit.relay.contexts import context_of
 
 GOAL = "actionlib_tutorials/FibonacciActionGoal"
@@ -110,3 +112,30 @@ def test_a_presence_that_breaks_is_made_again(
 )
 def test_only_the_topics_of_actions_need_names(type_name: str, named: bool) -> None:
     assert looks_for_names(type_name) is named
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("sent", [b"", b"map", b"a long map", b"torn", b"too long", b"closed"])
+def test_a_greeting_is_what_comes_at_once(loop: EventLoop, publisher: socket.socket, sent: bytes) -> None:
+    ended: list[bytes] = []
+    limits = RelayLimits(memory_bytes=MIB) if sent == b"too long" else RelayLimits()
+    context = context_of(loop, limits, named_hosts=("10.0.0.9",))
+    Greeting(context, "10.0.0.9", publisher.getsockname(), {"callerid": "/rosrv", **ACCEPTED}, ended.append)
+    sock, header = accept(loop, publisher)
+    assert header["callerid"] == "/rosrv"
+    frame = encode_frame(sent * (MIB if sent in {b"a long map", b"too long"} else 1)) if sent else b""
+    sock.setblocking(False)
+    data = encode_header(ACCEPTED) + (frame[:-1] if sent == b"torn" else frame)
+
+    def over() -> bool:
+        nonlocal data
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            data = data[sock.send(data) :] if data else data
+        if sent == b"closed":
+            sock.close()
+        return bool(ended)
+
+    turn_until(loop, over)
+    assert ended == [frame if sent in {b"map", b"a long map"} else b""]
+    assert context.memory.frames.of("10.0.0.9").used == 0
+    sock.close()

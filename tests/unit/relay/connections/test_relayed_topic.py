@@ -50,6 +50,10 @@ class RecordedUpstream(Upstream):
     def request_latched(self) -> None:
         self.asked.append("give again")
 
+    def greet(self, greeted: Callable[[bytes], None]) -> None:
+        self.asked.append("greet")
+        self.greeted = greeted
+
 
 class RecordedMember:
     def __init__(self, *, fits: bool = True, caller_id: str = "/listener", host: str = "10.0.0.2") -> None:
@@ -133,6 +137,80 @@ class Story:
         member = RecordedMember(caller_id=caller_id)
         self.topic.join(member)
         return member
+
+
+def greeting(story: Story) -> bool:
+    """Let two seconds pass; return whether the publisher was asked to greet."""
+    story.upstream.asked.clear()
+    for _second in range(2):
+        story.topic.tidy()
+        story.now += 1
+    story.topic.tidy()
+    return "greet" in story.upstream.asked
+
+
+def test_a_publisher_greets_later_subscribers_alone() -> None:
+    story, judged = Story(), []
+    first = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"map"))
+    assert not greeting(story), "no subscriber came later"
+    story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # the call is noted
+    second, third = story.join("/second"), story.join("/third")
+    assert story.upstream.asked.count("greet") == 1, "one greeting at a time"
+    story.upstream.greeted(bytes(batch(b"map").view))
+    assert (second.received, third.received, judged) == (bytes(batch(b"map").view), b"", [2])
+    assert greeting(story)
+    story.upstream.greeted(bytes(batch(b"map", b"more").view))
+    assert third.received == bytes(batch(b"map", b"more").view)
+    assert first.received == second.received == bytes(batch(b"map").view)
+    assert not greeting(story)
+    story.topic.leave(fourth := story.join("/fourth"))
+    story.upstream.greeted(bytes(batch(b"late").view))
+    assert (fourth.received, first.received) == (b"", bytes(batch(b"map").view))
+
+
+def test_a_publisher_that_does_not_greet_is_asked_once_a_minute() -> None:
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    asked = 0
+    for _second in range(200):  # a subscriber that joins and leaves
+        story.upstream.asked.clear()
+        member = story.join("/other")
+        story.topic.tidy()
+        if "greet" in story.upstream.asked:
+            asked += 1
+            story.upstream.greeted(b"")
+        story.topic.leave(member)
+        story.now += 1
+    assert asked == 5
+
+
+@pytest.mark.parametrize("why", ["latching", "stream", "goal", "guarded", "limited", "same"])
+def test_no_greeting(why: str) -> None:
+    story = Story("/a/goal" if why == "goal" else "/map")
+    story.join()
+    story.topic.monitor(lambda batch: batch, wanted=False, guarded=why == "guarded")
+    if why == "limited":
+        story.topic.flow.set(SharedRateLimit(FlowLimit(messages=2), story.now).of(""), None)
+    story.topic.upstream_opened(HEADER | ({"latching": "1"} if why == "latching" else {}))
+    greeting(story)
+    late = story.join("/late")
+    if why == "stream":
+        story.upstream.asked.clear()
+        for _message in range(60):
+            story.receive(batch(b"1"))
+            story.now += 0.05
+            late = story.join("/late")
+            if not _message % 20:
+                story.topic.tidy()
+    if why == "same":  # a message to all, which comes over both connections
+        story.receive(batch(b"1"))
+        story.upstream.greeted(bytes(batch(b"1").view))
+        assert late.received == bytes(batch(b"1").view)
+    else:
+        assert "greet" not in story.upstream.asked
 
 
 def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_name() -> None:
