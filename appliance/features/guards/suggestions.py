@@ -218,6 +218,11 @@ class _Writer:
             (topic.name, topic.type) for topic in self.graph.topics if topic.publishers
         }:  # fmt: skip
             self._add("answer", goal)
+        for node in sorted({*goal.publishers} & {*goal.subscribers}):
+            self._say(
+                f"{node} also publishes {goal.name} to itself, as move_base does with the goals of rviz"
+                " (/move_base_simple/goal): no guard gets these"
+            )
 
     def add_joystick(self, command: TopicFacts) -> None:
         """Propose to stop a command whose joystick is silent: some teleoperations repeat its last value."""
