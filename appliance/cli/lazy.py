@@ -4,7 +4,6 @@ import functools
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterable
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import typer
@@ -114,15 +113,23 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
         def resolve_command(
             self, ctx: "Context", args: list[str]
         ) -> "tuple[str | None, Command | None, list[str]]":
-            name = args[0]
-            if name in self.own_commands:
-                return super().resolve_command(ctx, args)
-            if name not in self.commands and name[:1] != "-" and not get_close_matches(name, self.commands):
-                shown = [verb for verb, command in self.commands.items() if not command.hidden]
-                ctx.fail(f"No such command {name!r}; use one of: {', '.join(shown)}.")
+            known = args[0] in self.own_commands or args[0][:1] == "-" or args[0] in self.commands
+            if not known and not ctx.resilient_parsing:
+                raise _unknown(args[0], ctx, joined(verbs, *further()))
             return super().resolve_command(ctx, args)
 
     return _Lazy
+
+
+def _unknown(word: str, ctx: "Context", verbs: Verbs) -> typer.Exit:
+    from appliance.cli.meanings import answer_to  # noqa: PLC0415  a correct command line does not need it
+    from appliance.cli.output import usage_error  # noqa: PLC0415  as above
+
+    groups = []
+    while ctx.parent is not None:
+        groups.insert(0, str(ctx.info_name))
+        ctx = ctx.parent
+    return usage_error(answer_to(word, " ".join(groups), verbs))
 
 
 def _command_of(
