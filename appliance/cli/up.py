@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import setproctitle
 import structlog
 import typer
 
@@ -144,7 +143,6 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     }
     configure_logs("supervisor")  # first: an error must not wait for a reader either
     settings = resolve(config, os.environ, flags)
-    setproctitle.setproctitle("rosrv: supervisor")
     pairing = pairing_in(settings.state)
     node_ports = read_inputs(settings, None if pairing is None else pairing.robot)
     run_appliance(

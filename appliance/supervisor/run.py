@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
+import setproctitle
 import structlog
 
 from appliance.base import clock
@@ -280,6 +281,7 @@ def _run(
     manager = ServiceManager.of(os.environ)
     manager.starting("locks its state, builds its firewall")
     state = StateDirectory(settings.state)
+    setproctitle.setproctitle("rosrv: supervisor")  # until the lock names this process, its command line does
     try:
         settings = _with_ports(settings)
         master = settings.listen_address[1]

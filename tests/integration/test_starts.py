@@ -1,8 +1,11 @@
 import json
 import os
+import shutil
+import threading
 
 import pytest
 
+from appliance.cli.connection.starting import starting
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.rosmaster import master_at
 from tests.support.small_disk import small_disk
@@ -57,3 +60,25 @@ def test_a_start_on_a_nearly_full_disk_serves_the_robot(left: int) -> None:
             appliance.stop()
     finally:
         appliance.close()
+
+
+def test_a_command_during_a_start_says_that_the_appliance_starts() -> None:
+    """From the first import to the first answer, also at the first start, no command says that none runs."""
+    with Appliance() as appliance:
+        for first in (False, True):
+            appliance.stop()
+            if first:
+                shutil.rmtree(appliance.state)
+            begun = threading.Thread(target=appliance.start)
+            begun.start()
+            eventually(lambda: starting(appliance.state), appliance.story)
+            said = []
+            while begun.is_alive():
+                done = appliance.rosrv("limits", check=False)
+                said.append(done.stderr)
+                assert done.returncode == (2 if "try again in a few seconds" in done.stderr else 0), (
+                    done.stderr
+                )
+            begun.join()
+            assert any("the appliance is starting" in text for text in said)
+            assert appliance.rosrv("limits").stderr == ""

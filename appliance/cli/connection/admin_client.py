@@ -1,11 +1,17 @@
 """The client of the admin socket in the state directory, which only its owner and root may use."""
 
+import fcntl
+import select
 import socket
+import struct
+import termios
 from pathlib import Path
 
 import msgspec
+import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, StatusWanted, decode
+from appliance.cli.connection.starting import starting, starting_for
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
@@ -13,6 +19,7 @@ SECONDS = 60.0
 QUICK_SECONDS = 2.0
 """A short time limit, because an appliance that hangs must not keep an operator from reading the log."""
 _GRACE_SECONDS = 10.0
+_PATIENCE_SECONDS = 1.0
 UNKNOWN = (
     "the change may have taken effect; if it has not by now, it never will. List recent changes:"
     " rosrv audit search --since 5m"
@@ -41,12 +48,18 @@ class AccessDeniedError(NotRunningError):
 
 
 class AdminSocket:
-    """A client of the admin socket; a request is withdrawn after `seconds`; its outcome may take `grace` seconds."""
+    """A client of the admin socket; a request is withdrawn after `seconds`; its outcome may take `grace` seconds.
 
-    def __init__(self, state: Path, seconds: float = SECONDS, grace: float = _GRACE_SECONDS) -> None:
+    `tells`: print that a request waits for the appliance's start.
+    """
+
+    def __init__(
+        self, state: Path, seconds: float = SECONDS, grace: float = _GRACE_SECONDS, *, tells: bool = False
+    ) -> None:
         self.state = state
         self._seconds = seconds
         self._grace = grace
+        self._tells = tells
 
     def robot_name(self) -> str:
         try:
@@ -60,25 +73,23 @@ class AdminSocket:
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
-            raise NotRunningError(
-                f"{self.state}: no such directory; give the appliance's state directory with --state"
-            )
+            raise self._absent("no such directory; give the appliance's state directory with --state")
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
                 sock.settimeout(self._seconds)
                 sock.connect(str(path))
                 sock.sendall(line + b"\n")
+                if self._tells:
+                    self._say_that_it_starts(sock)
                 answer = self._read(sock)
         except FileNotFoundError:
-            raise NotRunningError(
-                f"{self.state}: no appliance is running with this state directory; start it: rosrv up"
+            raise self._absent(
+                "no appliance is running with this state directory; start it: rosrv up"
             ) from None
         except PermissionError:
             raise AccessDeniedError(f"{path}: only its owner and root have access; use sudo") from None
         except ConnectionRefusedError:
-            raise NotRunningError(
-                f"{self.state}: the appliance that used this state directory has stopped"
-            ) from None
+            raise self._absent("the appliance that used this state directory has stopped") from None
         except TimeoutError:
             text = f"{path}: the appliance did not answer within {self._seconds:g} s"
             raise NotRunningError(f"{text}; {UNKNOWN}") from None
@@ -88,6 +99,20 @@ class AdminSocket:
             return decode(answer, request)
         except ValueError as error:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
+
+    def _absent(self, reason: str) -> NotRunningError:
+        return NotRunningError(f"{self.state}: {starting(self.state) or reason}")
+
+    def _say_that_it_starts(self, sock: socket.socket) -> None:
+        """Wait a second for the answer; then print that it waits, if no process has read the request during a start."""
+        if select.select([sock], [], [], _PATIENCE_SECONDS)[0]:
+            return
+        unread = struct.unpack("i", fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)))[0]
+        age = starting_for(self.state) if unread else None
+        if age is not None:
+            typer.echo(
+                f"rosrv: the appliance is starting, for {age:.0f} s now: waiting for its answer", err=True
+            )
 
     def _read(self, sock: socket.socket) -> bytes:
         line = bytearray()

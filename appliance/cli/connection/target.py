@@ -229,7 +229,7 @@ def _choose(
     if api is None or "state" in typed:
         if "api_ca" in typed:
             raise usage_error("--api-ca needs --api URL")
-        return _Target(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
+        return _Target(AdminSocket(state, tells=True), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
     from appliance.cli.connection.rest_orders import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
