@@ -125,7 +125,7 @@ def _unknown(word: str, ctx: "Context", verbs: Verbs) -> typer.Exit:
     from appliance.cli.meanings import answer_to  # noqa: PLC0415  a correct command line does not need it
     from appliance.cli.output import usage_error  # noqa: PLC0415  as above
 
-    groups = []
+    groups: list[str] = []
     while ctx.parent is not None:
         groups.insert(0, str(ctx.info_name))
         ctx = ctx.parent

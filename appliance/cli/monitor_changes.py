@@ -28,7 +28,10 @@ def say_replaced(body: Replaced | Replacement, enforce: str = "rosrv monitor enf
         if files
     ]
     what = "; ".join(parts) or "no difference"
-    say(f"revision {body.revision} of the specifications is in force (was {body.replaced}): {what}")
+    if body.revision == body.replaced:
+        say(f"no change: revision {body.revision} of the specifications stays in force")
+    else:
+        say(f"revision {body.revision} of the specifications is in force (was {body.replaced}): {what}")
     if body.moved:
         names = ", ".join(body.moved)
         say(f"{names} started in the initial state in another relay process", "yellow")

@@ -324,7 +324,10 @@ class SpecificationManager:
         )
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:
-        """Load the folder; files that are not in it stay in force, unless `prune` is set."""
+        """Load the folder; files that are not in it stay in force, unless `prune` is set.
+
+        The same texts make no new revision, unless one has an error or waits for a confirmation.
+        """
         async with self.present.changing(request.expected):
             if self._folder.path is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
@@ -334,6 +337,9 @@ class SpecificationManager:
             if kept:
                 sources = self.sources.with_files(sources)
             keeper = who if kept else DISK  # with `DISK`, the next start would read only the folder
+            same = sources == self.sources and (self.in_force.who == DISK) == (keeper == DISK)
+            if same and not broken(self.now) and self.confirm_by is None:
+                return self.present.replaced(self.revision, kept=kept)
             added, changed, _removed = sources.difference(self.sources)
             shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
             consent = Consent(request.force, request.hold)

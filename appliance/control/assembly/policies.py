@@ -159,7 +159,8 @@ class Policies(Revisions[RevisionRow]):
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        The revision is recorded as loaded from disk; its note names who ordered it.
+        The text in force makes no new revision, unless it waits for a confirmation. Others are recorded as loaded
+        from disk; the note names who ordered it.
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self.changing(request.expected):
@@ -168,6 +169,11 @@ class Policies(Revisions[RevisionRow]):
             except PolicyRefusedError as error:
                 self._note_refused(error.findings[0])
                 raise
+            now = self.in_force
+            equal = (now.who, now.text, now.signature) == (DISK, policy.text, signature)
+            if equal and self.confirm_by is None:
+                self._note_refused("")
+                return self._loaded(self.revision, 0)
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
     async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:

@@ -40,8 +40,13 @@ class HandledAlarms:
         row = self._rows.get(kind)
         return "not handled" if row is None else "acknowledged" if row.until is None else "silenced"
 
-    def acknowledge(self, kind: str, who: str, note: str) -> None:
+    def acknowledge(self, kind: str, who: str, note: str) -> bool:
+        """Return False if the same person has acknowledged it with the same note."""
+        row = self._rows.get(kind)
+        if row is not None and (row.who, row.until, row.note) == (who, None, note):
+            return False
         self._keep({**self._rows, kind: HandledAlarm(kind, who, clock.wall(), None, note)})
+        return True
 
     def silence(self, kind: str, who: str, note: str, seconds: float) -> float:
         """Silence an alarm; return the end in seconds since the epoch."""

@@ -30,7 +30,8 @@ class AlarmOrders:
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
         self._must_be_present(request.kind)
         kind, earlier = request.kind, self._handled.state(request.kind)
-        self._handled.acknowledge(kind, who, request.note)
+        if not self._handled.acknowledge(kind, who, request.note):
+            return self._list()
         text = f"{kind} is acknowledged"
         self._record("alarm acknowledged", text, kind, who, request.note, earlier=earlier)
         return self._list()

@@ -118,7 +118,7 @@ class RankedGroups:
         if driver.standing == "moving":
             raise SenselessError(f"{driver.node} moves {group.name}: it hands it back when it lets go")
         if driver.standing == "free":
-            raise SenselessError(f"{group.name} is free: the next node that moves drives")
+            return
         self._freed_by = who
         try:
             freed = self._relay.ranks.free(group.topic)

@@ -97,6 +97,9 @@ class BlockOrders:
             planned = HostBlockRow(str(address), clock.wall(), who, request.note)
             until = None if request.for_seconds is None else planned.since + request.for_seconds
             return self._answer(replace(self._row(planned), until=until), before, replaced)
+        endless = replaced is not None and replaced.until is None and request.for_seconds is None
+        if replaced is not None and endless and request.note in ("", replaced.note):  # the same block
+            return self._answer(replaced, requests.BlockEnded(0, 0, 0, 0, 0), replaced)
         take_effect()
         row = self._blocks.put(address, seconds=request.for_seconds, who=who, note=request.note)
         self._policies.decide_again()

@@ -81,7 +81,7 @@ class HostBlock(AdminRequest[HostBlocked], frozen=True, tag="host block"):
     """Block a host at every entrance, and end its registrations, connections, sessions and tunnel, for `for_seconds`,
     or until `DELETE`.
 
-    The block of a host that is already blocked is replaced.
+    The block of a host that is already blocked is replaced. The same block, without an end, changes nothing.
     """
 
     address: str

@@ -53,8 +53,8 @@ def block(
     """Block a host at once: refuse its calls and new connections, and end its registrations, connections, sessions
     and tunnel.
 
-    The block survives restarts. It ends after the given time, or with `rosrv host unblock`. Blocking it again
-    replaces the block.
+    The block survives restarts. It ends after the given time, or with `rosrv host unblock`. Another end or note
+    replaces the block; the same block changes nothing.
 
     Example: rosrv host block 10.0.0.7 --for 1h --note "strange traffic"
     """
@@ -65,6 +65,9 @@ def block(
         if body.until is not None
         else f"until `rosrv host unblock {body.address}`"
     )
+    if not dry_run and body.replaced is not None and body.replaced.since == body.since:
+        say(f"no change: {_named(body, running)} is blocked {end}")
+        return
     if dry_run:
         say(f"{_named(body, running)} would be blocked {end}; it would lose {_in_words(body.ended)}")
     else:

@@ -313,6 +313,8 @@ class GuardOrders:
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
         file, text = self._made(request)
+        if self._monitors.sources.files.get(file) == text:
+            return self._monitors.present.replaced(self._monitors.revision, loaded=[file]).in_lines()
         order = admin.MonitorLoad(
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
             shadow=request.shadow, hold=request.hold,
@@ -340,6 +342,8 @@ class GuardOrders:
 
     async def upgrade(self, request: guard_requests.GuardUpgrade, who: str) -> Replacement:
         monitors, name = self._monitors, request.name
+        if origin_of(self._guard(name)[1]) == "current":
+            return monitors.present.replaced(monitors.revision).in_lines()
         new = self._upgraded(name, request.topics)
         order = admin.MonitorLoad(
             {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
@@ -408,7 +412,8 @@ class GuardOrders:
             shadow = request.shadow or self._monitors.switches.starts_in_shadow
             text = text_of(replace(guard, switch="shadow" if shadow else "on"))
             file = f"{name}.rv"
-            if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
+            present = self._monitors.sources.files.get(file)
+            if present != text and (present is not None or name in self._monitors.checked.monitors):
                 raise GuardError(
                     f"a monitor {name} is loaded: give another name (--name), or change it: rosrv guard set {name}"
                     " VALUE=…"

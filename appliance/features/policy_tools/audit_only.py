@@ -14,6 +14,10 @@ class EnforceError(ValueError):
     """The sections cannot be enforced; the message says why."""
 
 
+class EnforcedAlreadyError(EnforceError):
+    """The sections are enforced, so nothing is to be changed."""
+
+
 class EnforcedText(NamedTuple):
     """A policy's text, and the sections that it enforces and the text before did not."""
 
@@ -39,8 +43,13 @@ def enforced(text: str, sections: Collection[str] = ()) -> EnforcedText:
     words = [] if entry is None else [word.text.strip("[]").casefold() for word in entry.values]
     lenient = list(_NAMES.values()) if "all" in words else [_NAMES[word] for word in words if word in _NAMES]
     if entry is None or not lenient:
-        raise EnforceError("no section of the policy is audit-only: all of them are enforced already")
-    chosen = [_section(name, lenient) for name in sections] or lenient
+        raise EnforcedAlreadyError("no section of the policy is audit-only: all of them are enforced already")
+    named = [_section(name) for name in sections]
+    chosen = [name for name in named if name in lenient] if named else lenient
+    if not chosen:
+        raise EnforcedAlreadyError(
+            f"{', '.join(named)}: enforced already; audit-only are: {', '.join(lenient)}"
+        )
     rest = [name for name in lenient if name not in chosen]
     lines = text.split("\n")
     place = entry.key.line - 1
@@ -53,10 +62,8 @@ def enforced(text: str, sections: Collection[str] = ()) -> EnforcedText:
     return EnforcedText("\n".join(lines), tuple(name for name in lenient if name in chosen))
 
 
-def _section(name: str, lenient: Collection[str]) -> str:
+def _section(name: str) -> str:
     section = _NAMES.get(name.strip("[]").casefold())
     if section is None:
         raise EnforceError(f"{name!a} is not a section that decides; these are: {', '.join(_NAMES.values())}")
-    if section not in lenient:
-        raise EnforceError(f"[{section}] is not audit-only; these are: {', '.join(lenient)}")
     return section

@@ -16,7 +16,12 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import refuse_beside_dry_run, say_json, write_told
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
-from appliance.features.policy_tools.audit_only import EnforcedText, EnforceError, enforced
+from appliance.features.policy_tools.audit_only import (
+    EnforcedAlreadyError,
+    EnforcedText,
+    EnforceError,
+    enforced,
+)
 from appliance.features.policy_tools.learn import Observation, needed_rights
 from appliance.features.policy_tools.live_verbs import say_loaded
 from appliance.features.policy_tools.policy_input import (
@@ -102,6 +107,12 @@ def enforce(
     body = body_in_force(appliance)
     try:
         change = enforced(body.text, sections or ())
+    except EnforcedAlreadyError as error:
+        if appliance.as_json:
+            say_json({"sections": [], "revision": body.revision, "replaced": body.revision})
+        else:
+            say(f"no change: {error}")
+        return
     except EnforceError as error:
         raise refused([f"rosrv policy: {error}"]) from None
     policy = compiled_with(change.text, body.file, context_of(body))

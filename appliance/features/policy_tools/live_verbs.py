@@ -57,7 +57,7 @@ def reload(
 ) -> None:
     """Reload the policy file: check it, run its tests, enforce it, and revoke rights that it no longer grants.
 
-    An invalid file changes nothing. All errors are shown, with exit status 1.
+    An invalid file changes nothing. All errors are shown, with exit status 1. The text in force makes no revision.
 
     Example: rosrv policy reload --confirm-within 5m
     """
@@ -70,9 +70,11 @@ def reload(
 def say_loaded(body: Loaded) -> None:
     for warning in body.warnings:
         say(warning, "yellow")
-    say(
-        f"revision {body.revision} is in force (was {body.replaced}); {counted(body.revoked, 'right')} revoked"
-    )
+    if body.revision == body.replaced:
+        say(f"no change: revision {body.revision} stays in force")
+    else:
+        revoked = counted(body.revoked, "right")
+        say(f"revision {body.revision} is in force (was {body.replaced}); {revoked} revoked")
     say_deadline(body.confirm_by, "policy")
 
 

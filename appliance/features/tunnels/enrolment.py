@@ -432,6 +432,8 @@ class HostEnrolment(TunnelHosts):
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         now = self._table.declared.in_force
+        if (now, before, taken) == (earlier, after, 0):
+            return self._reloaded(before, after, divergence)
         self._trail.happened(
             "hosts reloaded",
             f"{self._table.declared.source}: {counted(len(self._table.declared.hosts), 'host is', 'hosts are')}"
@@ -446,6 +448,9 @@ class HostEnrolment(TunnelHosts):
             who=who,
         )
         await self._carried_out()
+        return self._reloaded(before, after, divergence)
+
+    def _reloaded(self, before: set[str], after: set[str], divergence: list[str]) -> answers.Reloaded:
         return answers.Reloaded(
             self._table.revision,
             sorted(self._table.declared.hosts),

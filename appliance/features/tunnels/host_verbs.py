@@ -186,7 +186,8 @@ def reload(running: Appliance) -> None:
     Example: rosrv host reload
     """
     body = running.answer_or_exit(HostsReload())
-    say(f"{counted(len(body.declared), 'host is', 'hosts are')} declared")
+    change = "" if body.opened or body.closed else "; no tunnel was opened or closed"
+    say(f"{counted(len(body.declared), 'host is', 'hosts are')} declared{change}")
     for word, names in (("tunnel allowed again", body.opened), ("tunnel closed", body.closed)):
         if names:
             say(f"{word}: {', '.join(names)}")

@@ -161,8 +161,11 @@ async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.Mon
             ("alice", "reloaded from disk by alice"),
             ("disk", "reloaded from disk"),
         ):
-            await policies.reload(PolicyReload(), who)
-            assert (policies.in_force.who, policies.in_force.note) == ("disk", note)
+            policies.file.write_text(f"{OPEN}# {who}\n")
+            for _ in range(2):  # the same text makes no second revision
+                loaded = await policies.reload(PolicyReload(), who)
+                assert (policies.in_force.who, policies.in_force.note) == ("disk", note)
+            assert loaded.revision == loaded.replaced == policies.revision
         assert recorded == ["operator", "alice", "disk"]
 
 

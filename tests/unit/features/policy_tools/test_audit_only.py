@@ -38,7 +38,7 @@ def test_all_sections_are_enforced_without_the_line() -> None:
         (
             "[Options]\naudit-only = Nodes\n",
             ["Publishers"],
-            "[Publishers] is not audit-only; these are: Nodes",
+            "Publishers: enforced already; audit-only are: Nodes",
         ),
         ("[Options]\naudit-only = all\n", ["Ports"], "'Ports' is not a section that decides"),
     ],
