@@ -159,8 +159,8 @@ class Policies(Revisions[RevisionRow]):
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        The text in force makes no new revision, unless it waits for a confirmation. Others are recorded as loaded
-        from disk; the note names who ordered it.
+        The text in force makes no new revision, unless it waits for a confirmation, but begins rights again that a
+        wrong clock ended. Others are recorded as loaded from disk; the note names who ordered it.
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self.changing(request.expected):
@@ -173,8 +173,14 @@ class Policies(Revisions[RevisionRow]):
             equal = (now.who, now.text, now.signature) == (DISK, policy.text, signature)
             if equal and self.confirm_by is None:
                 self._note_refused("")
-                return self._loaded(self.revision, 0)
+                return self._unchanged()
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
+
+    def _unchanged(self) -> Loaded:
+        """Begin rights again that a wrong clock ended, as each load does."""
+        self.ends.forget(self.changes, *self.ends.names(self.changes))
+        self.time_passed()
+        return self._loaded(self.revision, 0)
 
     async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
         await asyncio.to_thread(self._tested, lambda: (text, signature), "policy.ini", self.known, cases)
@@ -192,9 +198,7 @@ class Policies(Revisions[RevisionRow]):
         async with self.changing(request.expected):
             now = self.in_force
             if now.who != DISK and (now.text, now.signature) == given:
-                self.ends.forget(self.changes, *self.ends.names(self.changes))
-                self.time_passed()
-                return self._loaded(self.revision, 0)
+                return self._unchanged()
             name = f"revision {self.revision + 1}"
             policy, signature = await self._prepared(lambda: given, name, who, cases)
             return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
