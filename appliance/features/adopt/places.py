@@ -1,5 +1,6 @@
 """Find the host of each node of the robot's master: where its URI leads, and its port answers."""
 
+import asyncio
 import ipaddress
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -17,7 +18,8 @@ from appliance.rpc.xmlrpc_client import (
     UnreachedError,
     XmlRpcClient,
 )
-from roswire.errors import InvalidUriError
+from roswire.errors import InvalidUriError, RosError
+from roswire.node.tcpros_streams import ANY, exchange_headers
 from roswire.uris import NodeUri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits
 
@@ -26,7 +28,9 @@ TOPIC_SECONDS = 5.0
 
 _SECONDS = 2.0
 _MOST_ADDRESSES = 8  # of one name
-_MOST_FAILED = 64  # of one host
+MOST_FAILED = 64
+"""The places of one host, or its ports, that may fail: registered URIs do not make the appliance scan ports."""
+
 _SHARE = HostShare(host=3.0, whole=5.0)
 _LIMITS = XmlRpcLimits(body=256 << 10)
 
@@ -71,6 +75,29 @@ async def call_node(uri: NodeUri, method: str, /, *params: Value) -> Value:
     return await XmlRpcClient(uri, timeout=seconds, limits=_LIMITS).call(method, CALLER, *params)
 
 
+class ServiceProbe(Protocol):
+    """Asks whether a port has a service of this name. Raises `UnansweredError`."""
+
+    async def __call__(self, uri: NodeUri, service: str) -> bool: ...
+
+
+async def has_service(uri: NodeUri, service: str) -> bool:
+    """Return whether the port answers as this service; a call of it is not made."""
+    header = {"callerid": CALLER, "service": service, "md5sum": ANY, "probe": "1"}
+    try:
+        async with asyncio.timeout(TOPIC_SECONDS):
+            reader, writer = await asyncio.open_connection(uri.host, uri.port)
+            try:
+                answer = await exchange_headers(reader, writer, header, TOPIC_SECONDS)
+            finally:
+                writer.close()
+    except TimeoutError:
+        raise UnansweredError(f"{service} did not answer within {TOPIC_SECONDS:g} s") from None
+    except (OSError, RosError):
+        return False
+    return answer.get("md5sum", ANY) != ANY  # a program that sends back what it gets is no service
+
+
 def parsed(nodes: Mapping[str, str]) -> tuple[dict[str, NodeUri], dict[str, str]]:
     """Return the URIs by the names of nodes, and the reasons why others are not valid."""
     valid, invalid = {}, {}
@@ -109,9 +136,9 @@ async def find_places(nodes: Mapping[str, str], facts: MachineFacts, call: NodeC
     failed = Counter[str]()
 
     async def ask(uri: NodeUri) -> CallFailedError | None:
-        if failed[shares[uri]] >= _MOST_FAILED:
+        if failed[shares[uri]] >= MOST_FAILED:
             return CallFailedError(
-                f"it was not asked, because {_MOST_FAILED} others of {uri.host} do not answer"
+                f"it was not asked, because {MOST_FAILED} others of {uri.host} do not answer"
             )
         try:
             await call(uri, "getPid")

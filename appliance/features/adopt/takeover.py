@@ -8,7 +8,9 @@ starts in the meantime registers at the master that it still finds.
 
 1. Publishers are registered before services, and services before subscribers.
 2. The rules come after the first registrations; before, calls of the robot would find an empty graph.
-3. Only ports of registered nodes are cut, and only ports on which the node's own process listens.
+3. Only ports of registered nodes are cut, and only ports on which the node's own process listens. Any host may have
+   registered a service for a node, so its port is cut if the node tells that port for its topics, or if the service
+   itself answers there.
 4. The phase says that a graph is being taken before the first registration: from then on RVMaster may tell nodes its
    own lists, above all a control that starts again, so only giving back ends it.
 5. In the phase `taken`, and with the graph on the disk, the robot's own master loses the adopted subscriptions: it then
@@ -31,6 +33,7 @@ publisher changes nothing; only a list without it removes it.
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -46,12 +49,15 @@ from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.graph_side import CLOCK, AdoptedGraph, service_text
 from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts
 from appliance.features.adopt.places import (
+    MOST_FAILED,
     TOPIC_SECONDS,
     NodeCaller,
     NodePlace,
     Places,
+    ServiceProbe,
     call_node,
     find_places,
+    has_service,
     names_to_resolve,
     parsed,
 )
@@ -76,7 +82,7 @@ from appliance.rpc.master_reader import (
     MasterReader,
     MasterReadError,
 )
-from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError
 from appliance.supervisor.machine_work import Found
 from roswire.names import ROSOUT
 from roswire.parameter_tree import same_value
@@ -191,6 +197,7 @@ class AdoptOperation:
     silence: Callable[[], None]
     speak: Callable[[], None]
     call: NodeCaller = call_node
+    probe: ServiceProbe = has_service
     forwards: bool = True
     passed: Callable[[str], Awaitable[None]] = _nothing
     stored: Callable[[], Awaitable[bool]] = _stored
@@ -281,8 +288,8 @@ class AdoptOperation:
         if reads:
             await self._register(graph, places, MasterGraph())
             await self.passed("register")
-        cuts = await self._cuts(graph, places)
         self.left.connections.clear()
+        cuts = await self._cuts(graph, places)
         await self.machine("forward")
         await self.passed("forward")
         while True:
@@ -524,18 +531,19 @@ class AdoptOperation:
         nodes = {name: place for name, place in places.found.items() if self._registered(name, place)}
         facts = await self.facts(place.uri for place in nodes.values())
         told = await self._topic_ports(graph, nodes, facts)
+        served = await self._service_ports(graph, nodes, facts, told)
         apis, master = {place.uri.port for place in nodes.values()}, self.reader(facts).uri
         ports: set[int] = set()
         remote: set[tuple[str, int]] = set()
-        for name, offered in self._service_ports(graph, nodes).items():
-            place = nodes[name]
+        for name, place in nodes.items():
             port = told.get(place.call_uri, 0)
+            offered = {port or 0, *served.get(place.call_uri, ())} - {0}
             self.left.untold.pop(name, None)
             if place.is_here(facts):
                 listening = set(facts.sockets.get(place.uri.port, []))
-                ports |= (listening if port is None else listening & {*offered, port}) - apis
+                ports |= (listening if port is None else listening & offered) - apis
             elif place.host.version == 4:
-                remote |= {(str(place.host), one) for one in {*offered, port or 0} - {place.uri.port, 0}}
+                remote |= {(str(place.host), one) for one in offered - {place.uri.port}}
                 if port is None:
                     self.left.untold[name] = (
                         f"it did not tell the port of its topics within {TOPIC_SECONDS:g} s"
@@ -549,11 +557,42 @@ class AdoptOperation:
         node = self.graph.node_at(name, place)
         return node is not None and bool(node.registrations)
 
-    def _service_ports(self, graph: MasterGraph, nodes: Mapping[str, NodePlace]) -> dict[str, set[int]]:
-        served: dict[str, set[int]] = {name: set() for name in nodes}
-        for kind, resource, name in self._entries(graph):
-            if name in nodes and kind == SERVICE and (port := self._service_port(graph, resource, name)):
-                served[name].add(port)
+    async def _service_ports(
+        self,
+        graph: MasterGraph,
+        nodes: Mapping[str, NodePlace],
+        facts: MachineFacts,
+        told: Mapping[NodeUri, int | None],
+    ) -> dict[NodeUri, set[int]]:
+        """Return the ports that answer as a service of each place, besides the one that it told for its topics.
+
+        Each place has a share of its own. A service that does not answer in time is named as not cut.
+        """
+        shares: dict[tuple[NodeUri, int, str], str] = {}
+        for kind, service, name in self._entries(graph):
+            if name not in nodes or kind != SERVICE:
+                continue
+            place, port = nodes[name], self._service_port(graph, service, name)
+            here = port in facts.sockets.get(place.uri.port, ()) or not place.is_here(facts)
+            if port >= FIRST_PORT and here and port not in {place.uri.port, told.get(place.call_uri)}:
+                shares[place.call_uri, port, service] = f"{place.host}:{place.uri.port}"
+        served: dict[NodeUri, set[int]] = {}
+        failed = Counter[str]()
+
+        async def ask(row: tuple[NodeUri, int, str]) -> None:
+            uri, port, service = row
+            if port in served.get(uri, ()) or failed[shares[row]] >= MOST_FAILED:
+                return
+            try:
+                if await self.probe(NodeUri("rosrpc", uri.host, port, "/"), service):
+                    served.setdefault(uri, set()).add(port)
+                    return
+            except UnansweredError as error:
+                self.left.connections[f"{uri.host} TCP {port}"] = str(error)
+            failed[shares[row]] += 1
+
+        seconds = TOPIC_SECONDS + 1
+        await serve_by_host(shares, ask, HostShare(seconds, seconds))
         return served
 
     async def _topic_ports(

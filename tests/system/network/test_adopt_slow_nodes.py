@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, Robot, rosrv, until_taken
+from tests.support.adopted_robot import POLICY, Robot, crash, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession, has_ros, numbers
 from tests.support.processes import Process
@@ -61,6 +61,36 @@ def test_time_never_goes_back_in_a_node_that_lags_behind(
             steps = [later - earlier for earlier, later in itertools.pairwise(times)]
             print("longest sleep of 0.1 s:", max(steps))  # noqa: T201  shown by pytest -s
             assert min(steps) >= 0
+
+
+def test_time_never_goes_back_at_a_start_beside_an_adopted_robot(
+    host: Host, tmp_path: Path, appliance: Appliance
+) -> None:
+    """After a crash of the whole appliance, of a relay, and of control."""
+    with PlainMaster(tmp_path, host), RosSession("http://localhost:11311", tmp_path, host) as ros:
+        ros.run("rosparam", "set", "/use_sim_time", "true")
+        ros.node("rospy", "sim_clock", name="clock")
+        sleepers = [ros.node("rospy", "sleeper", "--stutter", name=f"stutters_{number}") for number in (1, 2)]
+        sleepers += [ros.node(client, "sleeper", name=f"{client}_sleeper") for client in ("rospy", "roscpp")]
+        robot = Robot(host, ros, {}, {})
+        rosrv(robot, appliance, "adopt")
+        appliance.start()
+        until_taken(robot, appliance)
+        for _ in range(CHANGES // 3):
+            _require_time(sleepers)
+            crash(appliance)
+            appliance.start()
+            until_taken(robot, appliance)
+            _require_time(sleepers)
+            for role in ("relay", "control"):
+                _kill(appliance, role)
+                until_taken(robot, appliance)
+                _require_time(sleepers)
+
+
+def _kill(appliance: Appliance, role: str) -> None:
+    killed = appliance.kill(role)
+    eventually(lambda: killed not in appliance.pids(role), appliance.story)
 
 
 def _require_time(sleepers: list[Process]) -> None:

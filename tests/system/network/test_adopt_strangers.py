@@ -2,10 +2,11 @@
 
 import json
 import re
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,26 @@ for number, uri in enumerate(uris):
     master.registerSubscriber(f"/a%{number}", "/cmd_vel", "geometry_msgs/Twist", uri)
 print("registered", flush=True)
 sys.stdin.read()
+"""
+
+_SERVICES = """
+import sys, xmlrpc.client
+master = xmlrpc.client.ServerProxy(sys.argv[1])
+uri = master.lookupNode("/evil", "/nuc_talker")[2]
+for number in range(50):
+    for port in (2112, 2113):
+        master.registerService("/nuc_talker", f"/a{number}_{port}", f"rosrpc://{sys.argv[2]}:{port}", uri)
+"""
+_DEVICE = """
+import socket, sys, threading
+server = socket.create_server((sys.argv[1], int(sys.argv[2])))
+print("ready", flush=True)
+def serve(client):
+    while True:
+        client.sendall(b"a scan\\n" if sys.argv[3] == "talks" else client.recv(99))
+        threading.Event().wait(0.02)
+while True:
+    threading.Thread(target=serve, args=(server.accept()[0],), daemon=True).start()
 """
 
 
@@ -140,3 +161,41 @@ def test_names_of_an_unknown_host_keep_no_node_of_the_robot_out(
     with _filled(stranger, robot):
         rosrv(robot, appliance, "adopt")
         _require_served(robot, appliance)
+
+
+def test_a_port_that_a_stranger_registered_as_a_service_keeps_its_connections(
+    robot: Robot, appliance: Appliance, lab: Lab
+) -> None:
+    """Devices at the second computer: one sends without being asked, one sends back what it gets."""
+    nuc, stranger = lab.hosts["nuc"], lab.host("stranger", "10.77.0.66/24")
+    with ExitStack() as running:
+        devices = []
+        for port, kind in ((2112, "talks"), (2113, "echoes")):
+            command = ["/usr/bin/python3", "-c", _DEVICE, nuc.address, str(port), kind]
+            program = nuc.popen(command, stdout=subprocess.PIPE, text=True)
+            running.enter_context(program)
+            running.callback(program.kill)
+            assert program.stdout is not None
+            assert program.stdout.readline() == "ready\n"
+            with robot.host.entered():
+                devices.append(
+                    running.enter_context(socket.create_connection((nuc.address, port), timeout=10))
+                )
+        command = ["/usr/bin/python3", "-c", _SERVICES, f"http://{robot.host.address}:11311", nuc.address]
+        assert stranger.popen(command).wait(timeout=60) == 0
+        rosrv(robot, appliance, "adopt")
+        appliance.start()
+        until_taken(robot, appliance)
+        for device in devices:
+            device.setblocking(False)
+            while True:
+                try:
+                    assert device.recv(65536), "the connection was cut"
+                except BlockingIOError:
+                    break
+            device.settimeout(10)
+            device.sendall(b"?")
+            assert device.recv(99)
+            with robot.host.entered():
+                socket.create_connection(device.getpeername(), timeout=5).close()
+        robot.hears()

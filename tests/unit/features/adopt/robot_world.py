@@ -195,6 +195,9 @@ class RobotWorld:
         self.remote: list[tuple[str, int]] = []
         self.connected: set[int] = set()  # the ports of nodes whose processes are connected to the master
         self.refused: set[int] = set()  # ports that were cut
+        self.apart: dict[str, int] = {}  # the ports of services that have one of their own
+        self.probed: set[int] = set()  # ports that were asked for a service
+        self.devices: set[int] = set()  # ports of programs that say nothing to a probe
         self.kept_left, self.kept_unasked = (
             LeftThere(),
             set[Incarnation](),
@@ -220,6 +223,7 @@ class RobotWorld:
         self.operation = AdoptOperation(
             self._machine, lambda _facts: master, self.graph, world,
             waiting=self._waiting, silence=self._silence, speak=self._speak, call=self._call, passed=self._passed,
+            probe=self._probe,
         )  # fmt: skip
         self.operation.left = copy.deepcopy(self.kept_left)
         parts.subscribers.unasked.clear()
@@ -363,6 +367,16 @@ class RobotWorld:
             node.reads_on = {topic: max(0, looks - 1) for topic, looks in node.reads_on.items()}
             return [1, "", [[0, one, "i", "TCPROS", topic, True] for topic, one in rows]]
         return [1, "", node.port]
+
+    async def _probe(self, uri: NodeUri, service: str) -> bool:
+        self.probed.add(uri.port)
+        if uri.port in self.devices:
+            raise UnansweredError(f"{service} did not answer")
+        served = (one for one in self.robot.values() if one.alive and service in one.services)
+        return uri.port in (self._service_port(one, service) for one in served)
+
+    def _service_port(self, node: RobotNode, service: str) -> int:
+        return self.apart.get(service, node.port + 1000)
 
     def give_list(self, node: RobotNode, topic: str, uris: list[str]) -> None:
         if node.hangs:

@@ -122,6 +122,29 @@ def test_a_topic_that_an_unknown_host_registered_for_a_node_hides_no_port() -> N
     run(story)
 
 
+def test_a_port_is_cut_as_a_service_only_if_a_service_answers_there() -> None:
+    """Any host may have registered services for a node: other ports of its machine keep their connections."""
+
+    async def story(world: RobotWorld) -> None:
+        world.add("/nuc", 4004, uri="http://192.168.50.2:4004/", publishes=("/nuc",))
+        world.add("/calls", 4005, uri="http://192.168.50.2:4005/", services=("/calls",))
+        world.devices = {2112}
+        for port in (2112, *range(10_000, 10_050)):
+            world.master.entries.add(("service", f"/a{port}", "/nuc"))
+            world.master.services[f"/a{port}"] = f"rosrpc://192.168.50.2:{port}"
+        await world.until_settled()
+        assert {tuple(row) for row in world.remote} == {("192.168.50.2", 5004), ("192.168.50.2", 5005)}
+        assert world.operation.left.not_cut.keys() == {"192.168.50.2 TCP 2112"}
+        for port in range(20_000, 20_500):
+            world.master.entries.add(("service", f"/b{port}", "/nuc"))
+            world.master.services[f"/b{port}"] = f"rosrpc://192.168.50.2:{port}"
+        world.probed.clear()
+        await world.operation.take()
+        assert len(world.probed) <= 64 + 1, "registered services make the appliance scan no ports"
+
+    run(story)
+
+
 @pytest.mark.parametrize("wanted", [True, False], ids=["adopted", "released"])
 def test_a_node_gets_a_new_clock_only_after_it_has_read_the_earlier_one(wanted: bool) -> None:
     async def story(world: RobotWorld) -> None:

@@ -616,6 +616,7 @@ def test_no_port_of_the_machine_itself_is_cut_whatever_a_node_says() -> None:
             "/b": "rosrpc://nuc:11311",
             "/c": "rosrpc://nuc:5001",
         }
+        world.apart = {"/a": 22, "/b": 11311, "/c": 5001}
         await world.until_settled()
         assert world.remote == [("192.168.50.2", 5001), ("192.168.50.2", 5010)]
 
