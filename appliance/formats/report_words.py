@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from appliance.audit.proof.chain_findings import VerificationResult
 from appliance.base.counted import counted
 from appliance.formats.html_page import Cells, Unbroken, head, lines, section, text
 from appliance.formats.interventions import SUBJECTS, Intervention
@@ -320,18 +321,21 @@ def _verdict(log: ReportedLog) -> str:
     name, found = f"{log.name}: " if log.name else "", log.verification
     if found is None:
         return f"{name}not verified, as far as this machine knows"
-    verdict = "complete and unchanged" if found.complete else "NOT complete or changed"
-    return f"{name}{verdict}, at {_time(found.time_utc)}, up to record {found.through}"
+    return f"{name}{_outcome(found)}, at {_time(found.time_utc)}, up to record {found.through}"
+
+
+def _outcome(result: VerificationResult) -> str:
+    if not result.complete:
+        return "NOT complete or changed"
+    return result.verdict or "without a finding"
 
 
 def _verification(log: ReportedLog, verify: str) -> str:
     result = log.verification
     if result is None:
         return f"last verification: none is stored here: run `{verify}`"
-    verdict = "complete and unchanged" if result.complete else "NOT complete or changed"
-    text = (
-        f"last verification: {result.time_utc}, {counted(result.records, 'record')}: {verdict}: {result.text}"
-    )
+    read = counted(result.records, "record")
+    text = f"last verification: {result.time_utc}, {read}: {_outcome(result)}: {result.text}"
     if result.log and log.id and result.log != log.id:
         return f"{text}. It is of another log ({result.log}), and says nothing of this one: run `{verify}`"
     if result.through and log.last > result.through:

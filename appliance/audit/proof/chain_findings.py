@@ -108,7 +108,8 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
 class VerificationResult(msgspec.Struct, frozen=True, kw_only=True):
     """The last stored result of `rosrv audit verify`, which is not part of the report's own work.
 
-    `through` is the sequence of the last record that it read, of the log `log`.
+    `through` is the sequence of the last record that it read, of the log `log`. `complete` says that it had no finding,
+    and `verdict` in words what that proves; a result of an earlier version has no verdict.
     """
 
     time_utc: str
@@ -117,3 +118,4 @@ class VerificationResult(msgspec.Struct, frozen=True, kw_only=True):
     text: str
     log: str = ""
     through: int = 0
+    verdict: str = ""

@@ -35,7 +35,7 @@ def print_verification(result: Verification) -> None:
                 f" set aside at {rfc3339(other.set_aside)}"
             )
     write(f"key: {result.key or 'none (nothing was signed yet)'}")
-    write(_verdict(result))
+    write(verdict_of(result))
 
 
 def _vouched(result: Verification) -> str:
@@ -44,7 +44,8 @@ def _vouched(result: Verification) -> str:
     return "; the signer did not confirm it: their removal is not proven"
 
 
-def _verdict(result: Verification) -> str:
+def verdict_of(result: Verification) -> str:
+    """Return what a verification proves, in a sentence."""
     if result.ok:
         return _sound(result)
     if all(finding.kind in _BESIDE for finding in result.findings):
@@ -59,7 +60,10 @@ def _sound(result: Verification) -> str:
         return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
     if not (result.remembered or result.elsewhere):
         return "The log is consistent and its signatures are valid, but records may have been cut off at its end."
-    if result.other_logs or (result.elsewhere is not None and result.elsewhere.other_logs):
+    copies = result.elsewhere
+    if not result.remembered and copies is not None and copies.through < result.signed_through:
+        return f"The log is unchanged, and complete up to record {copies.through}; later ones may have been cut off."
+    if result.other_logs or (copies is not None and copies.other_logs):
         return "This log is complete and unchanged; the other logs named above are not part of it."
     return "The log is complete and unchanged."
 

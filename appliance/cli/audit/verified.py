@@ -12,6 +12,7 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.audit.proof.chain_findings import Verification, VerificationResult
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
+from appliance.cli.audit.verification_text import verdict_of
 
 _NAME = "verified.json"
 _MODE = 0o640
@@ -25,7 +26,7 @@ def keep_verification(log: Path, result: Verification, seconds: float) -> None:
     parts += [finding.message for finding in result.findings[:3]]
     kept = VerificationResult(
         time_utc=rfc3339(clock.wall_ns()), complete=result.ok, records=result.records, text="; ".join(parts),
-        log=result.log, through=result.last,
+        log=result.log, through=result.last, verdict=verdict_of(result).rstrip("."),
     )  # fmt: skip
     with contextlib.suppress(OSError):
         owner = log.parent.stat()

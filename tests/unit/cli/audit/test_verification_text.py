@@ -13,6 +13,13 @@ _COPIES = Elsewhere(checkpoints=1, through=7, time=0, other_logs=[])
         (7, 3, None, "The log is complete and unchanged."),
         (7, None, _COPIES, "The log is complete and unchanged."),
         (
+            9,
+            None,
+            _COPIES,
+            "The log is unchanged, and complete up to record 7; later ones may have been cut off.",
+        ),
+        (9, 3, _COPIES, "The log is complete and unchanged."),
+        (
             7,
             None,
             None,

@@ -454,14 +454,20 @@ def test_the_page_and_the_lines_say_what_is_not_covered_and_not_verified() -> No
 @pytest.mark.parametrize(
     ("log", "through", "words"),
     [
-        ("ab", 9, "complete and unchanged"),
+        ("ab", 9, "9 records: The log is consistent, but nothing is signed yet"),
         ("ab", 7, "2 later records are not verified"),
         ("cd", 9, "It is of another log (cd), and says nothing of this one"),
     ],
 )
 def test_a_verification_says_of_what_it_is(log: str, through: int, words: str) -> None:
     result = VerificationResult(
-        time_utc=rfc3339(HOUR), complete=True, records=9, text="", log=log, through=through
+        time_utc=rfc3339(HOUR),
+        complete=True,
+        records=9,
+        text="",
+        log=log,
+        through=through,
+        verdict="The log is consistent, but nothing is signed yet",
     )
     known = ReportedLog(name="", id="ab", begins_utc=rfc3339(HOUR), last=9, verification=result)
     assert words in page(report(logs=[known]))

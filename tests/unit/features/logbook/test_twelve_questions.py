@@ -151,7 +151,13 @@ def found() -> Page:
     period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
     read = read_records(merged({"": entries()}), period)
     result = VerificationResult(
-        time_utc="2026-05-03T04:00:00.000000000Z", complete=True, records=14, text="", log="ab", through=14
+        time_utc="2026-05-03T04:00:00.000000000Z",
+        complete=True,
+        verdict="The log is complete and unchanged",
+        records=14,
+        text="",
+        log="ab",
+        through=14,
     )
     log = ReportedLog(
         name="", id="ab", begins_utc="2026-02-20T08:00:00.000000000Z", last=14, verification=result
