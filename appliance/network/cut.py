@@ -43,7 +43,9 @@ _ERROR = struct.Struct("=i")
 _FOUND = struct.Struct("=xB42xQ")  # struct inet_diag_msg: the state and the cookie
 _ENDED_STATES = (6, 7, 10)  # TIME_WAIT, CLOSE, and LISTEN, which is the port's listener
 _SECONDS = 2.0
-_NO_INODE = "0"  # of a connection that its process has not accepted yet
+NO_INODE = "0"
+"""The inode of a connection that its process has not accepted yet."""
+
 _GONE = (errno.ENOENT, errno.ECONNREFUSED, errno.ESTALE)  # it ended before its removal
 
 
@@ -128,7 +130,7 @@ class DisturbedConnections:
         self._before = self._last = frozenset[str]()
 
     def remember(self) -> None:
-        self._before, self._last = self._last, self._machine.run(tcp_inodes) - {_NO_INODE}
+        self._before, self._last = self._last, self._machine.run(tcp_inodes) - {NO_INODE}
 
     def end(
         self, forwarded: Collection[int], master: int | None, near: Collection[str], nodes: Collection[str]

@@ -25,6 +25,7 @@ from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import interfaces
 from appliance.network.close_ports import local_port_range
+from appliance.network.cut import NO_INODE, end_connections
 from appliance.network.esp import Esp, choose_esp, lend_tun
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.firewall_rules import (
@@ -38,6 +39,7 @@ from appliance.network.firewall.firewall_rules import (
 )
 from appliance.network.firewall.rule_watch import RuleWatch, subscribed
 from appliance.network.isolation import Isolation, IsolationSettings
+from appliance.network.listening_sockets import tcp_inodes
 from appliance.network.namespaces import (
     Namespace,
     NetworkError,
@@ -192,6 +194,7 @@ class ContainerIsolation(NoIsolation):
         self._owed = False  # whether the kernel rejected the last rules, so they must be installed again
         self._changing = threading.RLock()
         self._ending = False
+        self._before = self._last = frozenset[str]()  # sockets at the last look but one, and at the last
 
     @contextlib.contextmanager
     def _standing(self) -> Iterator[None]:
@@ -334,6 +337,26 @@ class ContainerIsolation(NoIsolation):
         found = [] if self.firewall is None else self.firewall.restore()
         found, self._found = self._found + found, []
         return RestoredRules(found, clock.now())
+
+    def remember_connections(self) -> None:
+        self._before, self._last = self._last, self._namespace.run(tcp_inodes) - {NO_INODE}
+
+    def end_connections(self) -> int:
+        """End those that began without the rules at ports that these close to most: permitted programs connect again.
+
+        The rules refuse only new connections, so these would last.
+        """
+        settings = self._settings()
+        node, peer = settings.own_node, settings.peer
+        ports = {settings.rosmaster_port, settings.inner_port, settings.api_port}
+        ports |= {node and node.master_port, peer and peer.port}
+        spans = (*settings.own_ports, *((node.ports,) if node else ()))
+
+        def is_closed(port: int) -> bool:
+            return port in ports or any(span.first <= port <= span.last for span in spans)
+
+        before = self._before
+        return end_connections(self._namespace, lambda one: one.inode not in before and is_closed(one.port))
 
     def report(self) -> FirewallState:
         with self._standing():

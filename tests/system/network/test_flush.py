@@ -8,7 +8,9 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -20,7 +22,7 @@ from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.listening_sockets import TcpSocket, tcp_sockets
 from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import Robot, rosrv, until_taken
-from tests.support.appliance import Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.requirements import need_program, needs
@@ -275,3 +277,46 @@ def test_no_machine_commands_the_base_after_the_rules_are_back(
     rosrv(robot, appliance, "release")
     assert robot.graph() == graph
     robot.hears()
+
+
+@pytest.mark.nightly
+def test_nothing_that_reached_a_closed_port_without_the_rules_stays_connected(lab: Lab) -> None:
+    """In a container: another machine, and another account of this one, at each port that the rules close."""
+    box, stranger = lab.host("box", "10.77.0.2/24"), lab.host("stranger", "10.77.0.66/24")
+    places = ((stranger, box.address), (box, "127.0.0.1"))
+
+    def reached(host: Host, address: str, ports: set[int]) -> dict[int, socket.socket]:
+        found = {}
+        with host.entered():
+            for port in ports:
+                with suppress(OSError):
+                    found[port] = socket.create_connection((address, port), timeout=2)
+        return found
+
+    with Appliance(box, policy=OPEN_POLICY) as appliance, ExitStack() as running:
+        listening = {one.port for one in box.run(tcp_sockets) if one.listens}
+        closed = []
+        for host, address in places:
+            opened = reached(host, address, listening)
+            for client in opened.values():
+                client.close()
+            closed.append(listening - opened.keys())
+        assert all(closed)
+        began: dict[int, int] = {}  # the port that was reached, by the client's own
+        for number in range(1, FLUSHES + 1):
+            flushed, until = box.popen(["nft", "flush", "ruleset"]), time.monotonic() + 0.5
+            while time.monotonic() < until:
+                for (host, address), ports in zip(places, closed, strict=True):
+                    for port, client in reached(host, address, ports).items():
+                        running.enter_context(client)
+                        began[client.getsockname()[1]] = port
+            assert flushed.wait(timeout=20) == 0
+            appliance.recorded(event="firewall restored", count=number)
+
+        def left() -> list[TcpSocket]:
+            found = box.run(tcp_sockets)
+            return [one for one in found if one.established and began.get(one.peer_port) == one.port]
+
+        print(f"closed: {closed}; {len(began)} connections without the rules")  # noqa: T201  shown by pytest -s
+        assert began
+        eventually(lambda: not left(), lambda: str(left()), seconds=10)
