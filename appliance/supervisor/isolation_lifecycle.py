@@ -349,7 +349,8 @@ class ContainerIsolation(NoIsolation):
         settings = self._settings()
         node, peer = settings.own_node, settings.peer
         ports = {settings.rosmaster_port, settings.inner_port, settings.api_port}
-        ports |= {node and node.master_port, peer and peer.port}
+        ports |= {node.master_port} if node else set()
+        ports |= {peer.port} if peer else set()
         spans = (*settings.own_ports, *((node.ports,) if node else ()))
 
         def is_closed(port: int) -> bool:
