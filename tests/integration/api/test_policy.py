@@ -78,7 +78,8 @@ def test_a_valid_policy_is_in_force_at_once_and_survives(appliance: Appliance) -
 @pytest.mark.real
 def test_a_change_is_recorded_before_it_is_answered(appliance: Appliance) -> None:
     newest = ("--event", "policy loaded", "--limit", "1")
-    for _ in range(20):
+    for number in range(20):
+        appliance.policy_file.write_text(f"{OPEN_POLICY}# {number}\n")
         loaded = json.loads(appliance.rosrv("policy", "reload", "--json").stdout)
         assert [record["revision"] for record in appliance.audit(*newest)] == [loaded["revision"]]
 

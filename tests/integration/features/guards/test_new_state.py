@@ -110,7 +110,7 @@ PARTS: dict[str, Part] = {
     "switches": ([("monitor", "enable", "own")], lambda one: states(one)["own"]),
     "values": ([("guard", "set", "speed", "vMax=0.2")], fastest),
     "loaded specifications": ([("monitor", "load", "loaded.rv")], lambda one: "loaded" in states(one)),
-    "policy revisions": ([("policy", "reload")], names("policy", "revisions", of="revision")),
+    "policy revisions": ([("policy", "rollback", "1")], names("policy", "revisions", of="revision")),
     "blocks": ([("host", "block", "10.77.0.99", "--for", "1h")], names("host", "blocks", of="address")),
     "tokens": ([("token", "add", "eve", "--for", "1d")], names("token", "list", of="name")),
     "doors": ([("door", "add", "eve")], names("door", "list", of="name")),
