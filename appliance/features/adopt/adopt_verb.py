@@ -246,12 +246,9 @@ def _show_status(appliance: Appliance) -> None:
         "giving": "the graph is being given back",
         "given": "the graph is being given back",
     }
-    but = (
-        f", but not all: {len(found.missing) + len(found.not_cut)} below"
-        if found.missing or found.not_cut
-        else ""
-    )
-    say(f"{words[found.phase]}{but if found.phase == 'taken' else ''}; adopted since {found.since_utc}")
+    left = len(found.missing) + len(found.not_cut)
+    but = f", but not all: {left} below" if left and found.phase == "taken" else ""
+    say(f"{words[found.phase]}{but}; adopted since {found.since_utc}")
     away = "" if found.present else ", away: a release starts another master"
     say(f"own master: {found.master}{away}")
     say(f"{counted(found.nodes, 'node')}, of which {found.not_started} were never seen to start")

@@ -95,7 +95,7 @@ async def has_service(uri: NodeUri, service: str) -> bool:
         raise UnansweredError(f"{service} did not answer within {TOPIC_SECONDS:g} s") from None
     except (OSError, RosError):
         return False
-    return answer.get("md5sum", ANY) != ANY  # a program that sends back what it gets is no service
+    return answer.get("md5sum", ANY) != ANY  # not of a program that sends back what it gets
 
 
 def parsed(nodes: Mapping[str, str]) -> tuple[dict[str, NodeUri], dict[str, str]]:

@@ -123,6 +123,8 @@ def _require_served(robot: Robot, appliance: Appliance) -> None:
     )
     print(f"adopted in {took} s: {found['nodes']} nodes; {len(found['missing'])} left")  # noqa: T201  shown by pytest -s
     missing = [name for name in found["missing"] if name.startswith("/a%")]
+    said = f"the robot's nodes use the appliance, but not all: {len(missing)} below; adopted since"
+    assert said in rosrv(robot, appliance, "adopt", "--status")
     assert len(missing) == len(found["missing"]) > _SILENT + _UNKNOWN
     names = {name for part in robot.graph() for _resource, nodes in part for name in nodes}
     assert {"/rospy_talker", "/roscpp_talker", "/nuc_talker", "/rospy_server", "/rospy_of_nuc"} <= names
@@ -163,7 +165,7 @@ def test_names_of_an_unknown_host_keep_no_node_of_the_robot_out(
         _require_served(robot, appliance)
 
 
-def test_a_port_that_a_stranger_registered_as_a_service_keeps_its_connections(
+def test_a_port_that_an_unknown_host_registered_as_a_service_keeps_its_connections(
     robot: Robot, appliance: Appliance, lab: Lab
 ) -> None:
     """Devices at the second computer: one sends without being asked, one sends back what it gets."""
