@@ -191,7 +191,7 @@ CELLS: dict[str, dict[str, str]] = {
         " unit/features/authority/test_group_holders.py::test_hosts_that_may_only_ask_keep_no_driver_from_waiting",
         "restarted": f"{_LOSSES} {_LEASE}test_a_damaged_epoch_file_keeps_it_passive",
         "taken over": f"{_PAIR}test_features.py::test_a_door_a_held_group_and_guards",
-        "full": f"{_PAIR}test_full_disks.py::test_a_full_disk_of_the_active_appliance",
+        "full": f"{_PAIR}test_full_disks.py::test_two_nearly_full_disks",
     },
     "approvals": {
         "first": f"{_APPROVE}test_a_call_is_held_approved_used_once_and_held_again",
