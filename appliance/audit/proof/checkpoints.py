@@ -71,7 +71,8 @@ def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
     own = next((one for one in logs if one.log == log), None)
     beside = others(logs, log)
     if signed is None:
-        lost = own is None or own.lacks_memory  # a signer that signed has memory and key
+        emptied = key is None and not beside  # a signer that signed has memory and key
+        lost = (key is not None or emptied) and (own is None or own.lacks_memory)
         return SignerMemory(others=beside, lost=lost, key=key)
     removed_to = None if removed is None else int.from_bytes(removed, "big")
     first = int.from_bytes(signed[:HEADER_BYTES], "big")

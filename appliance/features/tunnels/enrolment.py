@@ -432,25 +432,21 @@ class HostEnrolment(TunnelHosts):
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         now = self._table.declared.in_force
-        if (now, before, taken) == (earlier, after, 0):
-            return self._reloaded(before, after, divergence)
-        self._trail.happened(
-            "hosts reloaded",
-            f"{self._table.declared.source}: {counted(len(self._table.declared.hosts), 'host is', 'hosts are')}"
-            " declared",
-            opened=sorted(after - before),
-            closed=sorted(before - after),
-            sha256=fingerprint(now),
-            earlier_sha256=fingerprint(earlier),
-            diff=self._table.declared.changed_lines(earlier),
-            taken_back=taken,
-            divergence=divergence,
-            who=who,
-        )
+        if (now, before, taken) != (earlier, after, 0):
+            self._trail.happened(
+                "hosts reloaded",
+                f"{self._table.declared.source}: {counted(len(self._table.declared.hosts), 'host is', 'hosts are')}"
+                " declared",
+                opened=sorted(after - before),
+                closed=sorted(before - after),
+                sha256=fingerprint(now),
+                earlier_sha256=fingerprint(earlier),
+                diff=self._table.declared.changed_lines(earlier),
+                taken_back=taken,
+                divergence=divergence,
+                who=who,
+            )
         await self._carried_out()
-        return self._reloaded(before, after, divergence)
-
-    def _reloaded(self, before: set[str], after: set[str], divergence: list[str]) -> answers.Reloaded:
         return answers.Reloaded(
             self._table.revision,
             sorted(self._table.declared.hosts),
