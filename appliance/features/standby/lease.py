@@ -32,7 +32,7 @@ SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits fo
 FARTHEST = 1 << 20  # takeovers and restarts that an appliance may have missed
 _RENEWABLE = 2 * EXPIRY  # in this time after its lease has lapsed, the other appliance has claimed, or cannot
 _MOST_PENDING = 16
-_MOST_TOLD = 200  # characters of a fault in a datagram
+_MOST_TOLD = 400  # characters of a fault in a datagram
 
 Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
 
@@ -390,7 +390,14 @@ class ApplianceLease:
         self._number += 1
         self._asked[self._number] = now
         self._asked.pop(self._number - _MOST_PENDING, None)
-        return PromiseRequest(self.epoch, self._session, self._number, self.fault[:_MOST_TOLD])
+        return PromiseRequest(self.epoch, self._session, self._number, _in_datagram(self.fault))
 
     def _take_over(self) -> TakeOver:
         return TakeOver(self.epoch, self._session, self._void_number)
+
+
+def _in_datagram(fault: str) -> str:
+    """Return a fault without the middle of a long one: its beginning says what is wrong, its end what is done."""
+    text = fault.encode("ascii", "replace").decode("ascii")
+    half = _MOST_TOLD // 2
+    return text if len(text) <= _MOST_TOLD else f"{text[:half]}...{text[-half:]}"

@@ -14,7 +14,7 @@ from appliance.features.standby.lease import (
     WitnessAnswer,
     WitnessRequest,
 )
-from appliance.features.standby.process import WitnessChannel
+from appliance.features.standby.process import PeerChannel, WitnessChannel
 from appliance.features.standby.witness.lease_file import LeaseRecord
 from appliance.features.standby.witness.protocol import EXPIRY, HIGHEST
 from tests.unit.features.standby.witness.robot import FIRST, KEYS, PEERS, Robot
@@ -571,3 +571,19 @@ def test_an_appliance_that_could_not_serve_does_not_claim() -> None:
     assert lease.operations() == ["look"]
     lease.lease.ready = True
     assert lease.later(1.0).operations() == ["claim"]
+
+
+@pytest.mark.parametrize(
+    "folder", ["/var/lib/rosrv", "/srv/" + "rechner/" * 40, "/srv/" + "ロボット/" * 60, '/"' * 200]
+)
+def test_the_standby_hears_why_the_lease_is_kept(folder: str) -> None:
+    """However long the reason is, its datagram is not too long to be read, and its end arrives."""
+    lease, there = active_lease(), Lease()
+    lease.lease.fault = f"{folder}/audit.db: the disk is full; it keeps the lease: b is not ready"
+    asked = PeerChannel("b", "a", KEYS["b"]).read(
+        PeerChannel("a", "b", KEYS["b"]).write(asked_by(lease.later(0.3)))
+    )
+    assert isinstance(asked, PromiseRequest)
+    there.lease.received(there.now, asked)
+    told = there.lease.active_fault(there.now)
+    assert (told[:5], told.endswith("it keeps the lease: b is not ready")) == (folder[:5], True)
