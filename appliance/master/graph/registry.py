@@ -101,7 +101,8 @@ class Incarnation:
 
     @property
     def only_listens(self) -> bool:
-        return not (self.resources(Kind.PUBLICATION) or self.resources(Kind.SERVICE))
+        kinds = {kind for kind, _resource in self.registrations}
+        return bool(kinds) and not kinds & {Kind.PUBLICATION, Kind.SERVICE}
 
     @property
     def of_monitors(self) -> bool:

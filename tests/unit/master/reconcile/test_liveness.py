@@ -175,6 +175,23 @@ async def test_a_node_that_was_never_reached_is_there_while_it_is_connected(
     assert world.records.pairs[-1][0] == "node lost"
 
 
+async def test_a_listener_that_ended_is_forgotten_while_its_next_start_is_connected() -> None:
+    world = ControlParts(silent=20.0)
+    await world.round()
+    first, voice = world.node("/n"), world.node("/voice", 2)
+    await world.register(voice, Kind.PUBLICATION, "/t")
+    await world.register(first, Kind.SUBSCRIPTION, "/t")
+    world.registry.unregister(first, Kind.SUBSCRIPTION, "/t")
+    world.nodes.gone.add("/n")
+    second = world.node("/n", 3)
+    await world.register(second, Kind.SUBSCRIPTION, "/t")
+    world.carried.opened(0, messages.ConnectionOpened(1, voice.key, "/t", "topic", str(first.host), "/n"))
+    await asyncio.sleep(31)
+    await world.look(first)
+    await world.look(second)
+    assert (first.life, second.life) == (Life.FORGOTTEN, Life.LIVE)
+
+
 @pytest.mark.parametrize("registers", [False, True])
 async def test_a_node_that_answers_later_gets_what_it_missed(registers: bool) -> None:
     world = ControlParts(silent=20.0)
