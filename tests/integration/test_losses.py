@@ -185,7 +185,7 @@ def digest(site: Site) -> dict[str, Any]:
         "limits": Counter({row["resource"]: row["used"] for row in limits if "bytes" not in row["resource"]}),
         "alarms": sorted(text for text in alarms if "in the last" not in text),
         "rules": re.sub(
-            r"counter packets \d+ bytes \d+|expires \S+|timeout \S+|elements = \{[^}]*\}", "", rules
+            r"counter packets \d+ bytes \d+|expires \S+|timeout \S+|\s*elements = \{[^}]*\}", "", rules
         ),
         "held": {
             f"{row['role']} {row.get('instance', '')}": _held(row["pid"])
