@@ -366,6 +366,10 @@ class Settings:
         default=False,
         description="also put output, verdicts and faults of monitors on /rosout (the audit log always has them)",
     )
+    alarms_on_diagnostics: bool = key(
+        default=False,
+        description="also publish the alarms and the guards' states on /diagnostics (diagnostic_msgs/DiagnosticArray)",
+    )
     hide_publisher: bool = key(default=False, description="omit the monitors' topics from getSystemState")
     site_keys: list[Annotated[str, AfterValidator(checked_key)]] = key(
         default=[],

@@ -4,6 +4,7 @@ from appliance.channel.alarms import AlarmList, activity, open_alarms
 from appliance.control.core import Alarms, ControlPart, Core
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
+from appliance.features.alarms.diagnostics import Diagnostics
 from appliance.features.alarms.requests import (
     LONGEST_SILENCE_SECONDS,
     AlarmAcknowledge,
@@ -84,10 +85,16 @@ class AlarmOrders:
 
 async def begin(core: Core) -> ControlPart:
     orders = AlarmOrders(core.alarms, core.trail)
+    work = {}
+    if core.settings.alarms_on_diagnostics:
+        work["the alarms on /diagnostics"] = Diagnostics(
+            core.alarms, core.relay, core.settings.publish_as
+        ).run
     return ControlPart(
         (
             RequestMethod(AlarmsWanted, orders.listed, order=False),
             RequestMethod(AlarmAcknowledge, orders.acknowledge, who=True),
             RequestMethod(AlarmSilence, orders.silence, who=True),
-        )
+        ),
+        work,
     )
