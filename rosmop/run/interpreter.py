@@ -466,6 +466,9 @@ class _Maker:
         return run
 
     def _skipper(self, skipper: nodes.Skipper) -> Callable[[wire.Buffer, int], int]:
+        strings = [one for one in skipper.body if isinstance(one, nodes.AfterText) and not one.at.offset]
+        if len(strings) == len(skipper.body) and not skipper.end.offset:
+            return partial(wire.texts_end, number=len(skipper.body))
         body, end = self.block(skipper.body), self._position(skipper.end)
 
         def skipped(buffer: wire.Buffer, start: int) -> int:

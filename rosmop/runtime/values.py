@@ -185,7 +185,10 @@ class ValueCodec:
     ) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
         decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
-        if code is None:
+        fields = self.fields(element) if isinstance(element, value_types.RecordType) else []
+        if fields and all(isinstance(field, value_types.StringType) for field in fields):
+            decode = partial(wire.rows, width=len(fields), check=self._check)
+        elif code is None:
             decode = partial(wire.elements, decode=self.decoder(element), check=self._check)
         elif len(code) == 2:
             decode = partial(wire.moments, code=code[0])

@@ -36,6 +36,12 @@ def text_end(buffer: Buffer, start: int) -> int:
     return int(start + 4 + _LENGTH.unpack_from(buffer, start)[0])
 
 
+def texts_end(buffer: Buffer, start: int, number: int) -> int:
+    for _ in range(number):
+        start += 4 + _LENGTH.unpack_from(buffer, start)[0]
+    return start
+
+
 def require_end(buffer: Buffer, end: int) -> None:
     if end != len(buffer):
         raise MalformedError(f"it has {len(buffer)} bytes, and its last field ends at byte {end}")
@@ -63,6 +69,13 @@ def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[in
     return [pairs[i] * 1_000_000_000 + pairs[i + 1] for i in range(0, len(pairs), 2)], end
 
 
+def _require_few(number: int) -> None:
+    if number > _MAX_DECODED:
+        raise MalformedError(
+            f"an array of {counted(number, 'element')}; at most {_MAX_DECODED} that are not numbers are read"
+        )
+
+
 def elements(
     buffer: Buffer,
     start: int,
@@ -70,10 +83,7 @@ def elements(
     decode: Callable[[Buffer, int], tuple[_T, int]],
     check: Callable[[], None],
 ) -> tuple[list[_T], int]:
-    if number > _MAX_DECODED:
-        raise MalformedError(
-            f"an array of {counted(number, 'element')}; at most {_MAX_DECODED} that are not numbers are read"
-        )
+    _require_few(number)
     values = []
     for index in range(number):
         if not index % PART:
@@ -81,6 +91,26 @@ def elements(
         value, start = decode(buffer, start)
         values.append(value)
     return values, start
+
+
+def rows(
+    buffer: Buffer, start: int, number: int, width: int, check: Callable[[], None]
+) -> tuple[list[list[bytes]], int]:
+    """Like `elements`, of records of `width` strings: a diagnostic array has thousands of them."""
+    _require_few(number)
+    found = []
+    for index in range(number):
+        if not index % PART:
+            check()
+        row = []
+        for _ in range(width):
+            first = start + 4
+            start = first + _LENGTH.unpack_from(buffer, start)[0]
+            row.append(bytes(buffer[first:start]))
+        if start > len(buffer):
+            raise MalformedError(f"a string ends at byte {start} of a message of {len(buffer)}")
+        found.append(row)
+    return found, start
 
 
 def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
