@@ -235,6 +235,20 @@ EVIDENCE: Mapping[str, Evidence] = {
             "test_a_zone_that_a_thing_before_it_hides_is_not_free",
         ),
     ),
+    "diagnostics": Evidence(
+        ("no standard: the robot's own diagnostics",),
+        "a named entry at ERROR or STALE, in that message; one that is silent for `silent`",
+        "silent",
+        (
+            "the node of each entry notices its fault",
+            "each entry comes at least every `silent`, also while it is well",
+        ),
+        ("a fault that the robot's nodes do not notice", "a base that ignores a zero velocity"),
+        unit=(
+            "test_an_entry_that_is_bad_silent_or_missing_stops_the_base_until_a_zero",
+            "test_entries_have_a_name_a_beginning_or_a_hardware_id",
+        ),
+    ),
     "withhold": Evidence(
         ("no standard: privacy",),
         "the switch, in that message; a switch that is silent for `silent`",

@@ -104,6 +104,12 @@ def boolean(on: bool) -> bytes:
     return bytes([on])
 
 
+@functools.cache
+def diagnostics(level: int) -> bytes:
+    """Return an entry; nodes that say it are told apart."""
+    return message("diagnostic_msgs/DiagnosticArray", status=[{"name": "motor", "level": level}])
+
+
 def battery(charge: float) -> bytes:
     return message("sensor_msgs/BatteryState", percentage=charge)
 

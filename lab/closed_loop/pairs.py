@@ -13,7 +13,17 @@ import numpy as np
 
 from appliance.features.guards.presets import Guard, preset_named, text_of
 from lab.closed_loop.guard_run import Beside
-from lab.closed_loop.messages import FIX, ODOMETRY, SCAN, battery, boolean, odometry, position, scan
+from lab.closed_loop.messages import (
+    FIX,
+    ODOMETRY,
+    SCAN,
+    battery,
+    boolean,
+    diagnostics,
+    odometry,
+    position,
+    scan,
+)
 from lab.closed_loop.world import World
 from tests.support.features.guards.running_guard import Change, Value
 
@@ -45,6 +55,7 @@ SIDES: Mapping[str, Side] = {
     "estop": Side({"silent": 0.3}, {}, {"stop": boolean(False)}),
     "enable": Side({}, {}, {"by": boolean(True)}, {"by": boolean(False)}),
     "mode": Side({"silent": 0.3}, {}, {"by": boolean(False)}),
+    "diagnostics": Side({"silent": 0.3}, {}, {"by": diagnostics(0)}),
     "arm": Side({"silent": 0.3}, {}, {"by": battery(0.9)}),
     "agree": Side({"samples": 1}, {"by": ODOMETRY, "other": ODOMETRY}, {"other": _STANDS, "by": _STANDS}),
     "overspeed": Side({}, {"by": ODOMETRY}, {"by": _STANDS}),

@@ -1,10 +1,10 @@
-"""Worlds of the guards that follow what persons say: an enabling device (`enable`), and the mode (`mode`)."""
+"""Worlds of the guards that follow a word of each node: an enabling device, the mode, a part that is well or not."""
 
 import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from lab.closed_loop.messages import STILL, VELOCITIES, Legs, boolean, straight
+from lab.closed_loop.messages import STILL, VELOCITIES, Legs, boolean, diagnostics, straight
 from lab.closed_loop.world import NEVER, SLACK, World
 
 TICK = 20
@@ -61,7 +61,10 @@ class SwitchWorld(World):
         switch.on, switch.heard = on, self.now
         switch.was_off = switch.was_off or not on
         self.heard(switch)
-        self.say("by", boolean(on), node)
+        self.say("by", self.word(on), node)
+
+    def word(self, on: bool) -> bytes:
+        return boolean(on)
 
     def heard(self, switch: Switch) -> None:
         """Note what a switch says, before the guard gets it."""
@@ -189,6 +192,19 @@ class EnableWorld(SwitchWorld):
     def ended(self) -> None:
         if self.live and self.passing < 0.95 * self.sent:
             self.broken("live", f"of {self.sent} commands with a held device {self.passing} pass")
+
+
+class DiagnosticsWorld(EnableWorld):
+    """Parts of a base that are well, at ERROR or silent: each is like a device that nobody has to let go first."""
+
+    preset: ClassVar[str] = "diagnostics"
+
+    def word(self, on: bool) -> bytes:
+        return diagnostics(0 if on else self.random.choice((2, 3, 4, -1)))
+
+    def heard(self, switch: Switch) -> None:
+        switch.was_off = True
+        super().heard(switch)
 
 
 class ModeWorld(SwitchWorld):

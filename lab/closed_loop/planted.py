@@ -246,6 +246,14 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L2", "enable", "hears no silence", r"now - heard\[(\w+)\] <= silent", "true"),
     ("L2", "mode", "hears no silence", r"silent > 0 && !\(now - heard\[i\] <= silent\)", "false"),
     ("L2", "mode", "begins in automatic mode", r"manual = nodes.size\(\) == 0 \|\| crowded", "manual = crowded"),
+    ("L2", "diagnostics", "hears no silence", r"&& now - oldest <= silent", ""),
+    ("L2", "diagnostics", "takes STALE for well", r"level != 0 && \(warnings", "level == 2 && (warnings"),
+    ("L3", "diagnostics", "does not stop at a message", r"tell\(now\); passed = false; STOP;", ""),
+    ("L4", "diagnostics", "has one node", r'caller\(report\) == ""', "true"),
+    ("L4", "diagnostics", "asks the first entry alone", r"i < levels.size\(\)", "i < 1"),
+    ("L6", "diagnostics", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
+    ("L6", "diagnostics", "takes the zero of any node", r"standing == node \|\| standingToo == node", 'standing != ""'),
+    ("L6", "diagnostics", "takes a zero from before the stop", r'standing = "";\s+standingToo = "";', ""),
     ("L2", "overspeed", "takes NaN for slow", r"!\(v <= vMax && w <= wMax\)", "v > vMax || w > wMax"),
     ("L2", "overspeed", "hears no silence", r"return since <= silent &&", "return"),
     ("L2", "standstill", "takes NaN for known", r"known = isfinite\(v\) && isfinite\(w\);", "known = true;"),
@@ -322,7 +330,7 @@ FAULTS = {
         f"a hold of {preset} holds nothing": Fault("L5", preset, patch=(RunningGuard, "hold", lambda _guard: None))
         for preset in (
             "speed", "separation", "fence", "sensor", "estop", "arm", "agree", "sane", "enable", "mode", "overspeed",
-            "standstill", "zone",
+            "standstill", "zone", "diagnostics",
         )
     },
     **{

@@ -13,7 +13,7 @@ from lab.closed_loop.limits import RateWorld, SaneWorld, SpeedWorld
 from lab.closed_loop.measured import OverspeedWorld, StandstillWorld
 from lab.closed_loop.motion import FenceWorld, SeparationWorld
 from lab.closed_loop.pairs import SIDES, WITHOUT, paired
-from lab.closed_loop.people import EnableWorld, ModeWorld
+from lab.closed_loop.people import DiagnosticsWorld, EnableWorld, ModeWorld
 from lab.closed_loop.world import LAWS, Report, World
 from lab.closed_loop.zones import ZoneWorld
 from tests.support.features.guards.running_guard import Change, unchanged
@@ -23,6 +23,7 @@ WORLDS: dict[str, type[World]] = {
     for one in (
         DeadmanWorld, SpeedWorld, SeparationWorld, FenceWorld, SensorWorld, EstopWorld, ArmWorld, RateWorld, AgreeWorld,
         SaneWorld, EnableWorld, ModeWorld, OverspeedWorld, StandstillWorld, ZoneWorld, JointsWorld,
+        DiagnosticsWorld,
     )
 }  # fmt: skip
 
@@ -43,6 +44,7 @@ EACH_NODE = {
     ("estop", "stop"): "each node is a button: worlds of `estop`",
     ("estop", "reset"): "each node is a hand: worlds of `estop`",
     ("enable", "by"): "each node is a device: worlds of `enable`",
+    ("diagnostics", "by"): "the entries of each node count: worlds of `diagnostics`",
     ("mode", "by"): "each node says the mode: worlds of `mode`",
     (
         "withhold",

@@ -228,7 +228,7 @@ ON_OR_OFF.5: /(on|shadow|off)(?=<GAP>*\{)/
 _ROLE.5: /role(?=<GAP>+[A-Za-z_]\w*<GAP>*\()/
 ROW_TYPE.5: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['(])/
 CANCEL: "cancel"
-GIVEN_KIND.5: /(corners|joints|hosts|time)(?!\w)/
+GIVEN_KIND.5: /(corners|joints|entries|hosts|time)(?!\w)/
 GIVEN.5: /given(?!\w)/
 TOPIC_WORD.5: /topic(?!\w)/
 GIVEN_VALUE.9: /[^;={}]+/

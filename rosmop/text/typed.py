@@ -246,6 +246,10 @@ class _Maker:
                     self._table(node, "", f"{name}_names", [row[0] for row in rows] or [""])
                     self._table(node, "double", f"{name}_low", [row[1] for row in rows] or ["0"])
                     self._table(node, "double", f"{name}_high", [row[2] for row in rows] or ["0"])
+                case "entries":
+                    found = given_lists.entries(value)
+                    self._table(node, "", f"{name}_names", [row[0] for row in found])
+                    self._table(node, "int", f"{name}_ways", [row[1] for row in found])
                 case "hosts":
                     self.hosts[name] = given_lists.hosts(value)
                 case _:

@@ -1,4 +1,4 @@
-"""Read the values of given lists: corners of a polygon, limits of joints, hosts, and times.
+"""Read the values of given lists: corners of a polygon, limits of joints, names of entries, hosts, and times.
 
 An invalid value raises `ValueError` with the reason, which may be empty.
 """
@@ -40,6 +40,7 @@ EXAMPLES: Mapping[str, str] = MappingProxyType(
     {
         "corners": "-2,-2 2,-2 2,2 -2,2",
         "joints": "elbow:-1.5..1.5",
+        "entries": "Battery, Laser: *, hardware_id:0815",
         "time": "120s",
         "hosts": "10.0.0.7 10.8.0.0/16",
     }
@@ -49,6 +50,8 @@ NO_JOINTS = "none"
 _MOST_CORNERS = 100
 _NUMBER = re.compile(r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?", re.ASCII)
 _JOINT = re.compile(r"[\w/]++", re.ASCII)
+_ENTRY = re.compile(r"(hardware_id:)?([^;={},\"\\\x00-\x1f*]{0,200})(\*?)")
+_MOST_ENTRIES = 16
 _SPAN = re.compile(r"(\d{1,9}+(?:\.\d{1,9}+)?)(ms|s)", re.ASCII)
 
 
@@ -83,6 +86,19 @@ def joints(value: str) -> tuple[tuple[str, str, str], ...]:
     return tuple(rows)
 
 
+def entries(value: str) -> tuple[tuple[str, str], ...]:
+    """Return each text, and where entries have it: 0: name, 1: its beginning, 2: hardware_id, 3: its beginning."""
+    rows: list[tuple[str, str]] = []
+    for word in value.split(","):
+        found = _ENTRY.fullmatch(word.strip())
+        if found is None or not found[2] + found[3] or "//" in found[2] or "/*" in found[2]:
+            raise ValueError
+        rows.append((found[2], str(2 * bool(found[1]) + bool(found[3]))))
+    if len(rows) > _MOST_ENTRIES:
+        raise ValueError(f"at most {_MOST_ENTRIES} entries can be named")
+    return tuple(rows)
+
+
 def hosts(value: str) -> tuple[str, ...]:
     """Return the networks; an address is one too."""
     if not value.split():
@@ -108,6 +124,7 @@ def number(text: str) -> str:
 _READERS: Mapping[str, Callable[[str], object]] = {
     "corners": corners,
     "joints": joints,
+    "entries": entries,
     "time": nanoseconds,
     "hosts": hosts,
 }

@@ -117,6 +117,10 @@ role Battery(double percentage) {
     sensor_msgs/BatteryState '{percentage:percentage}';
 }
 
+role Diagnostics(diagnostic_msgs::DiagnosticStatus[] statuses) {
+    diagnostic_msgs/DiagnosticArray '{status:statuses}';
+}
+
 // A device that a person holds, such as the given button of a Joy.
 role Enabler(bool held) {
     std_msgs/Bool '{data:held}';

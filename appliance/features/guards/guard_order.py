@@ -20,6 +20,7 @@ PRECEDENCES = (
             "agree",
             "arm",
             "deadman",
+            "diagnostics",
             "enable",
             "estop",
             "fence",
@@ -38,6 +39,7 @@ PRECEDENCES = (
             "agree",
             "arm",
             "deadman",
+            "diagnostics",
             "enable",
             "estop",
             "fence",
@@ -66,7 +68,7 @@ PRECEDENCES = (
         ("arm", "sane"), ("rate",), "a command that has to be stopped may be dropped, and the base drives on"
     ),
     Precedence(
-        ("arm", "enable", "estop", "joints", "sensor"),
+        ("arm", "diagnostics", "enable", "estop", "joints", "sensor"),
         ("answer",),
         "a goal that was dropped is reported as late, and cancelled, after the deadline",
     ),

@@ -176,7 +176,7 @@ PRESETS = {
     name: Preset(name)
     for name in (
         "deadman", "speed", "separation", "fence", "sensor", "estop", "arm", "answer", "joints", "rate", "agree",
-        "sane", "enable", "mode", "overspeed", "standstill", "zone", "withhold",
+        "sane", "enable", "mode", "overspeed", "standstill", "zone", "diagnostics", "withhold",
     )
 }  # fmt: skip
 
@@ -352,7 +352,8 @@ def _made_for(text: str) -> dict[str, tuple[str, str]]:
             for name, topic in preset.given_topics.items()
         }
     settings = {name: value for name, value in head.settings.items() if value.startswith("/")}
-    pairs = ((name, value.partition(" ")) for name, value in (default | settings).items())
+    named = default.keys() or settings.keys()  # names of entries may also begin with /
+    pairs = ((name, value.partition(" ")) for name, value in (default | settings).items() if name in named)
     return {name: (topic, kind) for name, (topic, _, kind) in pairs}
 
 

@@ -26,6 +26,7 @@ RESULTS = _ROLES["Result"]
 POSES = _ROLES["Pose"]
 SCANS = _ROLES["Scan"]
 BATTERIES = _ROLES["Battery"]
+DIAGNOSTICS = _ROLES["Diagnostics"]
 VALUED = tuple(kind for kind in _ROLES["Sensor"] if "/" in kind)
 """The sensors whose values are judged; of all others, only the silence is."""
 GOAL = "control_msgs/FollowJointTrajectoryActionGoal"

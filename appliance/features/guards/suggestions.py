@@ -41,7 +41,8 @@ _STEADY_HZ = 5.0
 
 _MOST_TOPICS = 500
 _READ = {
-    *types.COMMANDS, *types.GOALS, *types.RESULTS, *types.POSES, *types.SCANS, *types.BATTERIES, _BOOL, _JOY,
+    *types.COMMANDS, *types.GOALS, *types.RESULTS, *types.POSES, *types.SCANS, *types.BATTERIES, *types.DIAGNOSTICS,
+    _BOOL, _JOY,
     "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
 }  # fmt: skip
 """The types from which the advice follows."""
@@ -178,6 +179,21 @@ class _Writer:
             self._add("arm", base, _silence(batteries[0], 5, 5, 600), topics={"by": batteries[0].name})
         elif batteries:
             self._leave("arm", base, "several batteries fit", batteries)
+        self._add_diagnostics(base)
+
+    def _add_diagnostics(self, base: TopicFacts) -> None:
+        found = self.graph.sources(base, types.DIAGNOSTICS)
+        found = [topic for topic in found if self.graph.derived_from(topic, found)] or found
+        if len(found) > 1:
+            self._leave("diagnostics", base, "several topics have diagnostics", found)
+        elif found:
+            name = found[0].name
+            self._add("diagnostics", base, topics={"by": name})
+            self._say(
+                f"diagnostics of {base.name}: whether a motion needs each entry of {name}, and how often it comes, is"
+                f" not known: read the entries with rosrv topic echo {name}, and name those that count, such as"
+                " named='Motor, Laser: *'"
+            )
 
     def add_arm_velocity(self, arm: TopicFacts) -> None:
         self._add("deadman", arm, _silence(arm, 5, 0.2, 2))

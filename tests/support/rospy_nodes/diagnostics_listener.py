@@ -14,7 +14,8 @@ def heard(message):
     array.deserialize(message._buff)
     late = abs(rospy.get_time() - array.header.stamp.to_sec()) > LATE
     statuses = {
-        one.name: {"level": one.level, "message": one.message, "hardware": one.hardware_id} for one in array.status
+        one.name: {"level": one.level, "message": one.message, "hardware": one.hardware_id}
+        for one in array.status
     }
     report("received", publisher=header["callerid"], late=late, statuses=statuses)
 

@@ -112,6 +112,14 @@ BATTERY = stream("sensor_msgs/BatteryState", 5, {"percentage": 0.8})
 FIX = stream("sensor_msgs/NavSatFix", 5, {"latitude": 48.0, "longitude": 11.0})
 OFF = stream("std_msgs/Bool", 10, {})
 ON = stream("std_msgs/Bool", 10, {"data": True})
+DIAGNOSTICS = stream(
+    "diagnostic_msgs/DiagnosticArray", 5,
+    {"status": [
+        {"name": f"/Robot/Sensors/part {part}: Status", "message": "it works", "hardware_id": f"0815-{part}",
+         "values": [{"key": f"measured value {number}", "value": "17.25"} for number in range(20)]}
+        for part in range(60)
+    ]},
+)  # fmt: skip
 HELD = stream("std_msgs/Bool", 20, {}, *11 * ({"data": True},))
 """An enabling device that is let go at times: it has to be, before it counts as held."""
 PRESSED = stream("std_msgs/Bool", 10, *2 * ({},), *2 * ({"data": True},))
@@ -148,6 +156,7 @@ def rows(rays: int = RAYS[-1]) -> list[Row]:
         Row("arm", {"command": VELOCITY, "by": BATTERY, "fix": FIX, "check": ON},
             {"needFix": "true", "needCheck": "true"}),
         Row("deadman", {"command": VELOCITY}),
+        Row("diagnostics", {"command": VELOCITY, "by": DIAGNOSTICS}),
         Row("driver_check", {"command": VELOCITY, "by": ODOMETRY}),
         Row("enable", {"command": VELOCITY, "by": HELD}),
         Row("estop", {"command": VELOCITY, "stop": OFF, "reset": PRESSED}),

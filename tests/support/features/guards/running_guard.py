@@ -50,7 +50,9 @@ def part_with(
     another text of it. The part also has the guards of the texts `before` and `behind` it.
     """
     in_text = tuple(
-        (name, str(value).lower()) for name, value in values.items() if name in _loaded_values(preset)
+        (name, str(value).lower() if isinstance(value, bool) else str(value))
+        for name, value in values.items()
+        if name in _loaded_values(preset)
     )
     given = {name: value for name, value in values.items() if name not in _loaded_values(preset)}
     text = change(_text(preset, tuple(types.items()), in_text))

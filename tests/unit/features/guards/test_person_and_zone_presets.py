@@ -395,3 +395,95 @@ def test_a_muted_zone_stops_again_after_its_time_or_without_the_signal() -> None
     for at in range(700, 1300, 100):
         guard.tell("by", scan(NEAR), at, "/b")
     assert 1100 < stops(guard)[-1] <= 1220
+
+
+def diagnostics(*entries: tuple[str, int] | tuple[str, int, str]) -> bytes:
+    fields = ("name", "level", "hardware_id")
+    status = [dict(zip(fields, entry, strict=False)) for entry in entries]
+    return message("diagnostic_msgs/DiagnosticArray", status=status)
+
+
+WELL = ("motor", 0)
+
+
+@pytest.mark.parametrize(
+    ("later", "values", "passes"),
+    [
+        ([("/b", ("motor", 0))], {}, True),
+        ([("/b", ("motor", 1))], {}, True),
+        ([("/b", ("motor", 1))], {"warnings": True}, False),
+        *(([("/b", ("motor", level))], {}, False) for level in (2, 3, 4, -1)),
+        ([("/b", ("other", 0))], {}, False),  # the entry no longer comes, while another one of its node does
+        ([("/c", ("motor", 0))], {}, False),  # another node does not stand for it
+        ([("/b", ("motor", 0)), ("/c", ("motor", 2))], {}, False),
+        ([("/c", ("motor", 2)), ("/b", ("motor", 0))], {}, False),
+        ([("/b", ("motor", 2), ("motor", 0))], {}, False),  # of two with one name the worse
+        ([("/b", ("motor", 0), ("motor", 2))], {}, False),
+        ([("/b", ("motor", 0), *((f"part {number}", 0) for number in range(63)))], {}, True),
+        ([("/b", ("motor", 0), *((f"part {number}", 0) for number in range(64)))], {}, False),
+        ([], {}, False),
+    ],
+)
+def test_an_entry_that_is_bad_silent_or_missing_stops_the_base_until_a_zero(
+    later: list[Any], values: dict[str, Any], passes: bool
+) -> None:
+    guard = Guarded("diagnostics", silent=1, **values)
+    assert not moves(guard, STILL, 0)
+    assert not moves(guard, SLOW, 10)
+    guard.tell("by", diagnostics(WELL), 20, "/b")
+    assert not moves(guard, SLOW, 30), "a node commands zero first"
+    moves(guard, STILL, 40)
+    assert moves(guard, SLOW, 50)
+    for node, *entries in later:
+        guard.tell("by", diagnostics(*entries), 900, node)
+    assert moves(guard, SLOW, 1060) == passes
+    if not passes:
+        assert 900 <= stops(guard)[-1] <= 1060
+        guard.monitors.give({"guard": {"forget": 1}})
+        assert not moves(guard, STILL, 1070)
+        guard.tell("by", diagnostics(WELL), 1080, "/b")
+        assert not moves(guard, SLOW, 1090), "what comes again starts nothing"
+        moves(guard, STILL, 1100)
+        assert moves(guard, SLOW, 1110)
+
+
+@pytest.mark.parametrize(
+    ("named", "missing", "met"),
+    [
+        ("motor", ("motor 2", 0), ("motor", 0)),
+        ("motor*", ("a motor", 0), ("motor 2", 0)),
+        ("/Robot/*", ("Robot", 0), ("/Robot/Arm", 0)),
+        ("hardware_id:0815", ("0815", 0, "08151"), ("motor", 0, "0815")),
+        ("hardware_id:08*", ("08", 0, "18"), ("motor", 0, "0815")),
+        ("motor, laser: *", ("motor", 0), ("laser: status", 0)),
+    ],
+)
+def test_entries_have_a_name_a_beginning_or_a_hardware_id(named: str, missing: Any, met: Any) -> None:
+    guard = Guarded("diagnostics", named=named)
+    guard.tell("by", diagnostics(missing, ("unnamed", 2)), 0, "/b")
+    moves(guard, STILL, 10)
+    assert not moves(guard, SLOW, 20)
+    guard.tell("by", diagnostics(missing, met, ("unnamed", 2)), 30, "/b")
+    moves(guard, STILL, 40)
+    assert moves(guard, SLOW, 50)
+    guard.tell("by", diagnostics(missing, (met[0], 2, *met[2:]), ("unnamed", 0)), 60, "/b")
+    assert not moves(guard, SLOW, 70)
+
+
+def test_the_cause_of_a_stop_has_the_entry_its_node_and_the_limit() -> None:
+    guard = Guarded("diagnostics", silent=1, named="motor, laser: *")
+
+    def cause(at: int) -> str:
+        [line] = guard.tell("command", SLOW, at).log
+        return line.text
+
+    assert cause(0) == "stopped: no entry of the diagnostics has come whose name is 'motor'"
+    guard.tell("by", diagnostics(WELL), 500, "/b")
+    assert cause(2000) == "stopped: no entry of the diagnostics has come whose name begins with 'laser: '"
+    guard.tell("by", diagnostics(("laser: status", 2)), 2500, "/c")
+    assert cause(4000) == "stopped: motor from /b has not come for 3.5 s (limit 1.0 s)"
+    guard.tell("by", diagnostics(WELL), 4100, "/b")
+    assert cause(5500) == "stopped: motor from /b has not come for 1.4 s (limit 1.0 s)"
+    guard.tell("by", diagnostics(WELL), 5600, "/b")
+    guard.tell("by", diagnostics(("laser: status", 2)), 5600, "/c")
+    assert cause(6500) == "stopped: laser: status from /c is at level 2 (limit 1)"

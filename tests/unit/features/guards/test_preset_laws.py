@@ -56,6 +56,7 @@ EVIDENCE: dict[str, Callable[[int], Values]] = {
     "sensor_msgs/BatteryState": lambda _k: {"percentage": 0.9},
     "sensor_msgs/Joy": lambda _k: {},
     "std_msgs/Bool": lambda _k: {"data": False},
+    "diagnostic_msgs/DiagnosticArray": lambda _k: {"status": [{"name": "motor"}]},
 }
 """Good evidence by type; `k` counts the messages."""
 
@@ -104,6 +105,7 @@ RECIPES = {
     "mode": Recipe({"vMax": 0, "wMax": 0}, velocities="bounded"),
     "overspeed": Recipe(),
     "standstill": Recipe(),
+    "diagnostics": Recipe({"silent": 0.5}),
     "zone": Recipe({"clear": 0}, {"mute": "std_msgs/Bool"}),
 }
 
@@ -168,6 +170,12 @@ REASONS: dict[tuple[str, str, str, str], str] = {
         "*",
         "*",
     ): "muting is off by default: `test_muting_is_off_by_default_bounded_and_needs_a_signal_that_changes`",
+    (
+        "diagnostics",
+        "by",
+        "statuses",
+        "*",
+    ): "`test_an_entry_that_is_bad_silent_or_missing_stops_the_base_until_a_zero` has the levels and names",
     ("*", "*", "status", "NaN"): "a whole number has no NaN",
     ("sensor", "by", "altitude", "NaN"): "an altitude is not known without a fix in three dimensions",
     ("*", "*", "fixed", "NaN"): "a whole number has no NaN",

@@ -17,6 +17,8 @@ from appliance.features.guards.presets import (
     head_of,
     preset_of,
     text_of,
+    topics_in,
+    values_in,
     with_values,
 )
 from appliance.supervisor.sandbox.private_view import program_folders
@@ -114,6 +116,12 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
     assert {one.topic for one in code.events if one.topic} == {"/base/cmd", "/pose"}
 
 
+def test_a_name_of_an_entry_is_no_topic() -> None:
+    text = text_of(Guard("guard", PRESETS["diagnostics"], values={"named": " /Robot/*,Battery: (A) "}))
+    assert topics_in(text) == {"command": "/cmd_vel", "by": "/diagnostics"}
+    assert values_in(text)["named"] == "/Robot/*,Battery: (A)"
+
+
 def test_a_preset_statement_is_read_however_it_is_written() -> None:
     guard = Guard("yard", PRESETS["fence"], {"command": "/base/cmd"}, values={"margin": "0.5"})
     text = text_of(guard)
@@ -146,6 +154,11 @@ WRONG = [
     ("joints", "base", {}, {}, {"limits": 'a":1..2'}, "write it like limits="),
     ("joints", "base", {}, {}, {"limits": "a:10..20 " * 60 + "x"}, "write it like limits="),
     ("answer", "base", {}, {}, {"limit": "5"}, "write it like limit="),
+    *(
+        ("diagnostics", "base", {}, {}, {"named": named}, "write it like named=")
+        for named in ("", "a,,b", "a*b", "a;b", "a}", "a//b", "a/*b", "hardware_id:")
+    ),
+    ("diagnostics", "base", {}, {}, {"named": ", ".join("a" * 17)}, "at most 16 entries can be named"),
     ("withhold", "base", {}, {}, {"hosts": "tablet"}, "write it like hosts="),
     ("speed", "a b", {}, {}, {}, "not a name of a monitor"),
     ("speed", "base", {"command": "cmd"}, {}, {}, "not the name of a topic"),

@@ -286,3 +286,37 @@ def test_topics_of_another_host_crowd_out_none_of_the_robot() -> None:
     assert "/cmd_vel" in {one.command for one in advice(graph).proposals} | {
         topic for one in advice(graph).proposals for topic in one.topics.values()
     }
+
+
+@pytest.mark.parametrize(
+    ("more", "by"),
+    [
+        ({}, "/diagnostics"),
+        (
+            {"/diagnostics_agg": "/diagnostics"},
+            "/diagnostics_agg",
+        ),  # an aggregator keeps silent entries, as STALE
+        ({"/own/diagnostics": "/odom"}, ""),
+    ],
+)
+def test_diagnostics_stop_the_base_with_all_entries_until_a_person_names_those_that_count(
+    more: dict[str, str], by: str
+) -> None:
+    array = "diagnostic_msgs/DiagnosticArray"
+    heard = {name: tuple(f"/of{name}" for name, other in more.items() if other == of) for name, of in
+             {"/diagnostics": "/diagnostics", "/odom": "/odom"}.items()}  # fmt: skip
+    graph = [
+        TopicFacts("/cmd_vel", "geometry_msgs/Twist", ("/teleop",), ("/base",), 10.0),
+        TopicFacts("/odom", "nav_msgs/Odometry", ("/base",), heard["/odom"], 50.0),
+        TopicFacts("/diagnostics", array, ("/base", "/laser"), heard["/diagnostics"], 2.0),
+        *(TopicFacts(name, array, (f"/of{name}",), (), 1.0) for name in more),
+    ]
+    found = advice(graph)
+    assert [one.topics["by"] for one in found.proposals if one.preset == "diagnostics"] == [by] * bool(by)
+    [said] = [sentence for sentence in found.left_out if sentence.startswith("diagnostics of /cmd_vel")]
+    assert ("is not known" in said) == bool(by)
+    for topic in graph:
+        if topic.type == array:
+            unheard = [one if one is not topic else one._replace(publishers=()) for one in graph]
+            names = {one.topics.get("by") for one in advice(unheard).proposals if one.preset == "diagnostics"}
+            assert topic.name not in names

@@ -33,13 +33,14 @@ GOOD = {
     "estop": {"stop": message("std_msgs/Bool"), "reset": message("std_msgs/Bool")},
     "enable": {"by": message("std_msgs/Bool", data=True)},
     "mode": {"by": message("std_msgs/Bool")},
+    "diagnostics": {"by": message("diagnostic_msgs/DiagnosticArray", status=[{"name": "motor"}])},
     "overspeed": {"by": ODOMETRY},
     "standstill": {"by": ODOMETRY},
     "zone": {"by": SCAN, "mute": message("std_msgs/Bool")},
 }  # fmt: skip
 """For each preset with a safe velocity that observes topics: messages after which the base may move."""
 VALUES = {"zone": {"clear": "0"}, "arm": {"needFix": "true", "needCheck": "true"}}
-SPEAKERS = {"enable": ("by",), "mode": ("by",)}
+SPEAKERS = {"diagnostics": ("by",), "enable": ("by",), "mode": ("by",)}
 """Topics on which each node has a say, so that the guard holds its topics until each has spoken again."""
 BEFORE = {"enable": {"by": message("std_msgs/Bool")}}
 """Messages that come once before these."""
