@@ -34,7 +34,7 @@ RAYS = (180, 360, 720, 1080, 1650)
 JOINTS = [f"joint_{number}" for number in range(7)]
 POINTS = 50
 GARBAGE = (b"\xff" * 7).hex()
-SILENCE = 2.5
+SILENCE = 3.5
 """Seconds: longer than each preset permits by default."""
 ARRIVAL = 2.0
 """Seconds after which a message counts as lost."""
