@@ -1,8 +1,9 @@
-"""Compile `age(event)`, `seen(event)`, `host(event)`, `caller(event)` and `altered(event)`.
+"""Compile `age(event)`, `seen(event)`, `host(event)`, `caller(event)`, `altered(event)` and `topic(event)`.
 
 Variables keep the time when the event last happened (-1: never), and its sender, so they are saved, restored
 and undone, and each slice has its own. They are assigned after the action, unless it dropped the message or
 faulted. In the action itself, `host` and `caller` are the sender of its message. `altered` is only known there.
+`topic` is a literal.
 """
 
 import math
@@ -17,19 +18,21 @@ from rosmop.types import value_types
 from rosmop.types.messages import nearest, shown
 
 SENDER = ("host", "caller")
-ALTERED = "altered"
-FUNCTIONS = frozenset({"age", "seen", ALTERED, *SENDER})
+ALTERED, TOPIC = "altered", "topic"
+FUNCTIONS = frozenset({"age", "seen", ALTERED, TOPIC, *SENDER})
 
 
 def declare_facts(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    events = {
-        event.name: event for event in specification.events if isinstance(event.trigger, tree.MessageTrigger)
+    events = {event.name: event for event in specification.events}
+    names.events = {
+        event.name: event.trigger.topic
+        for event in specification.events
+        if isinstance(event.trigger, tree.MessageTrigger)
     }
-    names.events = [*events]
     for fact, event in dict.fromkeys(_asked(specification)):
-        if event in events and not (names.parameters and fact in SENDER):
+        if event in names.events and not (names.parameters and fact in SENDER):
             kind = value_types.STRING if fact in SENDER else value_types.LONG
             code, position = shared.symbols.fresh("g"), events[event].position
             variable = Variable(_name(fact, event), kind, code, position, shared=True, constant=True)
@@ -61,6 +64,9 @@ def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Valu
     event = _event(scope, node, function)
     if function in SENDER:
         return _sender(scope, node, function, event)
+    if function == TOPIC:
+        literal = nodes.Literal(value_types.STRING, scope.names.events[event].encode())
+        return Value(literal, node.position)
     if function == ALTERED:
         if event != scope.handled.event:
             text = f"`altered({event})` is only known in the `when` and the action of `{event}`"

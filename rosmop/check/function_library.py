@@ -138,6 +138,22 @@ long index(auto names, std::string name) {
     for (long i = 0; i < names.size(); i++) { if (names[i] == name) { return i; } }
     return -1;
 }
+std::string sender(std::string node, std::string host) {
+    if (node == "") { return "a monitor"; }
+    if (host == "") { return node; }
+    return node + " of " + host;
+}
+std::string silence(std::string topic, std::string node, std::string host, double since, double limit) {
+    if (since == INFINITY) { return "no message on " + topic + " since the guard began"; }
+    char text[100];
+    snprintf(text, 100, " for %.2f s (limit %g s)", since, limit);
+    return "no message from " + sender(node, host) + " on " + topic + text;
+}
+std::string intrusion(std::string topic, std::string node, std::string host, double since, double limit) {
+    char text[100];
+    snprintf(text, 100, ", last %.2f s ago (limit %g s)", since, limit);
+    return sender(node, host) + " also publishes on " + topic + text;
+}
 bool isfinite_all(auto values) {
     for (long i = 0; i < values.size(); i++) { if (!isfinite(values[i])) { return false; } }
     return true;

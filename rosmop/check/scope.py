@@ -59,7 +59,8 @@ class SpecificationNames:
     parameters: dict[str, Variable] = field(default_factory=dict)
     misdeclared: set[str] = field(default_factory=set)
     """Names with rejected declarations; using them is not reported again."""
-    events: list[str] = field(default_factory=list)
+    events: dict[str, str] = field(default_factory=dict)
+    """The topic of each event with a message."""
     uses: set[str] = field(default_factory=set)
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
     lent: list[ConstantReference] = field(default_factory=list)

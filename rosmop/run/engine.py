@@ -559,7 +559,7 @@ class MonitorSet:
         """Send the safe messages until a message comes on the topic."""
         for monitor in self._monitors:
             if monitor.enabled and topic in monitor.safes:
-                monitor.starting.add(topic)
+                monitor.starting[topic] = "an operator stopped it"
         self._agenda.schedule()
 
     def holds_if_lost(self, code: SpecificationCode) -> bool:

@@ -131,7 +131,7 @@ class MonitorExecution:
             if step.first:
                 monitor = step.monitor
                 monitor.context.begin()
-                monitor.starting.discard(message.channel or "")
+                monitor.starting.pop(message.channel or "", None)
                 source = monitor.sources.get(message.channel or "")
                 if source is not None and (source.waits or source.speakers):
                     if not source.hears(self._node()):
@@ -204,7 +204,7 @@ class MonitorExecution:
                 outcome.events = (*outcome.events, *alone.events)
                 outcome.log = [*outcome.log, *alone.log]
         for monitor in acting:
-            monitor.starting.discard(lane.topic)
+            monitor.starting.pop(lane.topic, None)
         for monitor in judging:
             self._see(monitor, outcome.time)
         steps[0].monitor.touch()

@@ -264,8 +264,8 @@ class _Maker:
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
         block = self.block(statements)
-        if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or self._marks_field(node)
-                   for node in nodes.walk(tuple(statements))):  # fmt: skip
+        if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish | nodes.Log)
+                   or self._marks_field(node) for node in nodes.walk(tuple(statements))):  # fmt: skip
             return block
         look = self._look(site)
 

@@ -179,8 +179,8 @@ class MonitorInstance:
     group: MonitorGroup | None = None
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
     safes: dict[str, SafeSender] = field(default_factory=dict)
-    starting: set[str] = field(default_factory=set)
-    """The topics with a safe message on which no message has come since the last start."""
+    starting: dict[str, str] = field(default_factory=dict)
+    """The topics with a safe message on which no message has come, and since when, in words: the last start."""
     sources: dict[str, Origin] = field(default_factory=dict)
     """The observed topics of a monitor declared `begin`."""
 
@@ -220,7 +220,7 @@ class MonitorInstance:
         return [sender for topic, sender in self.safes.items() if blocks or topic in self.starting]
 
     def start_anew(self) -> None:
-        self.starting = {*self.safes}
+        self.starting = dict.fromkeys(self.safes, "the guard began")
 
     def await_sources(self) -> None:
         for source in self.sources.values():
