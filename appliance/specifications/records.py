@@ -64,7 +64,9 @@ class StoppedTopic(msgspec.Struct, frozen=True):
     record: str = ""
     """The record of its begin."""
     publisher: tuple[str, str] = ("", "")
-    """Host and node of the topic's only publisher, if a timer led to the stop."""
+    """Host and node of the topic's only publisher, or of the last one that has ended, if a timer led to the stop."""
+    present: str = ""
+    """The cause that its last report had, while it goes on: that of the begin may have ended."""
 
 
 @dataclass(slots=True)
@@ -188,21 +190,31 @@ class Stops:
 
     def take(self, event: MonitorEvent, now: float) -> StoppedTopic | None:
         """Return the stop if it begins with this event."""
+        cause = str(event.detail.get("cause", ""))
         key, last = (event.monitor, event.resource), int(event.detail.get("last_time") or event.time)
         going = self._going.get(key)
         if going is not None:
             stop = going.stop
             count, until = stop.count + (event.count or 1), max(stop.until, last)
-            going.stop = self.last[event.monitor] = msgspec.structs.replace(stop, count=count, until=until)
+            going.stop = self.last[event.monitor] = msgspec.structs.replace(
+                stop, count=count, until=until, cause=stop.cause or cause, present=cause or stop.present
+            )
             going.at = now
             return None
         if key not in self._allowances and len(self._allowances) >= _MOST:
             self._allowances = {one: each for one, each in self._allowances.items() if not each.full(now)}
         allowance = self._allowances.setdefault(key, _Allowance(STOPS, LONG_QUIET, STOPS, now))
         first = int(event.detail.get("first_time") or event.time)
-        cause, count = str(event.detail.get("cause", "")), event.count or 1
         found = StoppedTopic(
-            *key, first, last, count, cause, event.host, event.caller_id, publisher=_only(event)
+            *key,
+            first,
+            last,
+            event.count or 1,
+            cause,
+            event.host,
+            event.caller_id,
+            publisher=_only(event),
+            present=cause,
         )
         self._going[key] = _Going(found, now, QUIET if allowance.take(now) else LONG_QUIET)
         self.last[event.monitor] = found

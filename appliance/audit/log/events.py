@@ -108,9 +108,10 @@ EVENTS: dict[str, str] = {
     "monitor published": "A monitor published a message; `at` is the location of the statement, `conditions` the"
     " conditions that led there; `handler` is the verdict whose handler ran, with its `why`.",
     "stop begun": "A monitor stops a topic: it sends its safe message, or puts it in the place of messages. `detail`"
-    " has `monitor`, `cause` (its own line, a fault, why it cannot judge, or the values that it compared), and what"
+    " has `monitor`, `cause` (its own line, a fault, or why it cannot judge), and what"
     " `message changed` or `monitor published` has of this message; `host` and `caller_id` are those of the message"
-    " that led to it, and `publishers` has the nodes that publish the topic if a timer did.",
+    " that led to it, and `publishers` has the nodes that publish the topic if a timer did, or the last one, which has"
+    " `ended`.",
     "stop ended": "A stop has ended; `detail` has `since` and `until` (its first and last action), `seconds`, the"
     " number of `actions`, its `cause`, and the record of its begin in `begun_in`. With `unknown_end`, control ended"
     " during the stop, so `until` is only what it knew.",

@@ -41,13 +41,22 @@ class LastStop(msgspec.Struct, frozen=True):
     since: Annotated[Moment, doc("its first action, in seconds since the epoch")]
     until: Annotated[Moment | None, doc("its last action, or null while it goes on")]
     actions: Annotated[int, doc("the safe messages so far")]
-    cause: Annotated[str, doc("the guard's own line, a fault, or why it cannot judge")]
+    cause: Annotated[
+        str,
+        doc(
+            "why it stops now, or if it has ended, why it began: a sentence of the guard with the values and limits"
+            " that it compared, a fault, or why it cannot judge"
+        ),
+    ]
     host: Annotated[str, doc("the host of the message that led to it, or empty if a timer did")]
     node: Annotated[str, doc("the node of that message")]
     record: Annotated[str, doc("the audit record `stop begun`")]
     publisher_host: Annotated[
         str,
-        doc("if a timer led to it: the host of the only publisher, or empty if there were several or none"),
+        doc(
+            "if a timer led to it: the host of the topic's only publisher, or of the last one that has ended; empty if"
+            " there were several"
+        ),
     ] = ""
     publisher_node: Annotated[str, doc("the node of that publisher")] = ""
 

@@ -483,7 +483,7 @@ class GuardOrders:
             stop.since / 1e9,
             until,
             stop.count,
-            stop.cause,
+            stop.present if until is None else stop.cause,
             stop.host,
             stop.node,
             stop.record,

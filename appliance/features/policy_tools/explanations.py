@@ -229,7 +229,8 @@ def _of_stop(detail: Mapping[str, Any]) -> Iterator[str]:
     if "cause" in detail:
         yield f"cause: {detail['cause']}"
     for publisher in map(_mapping, _list(detail.get("publishers"))):
-        yield f"published by: {publisher.get('node')} on {publisher.get('host')}"
+        words = "last published by" if publisher.get("ended") else "published by"
+        yield f"{words}: {publisher.get('node')} on {publisher.get('host')}"
 
 
 def _recorded(record: AuditRecord) -> Iterator[str]:

@@ -139,6 +139,11 @@ class Senders:
     def point(self, number: int) -> ObservationPoint | None:
         return self._points.get(number)
 
+    def last(self, topic: str, node: str = "") -> ObservationPoint | None:
+        """Return the last publisher of a topic, also after its end, or this node."""
+        every = (self._points[number] for number in reversed(self._points))
+        return next((one for one in every if one.resource == topic and node in ("", one.caller_id)), None)
+
 
 class ObservedMessage:
     """A message of a publication: its position in the batch, and the first bytes of its header, if it has one.

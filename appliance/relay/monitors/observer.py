@@ -32,8 +32,11 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
 _EXPLAINED = 10
-_LINE_NS = 10_000_000_000
-"""How long a monitor's last line explains its stops: the line may be throttled."""
+CAUSE = "stopped: "
+"""The beginning of a line that has the cause of a stop."""
+_SILENCE = "no message "
+_LINE_NS = 2_000_000_000
+"""How long a monitor's last cause explains its stops: presets print it once a second."""
 _MOST_STOPPING = 1000
 _PUBLISHERS = 8
 """The most publishers that the report of a stop names."""
@@ -77,7 +80,9 @@ class Observer:
         self._again: dict[tuple[tuple[str, ...], ObservationPoint, bool], int] = {}
         self._stopping: dict[tuple[tuple[str, ...], ObservationPoint], bool] = {}
         """Whether the last change that was compared, by its events and point, was a stop: the module only counts."""
-        self._lines: dict[str, tuple[int, str]] = {}
+        self._causes: dict[str, tuple[int, str]] = {}
+        self._unjudged: dict[str, tuple[int, str]] = {}
+        """By monitor: when a message that it observes was last over its budget, and in words."""
         self._owed: list[FastPathCounts] = []
 
     def take(self, monitors: MonitorSet) -> None:
@@ -85,7 +90,9 @@ class Observer:
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
         self._sum_up(time)
-        self._lines = {name: line for name, line in self._lines.items() if name in names}
+        for known in (self._causes, self._unjudged):
+            for name in known.keys() - {*names}:
+                del known[name]
         self._counters = {name: MonitorRow(name) if name in began else self._counter(name) for name in names}
 
     def shows(self, point: ObservationPoint) -> bool:
@@ -178,30 +185,48 @@ class Observer:
         return bool(self._monitors and not self._prefix and self._monitors.only_stops(event))
 
     def _cause(self, outcome: Outcome, monitor: str, topic: str) -> Mapping[str, object]:
-        """Return why a monitor stops a topic: its own last line, the fault, or why it cannot judge."""
-        assert self._monitors is not None  # noqa: S101  they have stopped it
-        lines = [line.text for line in outcome.log if line.monitor == monitor]
-        faults = [fault.text for fault in outcome.faults if fault.monitor == monitor]
-        instance = self._monitors.monitor(monitor)
-        cause = ""
-        if faults:
-            cause = f"a fault: {faults[-1]}"
-        elif lines:
-            cause = lines[-1]
-        elif instance.held:
-            cause = (
-                f"it holds its topics: {instance.why_held}" if instance.why_held else "it holds its topics"
-            )
-        elif instance.broken:
-            cause = "its initial values or `init` faulted"
-        elif topic in instance.starting:
-            cause = "no command has come since it began"
-        else:
-            said, line = self._lines.get(monitor, (0, ""))
-            cause = line if said and outcome.time - said <= _LINE_NS else _compared(outcome)
-        nodes = [] if outcome.timer is None else self._publishers(topic)
-        found = [{"node": one.caller_id, "host": one.host} for one in nodes[:_PUBLISHERS]]
+        """Return why a monitor stops a topic, and who publishes it if that is no sender of the outcome."""
+        cause = self._words(outcome, monitor, topic)
+        nodes = [] if outcome.timer is None else self._publishers(topic)[:_PUBLISHERS]
+        found = [{"node": one.caller_id, "host": one.host} for one in nodes]
+        if outcome.timer is not None and not nodes and (last := self.senders.last(topic)) is not None:
+            found = [{"node": last.caller_id, "host": last.host, "ended": True}]
         return {**({"cause": cause} if cause else {}), **({"publishers": found} if found else {})}
+
+    def _words(self, outcome: Outcome, monitor: str, topic: str) -> str:
+        """Return the cause of a stop: a fault, why the monitor cannot judge, or its own line."""
+        assert self._monitors is not None  # noqa: S101  they have stopped it
+        instance = self._monitors.monitor(monitor)
+        faults = [fault.text for fault in outcome.faults if fault.monitor == monitor]
+        own = _own_cause(outcome, monitor)
+        if faults:
+            return f"a message of {topic} could not be judged: {faults[-1]}"
+        if instance.held:
+            why = f": {instance.why_held}" if instance.why_held else ""
+            return f"it holds its topics until an operator resumes it{why}"
+        if instance.broken:
+            return "its start had a fault"
+        if instance.awaits and (not own or own.startswith(_SILENCE)):
+            awaited = (
+                f"{self._sender(node, on)} on {on}"
+                for on, source in instance.sources.items()
+                for node in source.awaited
+            )
+            return f"no readable message from {', '.join(awaited)} since the guard began again"
+        if own:
+            time, why = self._unjudged.get(monitor, (0, ""))
+            judged = not own.startswith(_SILENCE) or not time or outcome.time - time > _LINE_NS
+            self._causes[monitor] = outcome.time, own if judged else why
+        elif topic in instance.starting:
+            return f"no command on {topic} since {instance.starting[topic]}"
+        said, cause = self._causes.get(monitor, (0, ""))
+        return cause if said and outcome.time - said <= _LINE_NS else ""
+
+    def _sender(self, node: str, topic: str) -> str:
+        if node == "\0":
+            return "further nodes"
+        point = self.senders.last(topic, node) if node else None
+        return f"{node or 'a monitor'} of {point.host}" if point is not None else node or "a monitor"
 
     def _send(self, outcome: Outcome) -> None:
         for earlier in outcome.before:
@@ -228,7 +253,6 @@ class Observer:
         time: int,
         observed: ObservedMessage | None = None,
     ) -> None:
-        self._lines[monitor] = time, text
         self._observations.note(
             f"{self._prefix}log",
             monitor,
@@ -254,7 +278,8 @@ class Observer:
         if len(self._stopping) >= _MOST_STOPPING:
             self._stopping.clear()
         self._stopping[events, point] = safe
-        if point in self._second.shown:
+        explained = safe and _own_cause(outcome, _monitor(events[-1]))
+        if point in self._second.shown and not explained:
             self._again[events, point, safe] = self._again.get((events, point, safe), 0) + 1
             return
         self._second.shown.add(point)
@@ -429,6 +454,10 @@ class Observer:
     def _faults(self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None) -> None:
         for fault in outcome.faults:
             where = fault.position
+            if fault.over and not self._prefix:
+                who = f"{point.caller_id or 'a monitor'}{f' of {point.host}' if point.host else ''}"
+                text = f"a message of {who} on {point.resource} was not judged: {fault.text}"
+                self._unjudged[fault.monitor] = outcome.time, text
             self._observations.note(
                 f"{self._prefix}fault",
                 fault.monitor,
@@ -463,9 +492,11 @@ def refusal(outcome: Outcome, part: str) -> str:
     return f"the {part} is dropped by the monitor {outcome.dropped_by}{said}"
 
 
-def _compared(outcome: Outcome) -> str:
-    values = list(outcome.conditions.values())
-    return ", ".join(f"{name} = {value}" for name, value in values[-1].items()) if values else ""
+def _own_cause(outcome: Outcome, monitor: str) -> str:
+    """Return the last line of a monitor in an outcome, of those with a cause if there are any."""
+    lines = [line.text for line in outcome.log if line.monitor == monitor]
+    causes = [line.removeprefix(CAUSE) for line in lines if line.startswith(CAUSE)]
+    return (causes or lines or [""])[-1]
 
 
 def _why(outcome: Outcome) -> str:

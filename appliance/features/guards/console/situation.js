@@ -13,7 +13,6 @@ const ACTS = /** @type {Record<string, string>} */ ({ stopping: "stops", withhol
 const LATELY = 900; // seconds in which a stop that has ended is news
 const BEGINS = 10; // seconds in which a stop is red: then the robot is held
 const MOST = 2; // guards by name
-const VALUES = /^\w+ = /;
 
 export function Stops() {
   const { body, error } = useGuards({ presets: false });
@@ -42,22 +41,17 @@ export function Held(/** @type {{guard: any}} */ { guard: { name, last_stop } })
 
 function Acting(/** @type {{guard: any, now: number | null}} */ { guard, now }) {
   const { name, state, topics, why_held, last_stop } = guard;
-  const why = state === "holding" ? why_held : words(last_stop?.cause);
+  const why = state === "holding" ? why_held : last_stop?.cause;
   if (state === "stopping" && last_stop && !begins(guard, now)) return html`<div><${Held} guard=${guard} />${why && html`<div class="muted small"><${Given} value=${why} most=${120} /></div>`}</div>`;
   return html`<div><${Given} value=${name} most=${40} /> <span class="muted">${ACTS[state]}</span> <${Given} value=${topics.command} mono most=${60} />${state !== "holding" && last_stop && html`<${From} stop=${last_stop} /> <${Ago} at=${last_stop.since} lasts />`}${why && html`<div class="muted small"><${Given} value=${why} most=${120} /></div>`}</div>`;
 }
 
 function Stopped(/** @type {{guard: any}} */ { guard: { name, topics, last_stop } }) {
-  return html`<div><${Given} value=${name} most=${40} /> <span class="muted">stopped</span> <${Given} value=${topics.command} mono most=${60} /><${From} stop=${last_stop} />, <${Ago} at=${last_stop.until} />${words(last_stop.cause) && html`<div class="muted small"><${Given} value=${words(last_stop.cause)} most=${120} /></div>`}</div>`;
+  return html`<div><${Given} value=${name} most=${40} /> <span class="muted">stopped</span> <${Given} value=${topics.command} mono most=${60} /><${From} stop=${last_stop} />, <${Ago} at=${last_stop.until} />${last_stop.cause && html`<div class="muted small"><${Given} value=${last_stop.cause} most=${120} /></div>`}</div>`;
 }
 
 function From(/** @type {{stop: any}} */ { stop }) {
   return stop.host ? html` <span class="muted">of</span> <${Host} value=${stop.host} />` : null;
-}
-
-/** A cause in words; empty if it is the values of a condition, which its record explains. */
-function words(/** @type {string | undefined} */ cause) {
-  return cause && !VALUES.test(cause) ? cause : "";
 }
 
 function secondsOf(/** @type {string | number} */ at) {
