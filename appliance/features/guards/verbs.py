@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from appliance.base.counted import counted
@@ -104,7 +105,7 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
                       "origin": row.origin, "afresh": row.afresh, "below": row.below,
-                      "digest": row.digest})  # fmt: skip
+                      "digest": row.digest, "last_stop": msgspec.to_builtins(row.last_stop)})  # fmt: skip
         else:
             about = f"guard {row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())},"
             say_row([about, state_in_words(row)], gap=" ")
