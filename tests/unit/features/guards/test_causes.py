@@ -1,0 +1,647 @@
+"""The cause of each stop of each preset is a true sentence: condition, value, limit, node and host.
+
+Each `STOP` of a preset's text has to be reached here, so one without a sentence fails.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import pytest
+
+from appliance.base import clock
+from appliance.channel.messages import MonitorEvent, MonitorsReported
+from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.relay.monitors.observation_points import ObservationPoint, ObservedMessage
+from rosmop.form import nodes
+from rosmop.run.outcomes import MessageSender
+from rosmop.tests.acting import message
+from tests.support.virtual_clock import VirtualClock
+from tests.unit.relay.monitors.quiet import QuietMonitors
+
+NOT_YET = {"joints": "its text is written again"}
+"""Presets whose sentences are not judged yet."""
+APART = {
+    "answer": "it cancels goals, and has no stop",
+    "rate": "it drops commands, and has no stop",
+    "withhold": "it withholds a topic, and has no stop",
+}
+HOSTS = {
+    "/teleop": "10.0.0.7",
+    "/nav": "10.0.0.8",
+    "/third": "10.0.0.9",
+    "/lidar": "10.0.0.3",
+    "/other": "10.0.0.4",
+}
+TELEOP, LIDAR, OTHER = (f"{node} of {HOSTS[node]}" for node in ("/teleop", "/lidar", "/other"))
+FALSE = re.compile(r"\w+ = |\b(nan|inf|-inf)\b|, or | is not known")
+"""What no sentence has: a dump of variables, numbers that are none, a list of suspects."""
+
+KINDS = {
+    "sensor": "sensor_msgs/LaserScan", "separation": "sensor_msgs/LaserScan", "zone": "sensor_msgs/LaserScan",
+    "arm": "sensor_msgs/BatteryState", "enable": "std_msgs/Bool", "mode": "std_msgs/Bool",
+}  # fmt: skip
+"""The type of `by`, if it is not odometry."""
+OTHERS = {"fix": "sensor_msgs/NavSatFix", "other": "nav_msgs/Odometry"}
+"""The types of further topics, if they are not `std_msgs/Bool`."""
+
+
+class Robot:
+    """A guarded robot. `causes` are those that its relay reported since they were last taken, of stops only."""
+
+    def __init__(self, preset: str, time: VirtualClock, **values: object) -> None:
+        self.preset, self._time = preset, time
+        self.quiet = QuietMonitors()
+        given = {name: str(value).lower() for name, value in values.items()}
+        text = text_of(Guard("guard", PRESETS[preset], values=given))
+        self._lines = text.count("\n")
+        self.quiet.load(text)
+        self.interceptor = self.quiet.interceptor
+        self.topics = PRESETS[preset].given_topics
+        self.events: list[MonitorEvent] = []
+
+    def say(self, given: str, node: str, **fields: object) -> None:
+        by = KINDS.get(self.preset, "nav_msgs/Odometry")
+        kind = by if given == "by" else OTHERS.get(given, "std_msgs/Bool")
+        data = message("geometry_msgs/Twist" if given == "command" else kind, **fields)
+        point = ObservationPoint("key", self.topics[given], HOSTS[node], node)
+        interceptor, monitors = self.interceptor, self.interceptor.monitors
+        assert monitors is not None
+        sender = MessageSender(interceptor.senders.number(point))
+        outcome = monitors.process(point.resource, bytearray(data), interceptor.now(), sender)
+        interceptor.observer.report(outcome, point)
+        if outcome.result == "changed":
+            interceptor.observer.changed(outcome, point, data, len(data), ObservedMessage(None, 0, b""))
+
+    def drive(self, v: float = 0.2, node: str = "/teleop", **more: object) -> None:
+        self.say("command", node, linear__x=v, **more)
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass; a relay reports each second."""
+        for _ in range(round(seconds * 100)):
+            self._time.advance(0.01)
+            monitors = self.interceptor.monitors
+            assert monitors is not None
+            for outcome in monitors.advance(self.interceptor.now()):
+                self.interceptor.observer.report(outcome, ObservationPoint("", ""))
+        self.collect()
+
+    def collect(self) -> None:
+        self.interceptor.tick()
+        self.interceptor.observations.flush()
+        for one in self.quiet.reports.sent:
+            self.events += (
+                [] if not isinstance(one, MonitorsReported) else [each for each in one.events if each.safe]
+            )
+        self.quiet.reports.sent.clear()
+
+    def cause(self) -> str:
+        """Return the last cause."""
+        self.collect()
+        found = [str(event.detail["cause"]) for event in self.events if "cause" in event.detail]
+        return found[-1] if found else ""
+
+    def reached(self) -> set[tuple[int, str]]:
+        self.collect()
+        return {self.place(at) for event in self.events for at in event.detail.get("at", ())}
+
+    def place(self, position: str) -> tuple[int, str]:
+        """Return the lines behind a place, and its column: the values in the text are before it."""
+        _file, line, column = position.split(":")
+        return self._lines - int(line), column
+
+    def keep(self, seconds: float, every: Callable[[], None]) -> None:
+        """Do something every 50 ms."""
+        for _ in range(round(seconds * 20)):
+            every()
+            self.wait(0.05)
+
+
+Case = tuple[str, Mapping[str, object], Callable[[Robot], Any], str]
+
+
+def scan(robot: Robot, r: float = 9.0, node: str = "/lidar", **more: Any) -> None:
+    step = math.pi / 180
+    limits = {"angle_min": -math.pi, "angle_increment": step, "range_min": 0.1, "range_max": 30.0}
+    ranges = [r + 0.001 * ((ray * 7 + int(clock.now() * 100)) % 11) for ray in range(360)]
+    robot.say("by", node, **{**limits, "ranges": ranges, **more})
+
+
+def odometry(
+    robot: Robot, x: float = 0.0, v: float = 0.0, *, given: str = "by", node: str = "/lidar", w: float = 1.0
+) -> None:
+    robot.say(given, node, pose__pose__position__x=x, pose__pose__orientation__w=w, twist__twist__linear__x=v)
+
+
+def moving(robot: Robot, see: Callable[[], None], seconds: float = 0.6) -> None:
+    """Let the robot stand and then move, with what the guard wants to see."""
+    robot.keep(0.3, lambda: (see(), robot.drive(0.0)))  # type: ignore[func-returns-value]
+    robot.keep(seconds, lambda: (see(), robot.drive()))  # type: ignore[func-returns-value]
+
+
+def then(*steps: Callable[[Robot], Any]) -> Callable[[Robot], None]:
+    def run(robot: Robot) -> None:
+        for step in steps:
+            step(robot)
+
+    return run
+
+
+def driven(see: Callable[[Robot], None]) -> Callable[[Robot], None]:
+    return lambda robot: moving(robot, lambda: see(robot))
+
+
+def silent(seconds: float = 0.7) -> Callable[[Robot], None]:
+    """Let the evidence be silent while the robot is commanded to move."""
+    return lambda robot: robot.keep(seconds, robot.drive)
+
+
+def waits(seconds: float) -> Callable[[Robot], None]:
+    return lambda robot: robot.wait(seconds)
+
+
+def sees(see: Callable[[Robot], None], seconds: float = 0.4) -> Callable[[Robot], None]:
+    return lambda robot: robot.keep(seconds, lambda: (see(robot), robot.drive()))  # type: ignore[func-returns-value]
+
+
+def wall(r: float) -> Callable[[Robot], None]:
+    return lambda robot: scan(robot, ranges=[r] * 360)
+
+
+def at(x: float, v: float = 0.0, w: float = 1.0) -> Callable[[Robot], None]:
+    return lambda robot: odometry(robot, x, v, w=w)
+
+
+def both(v: float = 0.0, other: float = 0.0) -> Callable[[Robot], None]:
+    return lambda robot: (odometry(robot, v=other, given="other", node="/other"), odometry(robot, v=v))  # type: ignore[func-returns-value, return-value]
+
+
+def bool_of(data: bool, given: str = "by", node: str = "/lidar") -> Callable[[Robot], None]:
+    return lambda robot: robot.say(given, node, data=data)
+
+
+def battery(
+    left: float = 0.8, *, fix: int = 0, lat: float = 48.0, check: bool = True
+) -> Callable[[Robot], None]:
+    def see(robot: Robot) -> None:
+        robot.say("by", "/lidar", percentage=left)
+        robot.say("fix", "/other", status__status=fix, latitude=lat, longitude=11.0)
+        robot.say("check", "/nav", data=check)
+
+    return see
+
+
+def nine(given: str, node: str = "/lidar", **fields: object) -> Callable[[Robot], None]:
+    def see(robot: Robot) -> None:
+        for number in range(9):
+            HOSTS.setdefault(f"/n{number}", "10.0.1.1")
+            robot.say(given, f"/n{number}", **fields)
+
+    return see
+
+
+def manual(robot: Robot) -> None:
+    robot.say("by", "/lidar", data=True)
+
+
+def pressed(robot: Robot) -> None:
+    robot.say("stop", "/lidar", data=True)
+    robot.wait(0.01)
+
+
+def held(robot: Robot) -> None:
+    robot.say("by", "/lidar", data=False)
+    moving(robot, lambda: robot.say("by", "/lidar", data=True))
+
+
+def crossed(robot: Robot) -> None:
+    """Drive once the zone is free."""
+    sees(scan, 1)(robot)
+    robot.drive(0)
+    sees(scan, 0.2)(robot)
+
+
+ONCE = waits(0.01)
+NONE_YET = "no message on {} since the guard began"
+SILENT = f"no message from {LIDAR} on {{}} for {{}} s (limit {{}} s)"
+INTRUDER = f"{OTHER} also publishes on {{}}, last 0.00 s ago (limit 1 s)"
+NOT_FINITE = f"{TELEOP} commands a velocity that is not a finite number"
+ZERO_FIRST = f"{TELEOP} must command zero before its motion passes"
+STAND_FIRST = "the base stands, and a command to stand must come before a motion"
+SCAN, ODOM = "/scan", "/odom"
+CASES: list[Case] = [
+    (
+        "sane",
+        {},
+        lambda one: one.drive(math.nan),
+        f"the linear velocity that {TELEOP} commands is not a finite number",
+    ),
+    (
+        "sane",
+        {},
+        lambda one: one.drive(0, angular__z=math.inf),
+        f"the angular velocity that {TELEOP} commands is not a finite number",
+    ),
+    ("speed", {}, lambda one: one.drive(math.nan), NOT_FINITE),
+    (
+        "speed",
+        {"vMax": 0},
+        lambda one: one.drive(0.5),
+        f"{TELEOP} commands 0.50 m/s and 0.00 rad/s, which may not grow from"
+        " zero within 0.100 s (limits 0 m/s and 1 rad/s)",
+    ),
+    ("sensor", {}, silent(), NONE_YET.format(SCAN)),
+    ("sensor", {}, then(driven(scan), waits(0.6)), SILENT.format(SCAN, "0.51", "0.5")),
+    ("sensor", {}, then(driven(scan), silent(2)), SILENT.format(SCAN, "1.55", "0.5")),
+    (
+        "sensor",
+        {},
+        then(driven(scan), lambda one: scan(one, node="/other"), sees(scan, 0.05)),
+        INTRUDER.format(SCAN),
+    ),
+    (
+        "sensor",
+        {"frozen": 3},
+        sees(lambda one: scan(one, ranges=[1.0] * 360), 2),
+        f"{LIDAR} repeated its values on /scan 23 times (limit 3)",
+    ),
+    (
+        "sensor",
+        {},
+        sees(wall(99.0)),
+        f"0 of 360 values from {LIDAR} on /scan are valid (at least one and 10 % must be)",
+    ),
+    ("overspeed", {}, silent(), NONE_YET.format(ODOM)),
+    ("overspeed", {}, sees(at(0)), STAND_FIRST),
+    (
+        "overspeed",
+        {},
+        then(driven(at(0, 0.2)), at(0, 0.9)),
+        "the base moves with 0.90 m/s and 0.00 rad/s (limits 0.6 m/s and"
+        f" 1.2 rad/s), as {LIDAR} measures it on /odom",
+    ),
+    ("overspeed", {}, at(0, math.nan), f"{LIDAR} measures a velocity on /odom that is not a finite number"),
+    (
+        "overspeed",
+        {},
+        sees(at(0, 0.3)),
+        "the base still moves with 0.30 m/s and 0.00 rad/s (it stands at 0.05 m/s and rad/s), as"
+        f" {LIDAR} measures it on /odom",
+    ),
+    ("overspeed", {}, then(driven(at(0)), waits(0.6)), SILENT.format(ODOM, "0.51", "0.5")),
+    (
+        "overspeed",
+        {},
+        then(driven(at(0)), lambda one: odometry(one, node="/other"), waits(0.1)),
+        INTRUDER.format(ODOM).replace("0.00", "0.02"),
+    ),
+    ("standstill", {}, silent(), NONE_YET.format(ODOM)),
+    ("standstill", {}, sees(at(0)), STAND_FIRST),
+    ("standstill", {}, then(driven(at(0)), waits(0.6)), SILENT.format(ODOM, "0.51", "0.5")),
+    (
+        "standstill",
+        {},
+        then(driven(at(0)), lambda one: one.keep(1.2, lambda: (one.drive(0), at(0, 0.3)(one)))),  # type: ignore[func-returns-value]
+        "the base moves with 0.30 m/s and 0.00 rad/s (limit 0.05 m/s and rad/s) although no motion is commanded for"
+        f" 1.02 s (limit 1 s), as {LIDAR} measures it on /odom",
+    ),
+    (
+        "standstill",
+        {},
+        then(
+            driven(at(0)), lambda one: one.drive(0), lambda one: one.keep(1.2, lambda: at(0)(one)), at(0, 0.3)
+        ),
+        "the base moves with 0.30 m/s and 0.00 rad/s (limit 0.05 m/s and rad/s) although no motion is commanded for"
+        f" 1.20 s (limit 1 s), as {LIDAR} measures it on /odom",
+    ),
+    (
+        "standstill",
+        {},
+        sees(at(0, 0.3)),
+        "the base still moves with 0.30 m/s and 0.00 rad/s (it stands at 0.05 m/s and rad/s), as"
+        f" {LIDAR} measures it on /odom",
+    ),
+    (
+        "standstill",
+        {},
+        sees(at(0, math.nan)),
+        f"{LIDAR} measures a velocity on /odom that is not a finite number",
+    ),
+    ("agree", {}, silent(), NONE_YET.format(ODOM)),
+    ("agree", {}, sees(at(0)), NONE_YET.format("/odom_other")),
+    (
+        "agree",
+        {},
+        sees(both(), 0.1),
+        f"the velocities from {LIDAR} on /odom and from {OTHER} on /odom_other agree in 1 messages in"
+        " a row, of 5 that are needed",
+    ),
+    (
+        "agree",
+        {},
+        sees(both(1.0)),
+        f"the velocities from {LIDAR} on /odom and from {OTHER} on /odom_other differ by 1.00 m/s and"
+        " 0.00 rad/s (limits 0.1 m/s and 0.2 rad/s)",
+    ),
+    (
+        "agree",
+        {},
+        sees(both(math.nan)),
+        f"a velocity from {LIDAR} on /odom, compared with that from {OTHER} on /odom_other, is not"
+        " a finite number",
+    ),
+    ("agree", {}, then(driven(both()), waits(0.6)), SILENT.format(ODOM, "0.51", "0.5")),
+    (
+        "agree",
+        {},
+        then(driven(both()), lambda one: odometry(one, node="/other"), waits(0.1)),
+        INTRUDER.format(ODOM).replace("0.00", "0.02"),
+    ),
+    ("arm", {}, silent(), NONE_YET.format("/battery_state")),
+    ("arm", {}, sees(battery(0.1)), f"{LIDAR} reports a charge of 0.1 on /battery_state (limits 0.2 and 1)"),
+    ("arm", {}, sees(battery(75)), f"{LIDAR} reports a charge of 75 on /battery_state (limits 0.2 and 1)"),
+    ("arm", {}, sees(battery(math.nan)), f"{LIDAR} reports no charge on /battery_state"),
+    (
+        "arm",
+        {"needFix": True},
+        sees(battery(fix=-1)),
+        f"{OTHER} reports no fix on /fix, with the status -1 (limits 0 and 2)",
+    ),
+    (
+        "arm",
+        {"needFix": True},
+        sees(battery(lat=95)),
+        f"{OTHER} reports a position on /fix that is not on the earth: 95, 11 degrees",
+    ),
+    (
+        "arm",
+        {"needFix": True},
+        sees(battery(lat=math.nan)),
+        f"{OTHER} reports a position on /fix that is not a finite number",
+    ),
+    (
+        "arm",
+        {"needCheck": True},
+        sees(battery(check=False)),
+        "/nav of 10.0.0.8 reports on /preflight that the check was not passed",
+    ),
+    (
+        "arm",
+        {"silent": 0.5},
+        then(driven(battery()), waits(0.7)),
+        SILENT.format("/battery_state", "0.55", "0.5"),
+    ),
+    (
+        "arm",
+        {"needCheck": True, "silent": 0.5},
+        sees(lambda one: one.say("by", "/lidar", percentage=0.9)),
+        NONE_YET.format("/preflight"),
+    ),
+    (
+        "deadman",
+        {},
+        lambda one: one.drive(),
+        f"{TELEOP} commands for 0.00 s without a pause (a motion passes after 0.2 s)",
+    ),
+    (
+        "deadman",
+        {},
+        lambda one: (one.drive(), one.wait(0.4)),
+        f"the last motion on /cmd_vel, by {TELEOP}, was stopped 0.01 s ago, and no command has passed since",
+    ),
+    (
+        "deadman",
+        {},
+        then(driven(lambda _: None), waits(0.38)),
+        f"{TELEOP} commanded a motion on /cmd_vel, and nothing for 0.31 s since (limit 0.3 s)",
+    ),
+    (
+        "deadman",
+        {},
+        then(driven(lambda _: None), waits(2.1)),
+        f"{TELEOP} commanded a motion on /cmd_vel, and nothing for 0.31 s since (limit 0.3 s)",
+    ),
+    (
+        "deadman",
+        {},
+        then(
+            lambda one: one.keep(0.6, lambda: (one.drive(), one.drive(0.1, "/nav"))),
+            ONCE,  # type: ignore[func-returns-value]
+            lambda one: one.drive(0.1, "/third"),
+        ),
+        f"/third of 10.0.0.9 commands a motion, and so do {TELEOP} and /nav of 10.0.0.8 (limit 2 nodes)",
+    ),
+    ("estop", {}, silent(0.2), NONE_YET.format("/emergency_stop")),
+    ("estop", {"silent": 0}, silent(0.2), "no button has sent a message on /emergency_stop"),
+    ("estop", {}, pressed, f"{LIDAR} is pressed on /emergency_stop"),
+    ("estop", {}, then(pressed, silent(0.2)), f"{LIDAR} is pressed on /emergency_stop"),
+    (
+        "estop",
+        {},
+        then(pressed, lambda one: one.keep(1.5, lambda: bool_of(False, "stop")(one))),
+        "all buttons on /emergency_stop are released, and a reset by a node on /emergency_stop_reset is awaited",
+    ),
+    (
+        "estop",
+        {"twoHands": True},
+        then(pressed, lambda one: one.keep(1.5, lambda: bool_of(False, "stop")(one))),
+        "all buttons on /emergency_stop are released, and a reset by two nodes on /emergency_stop_reset is awaited",
+    ),
+    ("estop", {}, sees(bool_of(False, "stop")), ZERO_FIRST),
+    (
+        "estop",
+        {},
+        then(driven(bool_of(False, "stop")), waits(1.2)),
+        SILENT.format("/emergency_stop", "1.05", "1"),
+    ),
+    ("estop", {}, then(nine("stop", data=False), ONCE), "nine nodes publish on /emergency_stop (limit 8)"),
+    ("enable", {}, silent(0.2), NONE_YET.format("/enable")),
+    ("enable", {}, sees(bool_of(True)), f"{LIDAR} must be let go on /enable once before it counts as held"),
+    ("enable", {}, then(held, bool_of(False)), f"{LIDAR} is let go on /enable"),
+    ("enable", {}, then(held, waits(0.4)), SILENT.format("/enable", "0.31", "0.3")),
+    ("enable", {}, then(bool_of(False), sees(bool_of(True))), ZERO_FIRST),
+    ("enable", {}, then(held, nine("by", data=True), silent(0.1)), "nine nodes publish on /enable (limit 8)"),
+    (
+        "mode",
+        {"vMax": 0, "wMax": 0},
+        silent(0.2),
+        NONE_YET.format("/manual") + ", so the mode is manual (limits 0 m/s and 0 rad/s)",
+    ),
+    (
+        "mode",
+        {"vMax": 0, "wMax": 0},
+        sees(manual),
+        f"{LIDAR} says manual mode on /manual (limits 0 m/s and 0 rad/s)",
+    ),
+    (
+        "mode",
+        {"vMax": 0.1},
+        then(driven(bool_of(False)), manual),
+        f"{LIDAR} says manual mode on /manual (limits 0.1 m/s and 0.5 rad/s)",
+    ),
+    (
+        "mode",
+        {"vMax": 0.1},
+        then(driven(bool_of(False)), waits(1.1)),
+        SILENT.format("/manual", "1.01", "1") + ", so the mode is manual (limits 0.1 m/s and 0.5 rad/s)",
+    ),
+    (
+        "mode",
+        {"vMax": 0, "wMax": 0},
+        sees(bool_of(False)),
+        f"{TELEOP} commands 0.20 m/s and 0.00 rad/s, and has not been slow in"
+        " automatic mode (limits 0 m/s and 0 rad/s)",
+    ),
+    ("mode", {"vMax": 0.1}, lambda one: one.drive(math.nan), NOT_FINITE),
+    (
+        "mode",
+        {"vMax": 0.1},
+        then(driven(bool_of(False)), nine("by", data=False)),
+        "nine nodes publish on /manual (limit 8), so the mode is manual (limits 0.1 m/s and 0.5 rad/s)",
+    ),
+    ("fence", {}, silent(0.2), NONE_YET.format(ODOM)),
+    ("fence", {}, then(driven(at(0)), waits(0.6)), SILENT.format(ODOM, "0.51", "0.5")),
+    ("fence", {}, sees(at(math.nan)), f"{LIDAR} reports a position on /odom that is not a finite number"),
+    ("fence", {}, sees(at(0, w=0)), f"{LIDAR} reports a position on /odom without a direction"),
+    (
+        "fence",
+        {},
+        sees(at(7)),
+        "the base is 5.00 m outside the fence, at 7.00 and 0.00 m, and its command does not lead straight"
+        " back",
+    ),
+    (
+        "fence",
+        {},
+        sees(at(1.9)),
+        "the base is 0.10 m from the fence (margin 0.2 m), at 1.90 and 0.00 m, and its command does not"
+        " lead straight back",
+    ),
+    (
+        "fence",
+        {},
+        then(driven(at(0)), at(1.75)),
+        "the base is 0.25 m from the fence, at 1.75 and 0.00 m, and could come nearer than"
+        " 0.2 m with 0.20 m/s before the next position",
+    ),
+    ("fence", {}, sees(lambda one: (at(0)(one), one.drive(math.inf))), NOT_FINITE),  # type: ignore[func-returns-value, arg-type, return-value]
+    (
+        "fence",
+        {},
+        then(driven(at(0)), lambda one: odometry(one, node="/other"), waits(0.1)),
+        INTRUDER.format(ODOM).replace("0.00", "0.02"),
+    ),
+    ("separation", {}, silent(0.2), NONE_YET.format(SCAN)),
+    ("separation", {}, then(driven(scan), waits(0.6)), SILENT.format(SCAN, "0.51", "0.5")),
+    (
+        "separation",
+        {},
+        sees(wall(0.6)),
+        "0.45 m are known to be free in the way, and a motion needs more than 1.45 m, by the scan"
+        f" from {LIDAR} on /scan",
+    ),
+    (
+        "separation",
+        {},
+        sees(wall(math.nan)),
+        "0.00 m are known to be free in the way, and a motion needs more than 1.45 m, by the scan"
+        f" from {LIDAR} on /scan",
+    ),
+    (
+        "separation",
+        {"sector": 1},
+        sees(lambda one: (scan(one), one.drive(-0.2))),
+        "the way of 0.20 m/s is outside the sector of the"  # type: ignore[func-returns-value, arg-type, return-value]
+        f" scanner, {LIDAR} on /scan (limit 0 m/s)",
+    ),
+    (
+        "separation",
+        {},
+        then(driven(scan), wall(0.6), waits(0.1)),
+        "0.45 m are known to be free in the way, and a motion needs more than"
+        f" 0.77 m, by the scan from {LIDAR} on /scan",
+    ),
+    ("separation", {}, lambda one: one.drive(math.nan), NOT_FINITE),
+    (
+        "separation",
+        {},
+        then(driven(scan), lambda one: scan(one, node="/other"), waits(0.1)),
+        INTRUDER.format(SCAN).replace("0.00", "0.02"),
+    ),
+    ("zone", {}, silent(0.2), NONE_YET.format(SCAN)),
+    ("zone", {}, then(crossed, waits(0.4)), SILENT.format(SCAN, "0.31", "0.3")),
+    (
+        "zone",
+        {},
+        sees(wall(0.6)),
+        f"83 rays from {LIDAR} on /scan end in the zone or before it, and 0 are not valid (limit 3)",
+    ),
+    (
+        "zone",
+        {},
+        sees(scan),
+        f"the zone is free for 0.00 s (limit 0.5 s), by the scans from {LIDAR} on /scan",
+    ),
+    ("zone", {}, sees(scan, 1), ZERO_FIRST),
+    (
+        "zone",
+        {},
+        sees(lambda one: scan(one, angle_increment=0.0)),
+        f"{LIDAR} sends scans on /scan whose angles or ranges are not valid",
+    ),
+    (
+        "zone",
+        {},
+        sees(lambda one: scan(one, angle_min=0.0, ranges=[9.0] * 9)),
+        f"the rays from {LIDAR} on /scan do not cover the zone",
+    ),
+    (
+        "zone",
+        {},
+        then(crossed, wall(0.6), waits(0.1)),
+        f"83 rays from {LIDAR} on /scan end in the zone or before it, and 0 are not valid (limit 3)",
+    ),
+    ("zone", {}, lambda one: one.drive(math.nan), NOT_FINITE),
+]
+
+
+@pytest.fixture
+def time() -> Iterator[VirtualClock]:
+    virtual = VirtualClock(wall=1.7e9)
+    with clock.using(virtual):
+        yield virtual
+
+
+def stops_of(robot: Robot) -> set[tuple[int, str]]:
+    """Return the places of `STOP` in the guard's text."""
+    monitors = robot.interceptor.monitors
+    assert monitors is not None
+    found = (
+        node.site
+        for function in monitors.compiled.functions.values()
+        for node in nodes.walk(function.body)
+        if isinstance(node, nodes.StopMessage)
+    )
+    return {robot.place(str(monitors.interpreter.sites[site].position)) for site in found}
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS.keys() - NOT_YET.keys() - APART.keys()))
+def test_each_stop_has_a_true_sentence_as_its_cause(preset: str, time: VirtualClock) -> None:
+    missing, wrong = None, []
+    for name, values, script, wanted in CASES:
+        if name != preset:
+            continue
+        robot = Robot(preset, time, **values)
+        missing = stops_of(robot) if missing is None else missing
+        script(robot)
+        found = robot.cause()
+        missing -= robot.reached()
+        wrong += [f"{found!r} instead of {wanted!r}"] if found != wanted else []
+        full = [event for event in robot.events if not event.count]
+        wrong += [f"no cause: {event}" for event in full if "cause" not in event.detail]
+        wrong += [
+            f"no sentence: {found}" for event in full if FALSE.search(str(event.detail.get("cause", "")))
+        ]
+    assert not wrong, "\n".join(wrong)
+    assert missing == set()
