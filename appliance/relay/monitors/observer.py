@@ -36,7 +36,7 @@ CAUSE = "stopped: "
 """The beginning of a line that has the cause of a stop."""
 _SILENCE = "no message "
 _LINE_NS = 2_000_000_000
-"""How long a monitor's last cause explains its stops: presets print it once a second."""
+"""How long a monitor's last cause explains its next stop; it is printed when it changes, or once a second."""
 _MOST_STOPPING = 1000
 _PUBLISHERS = 8
 """The most publishers that the report of a stop names."""
@@ -220,7 +220,10 @@ class Observer:
         elif topic in instance.starting:
             return f"no command on {topic} since {instance.starting[topic]}"
         said, cause = self._causes.get(monitor, (0, ""))
-        return cause if said and outcome.time - said <= _LINE_NS else ""
+        if not said or outcome.time - said > _LINE_NS:
+            return ""
+        self._causes[monitor] = outcome.time, cause  # the stop goes on
+        return cause
 
     def _sender(self, node: str, topic: str) -> str:
         if node == "\0":
