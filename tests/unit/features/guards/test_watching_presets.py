@@ -76,6 +76,24 @@ def test_no_button_hides_another() -> None:
     assert runs(guard, 1001) and not runs(guard, 1101)
 
 
+@pytest.mark.parametrize(("preset", "topic"), [("estop", "stop"), ("enable", "by"), ("mode", "by")])
+def test_a_base_waits_for_the_given_number_of_publishers(preset: str, topic: str) -> None:
+    """A button whose node never ran is not hidden by another one. More than the given number may speak."""
+
+    def fast(guard: Guarded, at: int) -> bool:
+        guard.drive(twist(), at)
+        return guard.drive(twist(0.5), at + 1)[0] == 0.5
+
+    for publishers, heard in ((0, 1), (1, 1), (2, 1), (2, 2), (2, 3), (8, 7), (8, 8)):
+        guard = Guarded(preset, publishers=publishers)
+        for node in NODES[1 : heard + 1]:
+            guard.tell(topic, button(False), 1, node)
+            guard.tell(topic, button(preset == "enable"), 2, node)
+        assert fast(guard, 3) == (heard >= publishers), (publishers, heard)
+    guard.monitors.give({"guard": {"publishers": 0}})
+    assert fast(guard, 10)
+
+
 def test_a_ninth_button_stops() -> None:
     guard = Guarded("estop", silent=0)
     for place in range(8):
