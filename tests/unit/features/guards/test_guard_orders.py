@@ -345,7 +345,7 @@ async def test_a_new_guard_is_in_shadow_mode_or_in_force(tmp_path: Path, shadow:
         assert not switches.enabled("fence")
         assert "\n    vMax = 0.3;\n" in monitors.sources.files["speed.rv"]
         assert monitors.confirm_by == pytest.approx(clock.wall() + 300.0)
-        assert monitors.in_force.note[:14] == "preset speed 2"
+        assert monitors.in_force.note[:14] == "preset speed 3"
 
 
 async def test_suggestions_name_the_guards_that_are_loaded(monitors: SpecificationManager) -> None:
