@@ -178,6 +178,9 @@ class Suggestions(msgspec.Struct, frozen=True):
     suggestions: Annotated[list[Suggestion], doc("the proposed guards")]
     loaded: Annotated[list[LoadedSuggestion], doc("guards that are loaded, so not proposed")] = []
     left_out: Annotated[list[str], doc("what is ambiguous or cannot be guarded, as sentences")] = []
+    not_protected: Annotated[
+        list[str], doc("what neither these guards nor those in use protect, as sentences; never empty")
+    ] = []
 
 
 class DriverCheck(msgspec.Struct, frozen=True):

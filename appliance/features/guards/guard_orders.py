@@ -308,7 +308,7 @@ class GuardOrders:
                         dict(one.values), one.command, {name: [*topics] for name, topics in one.others.items()})
              for one in found.proposals],
             [LoadedSuggestion(guard.name, guard.preset, dict(guard.topics)) for guard in found.loaded],
-            found.left_out,
+            found.left_out, found.not_protected,
         )  # fmt: skip
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:

@@ -1,6 +1,7 @@
 """Read from the graph which topics command a base or an arm, and which sources belong to the same robot.
 
-1. Direction decides before names: a driver subscribes to a command, and does not pass it on to another command.
+1. Direction decides before names: a driver subscribes to a command, and does not pass it on to another command. What a
+   driver subscribes to is a command, and a velocity that a driver reports is none.
 2. A source below the namespace of another robot never belongs to this one. A source below no robot's namespace
    belongs to the only robot, or to the one whose nodes use it.
 3. An undecided source belongs to no robot; callers report it.
@@ -8,9 +9,10 @@
 """
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 from rosmop.types.roles import types_of_roles
@@ -42,6 +44,15 @@ _NOT_A_BASE = re.compile(
 )  # fmt: skip
 _JOINT_COMMANDS = {*TRAJECTORIES, "std_msgs/Float64MultiArray"}
 _MEASURED = {*POSES, "sensor_msgs/LaserScan", "sensor_msgs/JointState", "sensor_msgs/Imu"}
+_OF_A_DRIVER = {"nav_msgs/Odometry", "sensor_msgs/JointState"}
+_A_MEASUREMENT = re.compile(
+    r"wheel|encoder|odom|measured|actual|feedback|estimat|vision|imu|gps|gnss|filtered|local_position|state",
+    re.IGNORECASE,
+)
+"""In the name of a velocity that nothing but its subscribers shows to be a command."""
+_ESTIMATOR = re.compile(r"odom|ekf|ukf|locali[sz]|fusion|estimat|slam|track", re.IGNORECASE)
+"""In the name of a node that does not drive."""
+SIDE = re.compile(r"(?:^|[/_])(?:f|b|r|l|front|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
 
 MOST_COMMANDS = 20
 _MOST_STEPS = 10
@@ -58,6 +69,13 @@ class TopicFacts(NamedTuple):
     subscribers: tuple[str, ...]
     rate: float = 0.0
     hosts: tuple[str, ...] = ()
+    slowest: float | None = None
+    """The rate of its slowest publisher, if that is known."""
+
+    @property
+    def rate_of_each(self) -> float:
+        even = self.rate / max(len(self.publishers), 1)
+        return even if self.slowest is None else self.slowest
 
 
 @dataclass(frozen=True)
@@ -69,10 +87,16 @@ class GraphedRobot:
     drivers: frozenset[str]
     chain: frozenset[str]
     """The drivers, and the nodes from which their commands come."""
+    prefixed: bool = False
+    """Its topics have a prefix, such as `r1_`, instead of a namespace."""
 
     @property
     def title(self) -> str:
-        return f"/{'/'.join(self.namespace)}" if self.namespace else self.commands[0].name
+        return self.name_of("…").removesuffix("/…") if self.namespace else self.commands[0].name
+
+    def name_of(self, leaf: str) -> str:
+        """Return the name of a topic of this robot."""
+        return f"/{'/'.join(self.namespace)}{'_' if self.prefixed else '/'}{leaf}"
 
 
 @dataclass(frozen=True)
@@ -83,8 +107,104 @@ class RobotGraph:
 
     @cached_property
     def velocities(self) -> list[TopicFacts]:
-        """The topics named as commands of velocities, those between a node and a multiplexer too."""
-        return [topic for topic in self.topics if topic.type in VELOCITIES and COMMAND.search(topic.name)]
+        """The topics that command velocities, those between a node and a multiplexer too.
+
+        Their name says so, or a node subscribes to them that carries out, passes on or publishes another command. In a
+        graph without any of these, the subscriber reports how the robot moves.
+        """
+        directed = [topic for topic in self.topics if topic.type in VELOCITIES and not self._reports(topic)]
+        found = [topic for topic in directed if COMMAND.search(topic.name)]
+        others = [topic for topic in directed if topic not in found and self._carrying_out(topic)]
+        for _step in range(_MOST_STEPS):
+            takers = {node for topic in found for node in _used(topic)}
+            senders = {node for topic in found if _used(topic) for node in topic.publishers}
+            kinds = {topic.type for topic in found}
+            more = [
+                topic
+                for topic in others
+                if not _A_MEASUREMENT.search(topic.name) and topic not in found and topic.type in kinds
+                and not (takers.isdisjoint(topic.publishers)
+                         and (takers | senders).isdisjoint(self._carrying_out(topic)))
+            ]  # fmt: skip
+            found += more
+            if not more:
+                break
+        return [topic for topic in self.topics if topic in (found or self._of_drivers(others))]
+
+    @cached_property
+    def undecided(self) -> list[TopicFacts]:
+        """The velocities that some node uses, and that neither a name nor the graph shows to be commands or not."""
+        return [
+            topic for topic in self.topics
+            if topic.type in VELOCITIES and topic.publishers and self._carrying_out(topic)
+            and topic not in self.velocities and (COMMAND.search(topic.name) or not self._reports(topic))
+        ]  # fmt: skip
+
+    def _of_drivers(self, velocities: Iterable[TopicFacts]) -> list[TopicFacts]:
+        return [
+            topic
+            for topic in velocities
+            if not _A_MEASUREMENT.search(topic.name)
+            and not self._measuring.isdisjoint(self._carrying_out(topic))
+        ]
+
+    def _carrying_out(self, velocity: TopicFacts) -> list[str]:
+        return [
+            node
+            for node in _used(velocity)
+            if node not in self._filters and not _ESTIMATOR.search(node.rsplit("/", 1)[1])
+        ]
+
+    @cached_property
+    def _measuring(self) -> frozenset[str]:
+        return frozenset(
+            node for topic in self.topics if topic.type in _OF_A_DRIVER for node in topic.publishers
+        )
+
+    def _reports(self, velocity: TopicFacts) -> bool:
+        """Whether only drivers publish it: nodes that report how the robot moves.
+
+        With a command's name, they also take another command, and no driver subscribes to it.
+        """
+        named = COMMAND.search(velocity.name) and not (
+            self._measuring.isdisjoint(_used(velocity)) and self._commanded.issuperset(velocity.publishers)
+        )
+        return bool(velocity.publishers) and not named and self._measuring.issuperset(velocity.publishers)
+
+    @cached_property
+    def _commanded(self) -> frozenset[str]:
+        return frozenset(
+            node
+            for topic in self.topics
+            if topic.type in VELOCITIES and COMMAND.search(topic.name)
+            for node in topic.subscribers
+        )
+
+    @cached_property
+    def _prefixes(self) -> frozenset[str]:
+        """The prefixes that stand for namespaces: `r1` of `/r1_cmd_vel`, with another driver than `/r2_cmd_vel`."""
+        found = set[str]()
+        for one, other in combinations((*self.bases, *self.arms), 2):
+            (head, _, rest), (other_head, _, other_rest) = (
+                topic.name.strip("/").partition("_") for topic in (one, other)
+            )
+            heads = {head, other_head}
+            if len(heads) == 2 and rest and rest == other_rest and not any(map(SIDE.fullmatch, heads)) and (
+                self.ends(one).isdisjoint(self.ends(other)) or all(map(self._measured_below, heads))
+            ):  # fmt: skip
+                found |= heads
+        return frozenset(head for head in found if head and "/" not in head)
+
+    def _measured_below(self, prefix: str) -> bool:
+        return any(
+            topic.type in _MEASURED and topic.publishers and topic.name.startswith(f"/{prefix}_")
+            for topic in self.topics
+        )
+
+    def _parts(self, name: str) -> Namespace:
+        first, *rest = name.strip("/").split("/")
+        head, _, tail = first.partition("_")
+        return (head, tail, *rest) if tail and head in self._prefixes else (first, *rest)
 
     @cached_property
     def velocity_commands(self) -> list[TopicFacts]:
@@ -101,7 +221,18 @@ class RobotGraph:
 
     @cached_property
     def arms(self) -> list[TopicFacts]:
-        return [topic for topic in self.topics if topic.type in TRAJECTORIES and _used(topic)][:MOST_COMMANDS]
+        found = [topic for topic in self.topics if topic.type in TRAJECTORIES and _used(topic)]
+        return [topic for topic in found if topic not in self.legs][:MOST_COMMANDS]
+
+    @cached_property
+    def legs(self) -> list[TopicFacts]:
+        """The trajectories by which a driver of a base carries out a velocity."""
+        drivers = frozenset(node for base in self.bases for node in self.drivers(base))
+        return [
+            topic
+            for topic in self.topics
+            if topic.type in TRAJECTORIES and topic.publishers and drivers.issuperset(topic.publishers)
+        ]
 
     @cached_property
     def robots(self) -> list[GraphedRobot]:
@@ -118,16 +249,19 @@ class RobotGraph:
     def drivers(self, command: TopicFacts) -> frozenset[str]:
         """Return the subscribers that carry out a velocity, or nothing if all pass it on."""
         nodes = _used(command)
-        passing = {
-            node
-            for other in self.velocities
-            if other.name != command.name and _used(other)
-            for node in other.publishers
-        }
-        driving = nodes - passing
+        driving = frozenset(node for node in nodes if self._commands_of.get(node, set()) <= {command.name})
         if len(nodes) > 1:  # a filter of positions may also use the commands
-            driving = frozenset(node for node in driving if not self._filters_positions(node))
+            driving -= self._filters
         return driving
+
+    @cached_property
+    def _commands_of(self) -> Mapping[str, set[str]]:
+        """The velocities that each node publishes for another one."""
+        found = dict[str, set[str]]()
+        for topic in self.velocities:
+            for node in topic.publishers if _used(topic) else ():
+                found.setdefault(node, set()).add(topic.name)
+        return found
 
     def ends(self, command: TopicFacts) -> frozenset[str]:
         """Return the nodes that carry out a command of any type."""
@@ -142,8 +276,8 @@ class RobotGraph:
         return [
             topic
             for topic in self.topics
-            if topic.type in wanted and topic.publishers and not COMMAND.search(topic.name)
-            and self.belongs(topic, command)
+            if topic.type in wanted and topic.publishers and self.belongs(topic, command)
+            and (not COMMAND.search(topic.name) or self.ends(command).issuperset(topic.publishers))
         ]  # fmt: skip
 
     def shared(self, kinds: Iterable[str]) -> list[TopicFacts]:
@@ -152,16 +286,23 @@ class RobotGraph:
         return [
             topic
             for topic in self.topics
-            if topic.type in wanted and topic.publishers
-            and not any(robot.namespace and _parts(topic.name)[: len(robot.namespace)] == robot.namespace
-                        for robot in self.robots)
+            if topic.type in wanted and topic.publishers and not self.is_below(topic, self.robots)
             and not any(self.belongs(topic, command) for command in commands)
         ]  # fmt: skip
+
+    def is_below(self, topic: TopicFacts, robots: Iterable[GraphedRobot]) -> bool:
+        """Whether a topic is below the namespace of one of these robots."""
+        place = self._parts(topic.name)
+        return any(robot.namespace and place[: len(robot.namespace)] == robot.namespace for robot in robots)
+
+    def leaf(self, topic: TopicFacts) -> str:
+        """Return the last part of a name, without a prefix that stands for a namespace."""
+        return self._parts(topic.name)[-1]
 
     def belongs(self, source: TopicFacts, command: TopicFacts) -> bool:
         own = self.robot_of(command)
         others = [robot for robot in self.robots if robot is not own]
-        place = _parts(source.name)
+        place = self._parts(source.name)
         inside = place[: len(own.namespace)] == own.namespace
         for other in others:
             below = bool(other.namespace) and place[: len(other.namespace)] == other.namespace
@@ -171,13 +312,28 @@ class RobotGraph:
             if inside and (own.namespace or all(other.namespace for other in others)):
                 return True
             return _touches(source, own) and not any(_touches(source, other) for other in others)
-        homes = {_parts(node)[:-1][:1] for node in own.drivers}
+        homes = {self._parts(node)[:-1][:1] for node in own.drivers}
         of_another = (
-            {_parts(node)[:-1][:1] for node in source.publishers} == {place[:1]}
+            {self._parts(node)[:-1][:1] for node in source.publishers} == {place[:1]}
             and len(place) > 1
             and not homes & {(), place[:1]}
         )
         return not of_another or _touches(source, own)
+
+    def near(self, source: TopicFacts, command: TopicFacts) -> int:
+        """Return how many levels of the namespace two topics share."""
+        ours, theirs = self._parts(source.name), self._parts(command.name)
+        pairs = zip(ours[:-1], theirs[:-1], strict=False)
+        return next((level for level, (one, other) in enumerate(pairs) if one != other),
+                    min(len(ours), len(theirs)) - 1)  # fmt: skip
+
+    def origins(self, topic: TopicFacts, kinds: Collection[str]) -> list[TopicFacts]:
+        """Return the topics of these types from which the topic's nodes may make it."""
+        return [
+            other for other in self.topics
+            if other.name != topic.name and other.type in kinds and other.publishers
+            and not {*topic.publishers}.isdisjoint(other.subscribers)
+        ]  # fmt: skip
 
     def derived_from(self, topic: TopicFacts, others: Iterable[TopicFacts]) -> bool:
         """Whether a node makes the topic from one of the others: a filter, or a merger of scans."""
@@ -197,30 +353,40 @@ class RobotGraph:
             topic
             for topic in self.topics
             if topic.type not in kinds
+            and not (topic.type in _MEASURED and drivers.issuperset(topic.publishers))
             and (
                 (COMMAND.search(topic.name) and topic.publishers and _used(topic))
                 or (topic.type.endswith("ActionGoal") and not drivers.isdisjoint(topic.subscribers))
             )
         ]
 
-    def _filters_positions(self, node: str) -> bool:
-        used = any(
-            topic.type == "nav_msgs/Odometry" and node in topic.subscribers and topic.publishers != (node,)
+    @cached_property
+    def _filters(self) -> frozenset[str]:
+        """The nodes that publish positions from the odometry of others."""
+        users = {
+            node
             for topic in self.topics
+            if topic.type == "nav_msgs/Odometry"
+            for node in topic.subscribers
+            if topic.publishers != (node,)
+        }
+        return frozenset(
+            node for topic in self.topics if topic.type in POSES for node in topic.publishers if node in users
         )
-        return used and self.publishes(node, POSES)
 
     def _moves_an_arm(self, command: TopicFacts) -> bool:
         if _NOT_A_BASE.search(command.name):
             return True
+        if command.name.endswith("/cmd_vel"):  # of a base with legs, too
+            return False
         drivers = self.drivers(command)
         measured = any(self.publishes(node, POSES) for node in drivers)
         return not measured and any(self.publishes(node, _JOINT_COMMANDS) for node in drivers)
 
     def _same_robot(self, one: TopicFacts, other: TopicFacts) -> bool:
-        ours, theirs = _parts(one.name)[:-1], _parts(other.name)[:-1]
+        ours, theirs = self._parts(one.name)[:-1], self._parts(other.name)[:-1]
         if ours == theirs:
-            return True
+            return self._one_body(one, other, ours)
         if self.ends(one).isdisjoint(self.ends(other)):
             return one not in self.bases and bool(theirs) and ours[: len(theirs)] == theirs
         apart = next((i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b), None)
@@ -228,18 +394,30 @@ class RobotGraph:
             return True
         heads = ours[: apart + 1], theirs[: apart + 1]
         return not all(  # a simulator drives several robots
-            any(topic.type in _MEASURED and topic.publishers and _parts(topic.name)[: apart + 1] == head
+            any(topic.type in _MEASURED and topic.publishers and self._parts(topic.name)[: apart + 1] == head
                 for topic in self.topics)
             for head in heads
         )  # fmt: skip
 
+    def _one_body(self, one: TopicFacts, other: TopicFacts, namespace: Namespace) -> bool:
+        """Whether two commands of one namespace have a common driver, or nothing says that they are of two robots."""
+        bases = [base for base in self.bases if self._parts(base.name)[:-1] == namespace]
+        apart = [
+            base
+            for base in bases
+            if base is not one and not SIDE.search(base.name) and self.ends(one).isdisjoint(self.ends(base))
+        ]
+        return not apart or other not in apart or (one not in bases and len(apart) == 1 == len(bases))
+
     def _robot(self, group: list[TopicFacts], groups: list[list[TopicFacts]]) -> GraphedRobot:
-        places = [_parts(command.name)[:-1] for command in group]
+        places = [self._parts(command.name)[:-1] for command in group]
         common = places[0]
         for place in places[1:]:
             same = next((i for i, (a, b) in enumerate(zip(common, place, strict=False)) if a != b), None)
             common = common[: min(len(common), len(place)) if same is None else same]
-        others = [_parts(command.name)[:-1] for other in groups if other is not group for command in other]
+        others = [
+            self._parts(command.name)[:-1] for other in groups if other is not group for command in other
+        ]
         namespace = common if others else ()
         for length in range(1, len(common) + 1):
             if others and not any(place[:length] == common[:length] for place in others):
@@ -250,18 +428,8 @@ class RobotGraph:
         for _step in range(_MOST_STEPS):
             inputs = (topic for topic in self.velocities if not chain.isdisjoint(topic.subscribers))
             chain = chain.union(*(topic.publishers for topic in inputs))
-        return GraphedRobot(namespace, tuple(group), drivers, chain)
-
-
-def near(source: TopicFacts, command: TopicFacts) -> int:
-    """Return how many levels of the namespace two topics share."""
-    pairs = zip(_parts(source.name)[:-1], _parts(command.name)[:-1], strict=False)
-    return next((level for level, (one, other) in enumerate(pairs) if one != other),
-                min(len(_parts(source.name)), len(_parts(command.name))) - 1)  # fmt: skip
-
-
-def _parts(name: str) -> Namespace:
-    return tuple(name.strip("/").split("/"))
+        prefixed = len(namespace) == 1 and namespace[0] in self._prefixes
+        return GraphedRobot(namespace, tuple(group), drivers, chain, prefixed)
 
 
 def _used(topic: TopicFacts) -> frozenset[str]:

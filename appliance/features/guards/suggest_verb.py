@@ -8,7 +8,7 @@ import typer
 
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json
-from appliance.features.guards.guard_answers import Suggestion
+from appliance.features.guards.guard_answers import Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.features.guards.requests import GuardSuggestionsWanted
 from appliance.features.table import recorded_messages
@@ -72,7 +72,9 @@ def suggest(
         ),
     ] = False,
 ) -> None:
-    """Propose guards for the topics of the running robot, as commands to paste. Nothing changes.
+    """Propose guards for the topics of the running robot, as commands to paste, and list what is not protected.
+
+    Nothing changes.
 
     Values in the commands come from the present rates of topics; all others are defaults. `--with-scan` reads the
     scans of the last five seconds from the flight recorder: over REST this needs the role of an investigator.
@@ -81,30 +83,42 @@ def suggest(
     """
     found = appliance.ask_or_exit(GuardSuggestionsWanted())
     by_scan = [one for one in found.suggestions if with_scan and one.preset in WITHOUT]
-    if appliance.as_json:
-        for guard in found.loaded:
-            say_json({"loaded": guard.name, "preset": guard.preset, "topics": guard.topics})
-        for one in found.suggestions:
-            say_json({"preset": one.preset, "name": one.name, "topics": one.topics, "measured": one.measured,
-                      "values": one.values, "command": one.command, "others": one.others})  # fmt: skip
-        for sentence in found.left_out:
-            say_json({"left_out": sentence})
-    else:
-        for guard in found.loaded:
-            say(f"loaded: {guard.name} ({guard.preset} on {guard.topics['command']})", "green")
-        for one in found.suggestions:
-            _say_suggestion(one)
-        for sentence in found.left_out:
-            say(sentence, "yellow")
-        if not (found.suggestions or found.loaded):
-            say(
-                "no topic now commands a base or an arm: start the robot's nodes, or name a topic:"
-                " rosrv guard new --help"
-            )
+    (_put if appliance.as_json else _print)(found)
     if by_scan:
         _say_permitted(appliance, by_scan)
     elif with_scan and not appliance.as_json:
         say(f"no proposed guard limits a velocity by a scan ({', '.join(WITHOUT)})")
+    if found.not_protected and not appliance.as_json:  # an older appliance does not know it
+        say("not protected:", "yellow")
+    for sentence in found.not_protected:
+        if appliance.as_json:
+            say_json({"not_protected": sentence})
+        else:
+            say(f"    {sentence}")
+
+
+def _put(found: Suggestions) -> None:
+    for guard in found.loaded:
+        say_json({"loaded": guard.name, "preset": guard.preset, "topics": guard.topics})
+    for one in found.suggestions:
+        say_json({"preset": one.preset, "name": one.name, "topics": one.topics, "measured": one.measured,
+                  "values": one.values, "command": one.command, "others": one.others})  # fmt: skip
+    for sentence in found.left_out:
+        say_json({"left_out": sentence})
+
+
+def _print(found: Suggestions) -> None:
+    for guard in found.loaded:
+        say(f"loaded: {guard.name} ({guard.preset} on {guard.topics['command']})", "green")
+    for one in found.suggestions:
+        _say_suggestion(one)
+    for sentence in found.left_out:
+        say(sentence, "yellow")
+    if not (found.suggestions or found.loaded):
+        say(
+            "no topic now commands a base or an arm: start the robot's nodes, or name a topic:"
+            " rosrv guard new --help"
+        )
 
 
 def _say_suggestion(one: Suggestion) -> None:

@@ -1,7 +1,7 @@
 """Propose guards for the topics of a running robot.
 
 `robot_graph.py` decides which sources belong to a command. A source that is ambiguous is not chosen: the proposal is
-left out, and a sentence names the alternatives.
+left out, and a sentence names the alternatives. The advice ends with what no guard protects, which is never nothing.
 """
 
 import re
@@ -10,7 +10,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from appliance.features.guards import robot_graph as types
-from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, RobotGraph, TopicFacts, near
+from appliance.features.guards.presets import PRESETS
+from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, SIDE, RobotGraph, TopicFacts
 
 _WORD = re.compile(r"[a-z]+")
 _STOP = re.compile(r"e_?stop|emergency(?:_stop)?|protective_stop|run_?stop(?:ped)?", re.IGNORECASE)
@@ -25,14 +26,17 @@ _RESET = re.compile(r"(?:(?<![A-Za-z])[rc]|(?<![A-Z])[RC])(?:eset|lear)(?![a-z])
 """A word of the name, not a part of another one, such as `clearpath` or `preset`."""
 _FILTERED = re.compile(r"filtered|fused|ekf|local_position", re.IGNORECASE)
 _WHEELS = re.compile(r"wheel|encoder|(?:^|[/_])(?:enc|raw)(?=[/_]|$)", re.IGNORECASE)
-_SIDE = re.compile(r"(?:^|[/_])(?:f|b|r|l|front|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
 _NOT_AHEAD = re.compile(r"(?:^|[/_])(?:b|r|l|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
 _RAW = re.compile(r"(?:^|[/_])raw(?=[/_]|$)", re.IGNORECASE)
 _AMCL = re.compile(r"amcl", re.IGNORECASE)
 _NO_POSITION = re.compile(r"initialpose|goal|target|setpoint|ground_truth", re.IGNORECASE)
 _WORLD_FRAME = re.compile(r"/mavros/setpoint_velocity/")  # MAVROS takes them in the local frame by default
 _SCAN_OF_A_CAMERA = re.compile(r"camera|depth|rgbd", re.IGNORECASE)
+_MANUAL = re.compile(r"(?:is_|in_)?manual(?:_?mode)?(?:_active|_enabled|_on)?", re.IGNORECASE)
+_MODE = re.compile(r"manual|auto(?:nomous|matic)?(?=_|$)|(?:^|_)mode(?=_|$)", re.IGNORECASE)
+_RESET_TOPIC = PRESETS["estop"].given_topics["reset"]
 _JOY = "sensor_msgs/Joy"
+_CLOUD = "sensor_msgs/PointCloud2"
 _BOOL = "std_msgs/Bool"
 _SLOWEST_HZ = 2.0
 """A base drives blind between two messages of a slower sensor."""
@@ -42,15 +46,13 @@ _STEADY_HZ = 5.0
 _MOST_TOPICS = 500
 _READ = {
     *types.COMMANDS, *types.GOALS, *types.RESULTS, *types.POSES, *types.SCANS, *types.BATTERIES, *types.DIAGNOSTICS,
-    _BOOL, _JOY,
-    "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
+    _BOOL, _JOY, _CLOUD, "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
 }  # fmt: skip
 """The types from which the advice follows."""
 
 NOT_SUGGESTED = {
     "agree": "no name says which two velocities should be equal",
     "enable": "no name says that a person has to hold a switch",
-    "mode": "no name says that `true` means manual mode",
     "overspeed": "its limits follow from the base, which the graph does not show",
     "rate": "a rate follows from the driver, which the graph does not show",
     "sane": "the other guards of a base stop it at values that are not finite",
@@ -99,11 +101,15 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Advice:
-    """Proposals, the guards in use that make further ones unnecessary, and what is left out, as sentences."""
+    """Proposals, the guards in use that make further ones unnecessary, and sentences.
+
+    `left_out` has what is ambiguous, and `not_protected` what neither the proposals nor the guards in use protect.
+    """
 
     proposals: list[Proposal]
     loaded: list[LoadedGuard]
     left_out: list[str]
+    not_protected: list[str]
 
 
 def _by_host(topics: Iterable[TopicFacts]) -> list[TopicFacts]:
@@ -148,14 +154,26 @@ def advice(
         writer.add_joystick(command)
     unguarded = graph.unguarded({*types.COMMANDS, *types.GOALS})
     if unguarded and graph.robots:
-        named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:5])
+        named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:_MOST_NAMED])
         writer.left_out.append(f"no preset works with these commands, which may also move the robot: {named}")
     if len(read) > _MOST_TOPICS or MOST_COMMANDS in (len(graph.velocity_commands), len(graph.arms)):
         writer.left_out.append(
             f"only the first {MOST_COMMANDS} commands of each kind among {_MOST_TOPICS} topics were read: others may"
             " need a guard"
         )
-    return Advice(writer.found, writer.in_use, writer.left_out)
+    for topic in graph.legs[:_MOST_NAMED]:
+        writer.left_out.append(
+            f"{topic.name} comes from {', '.join(topic.publishers)}, which carries out a velocity of the base: it may"
+            " move legs, and a robot with legs may fall at a stop; if it moves an arm:"
+            f" rosrv guard new joints {topic.name} --shadow"
+        )
+    for topic in graph.undecided[:_MOST_NAMED]:
+        ends = f"{', '.join(topic.publishers)} to {', '.join(sorted(graph.ends(topic)))}"
+        writer.left_out.append(
+            f"{topic.name} ({topic.type}) goes from {ends}, and may be a command or a measurement; if it moves the"
+            f" robot: rosrv guard new deadman {topic.name} --shadow"
+        )
+    return Advice(writer.found, writer.in_use, writer.left_out, [*writer.not_protected()])
 
 
 class _Writer:
@@ -163,6 +181,11 @@ class _Writer:
 
     def __init__(self, graph: RobotGraph, loaded: Sequence[LoadedGuard], names: set[str]) -> None:
         self.graph, self._loaded, self._names = graph, loaded, names
+        self._stops = {
+            topic.name
+            for topic in graph.topics
+            if _stops(f"{topic.name.rsplit('/', 1)[0]}/{graph.leaf(topic)}")
+        }
         self._alone = len([*graph.bases, *graph.arms, *graph.arm_velocities]) == 1
         self.found: list[Proposal] = []
         self.in_use: list[LoadedGuard] = []
@@ -174,6 +197,7 @@ class _Writer:
         self._add_fence(base)
         self._add_scanners(base)
         self._add("speed", base)
+        self._add_mode(base)
         batteries = self.graph.sources(base, types.BATTERIES)
         if len(batteries) == 1:
             self._add("arm", base, _silence(batteries[0], 5, 5, 600), topics={"by": batteries[0].name})
@@ -206,7 +230,12 @@ class _Writer:
     def add_arm(self, arm: TopicFacts) -> None:
         states = self.graph.sources(arm, {"sensor_msgs/JointState"})
         drivers = self.graph.robot_of(arm).drivers
-        best = [state for state in states if not drivers.isdisjoint(state.publishers)] or states
+        reported = [
+            topic
+            for topic in self.graph.topics
+            if topic.type == "sensor_msgs/JointState" and not drivers.isdisjoint(topic.publishers)
+        ]
+        best = reported or states
         if len(best) == 1:
             self._add("joints", arm, topics={"state": best[0].name})
         else:
@@ -264,9 +293,9 @@ class _Writer:
         resets = [
             topic
             for topic in switches
-            if _STOP.search(topic.name) and _RESET.search(topic.name) and not _stops(topic.name)
+            if _STOP.search(topic.name) and _RESET.search(topic.name) and topic.name not in self._stops
         ]
-        stops = [topic for topic in switches if _stops(topic.name)]
+        stops = [topic for topic in switches if topic.name in self._stops]
         stops = [
             topic for topic in stops if not any(self.graph.derived_from(other, [topic]) for other in stops)
         ]
@@ -274,16 +303,24 @@ class _Writer:
             topics = {"stop": stop.name}
             if len(resets) == 1:
                 topics["reset"] = resets[0].name
-            elif space := self.graph.robot_of(command).namespace:
-                topics["reset"] = f"/{'/'.join(space)}/emergency_stop_reset"
-            self._add("estop", command, _silence(stop, 5, 0.5, 5), several=len(stops) > 1, topics=topics)
-            if not stop.rate:
+            elif (robot := self.graph.robot_of(command)).namespace:
+                topics["reset"] = robot.name_of("emergency_stop_reset")
+            self._add(
+                "estop",
+                command,
+                _silence_of_each(stop),
+                _publishers(stop),
+                several=len(stops) > 1,
+                topics=topics,
+            )
+            self._say_slow(stop, "estop")
+            if not resets:
                 self._say(
-                    f"{stop.name} sends nothing now: if it sends only changes, add silent=0, and its failure is not"
-                    " noticed"
+                    f"no node sends on {topics.get('reset', _RESET_TOPIC)}: after a press of a button the robot stays"
+                    " stopped until one sends true there; for another topic add --topic reset=TOPIC"
                 )
         for topic in switches:
-            if topic not in resets and _STOP.search(topic.name) and not _stops(topic.name):
+            if topic not in resets and _STOP.search(topic.name) and topic.name not in self._stops:
                 self._say(
                     f"{topic.name}: its name does not say whether true stops; {_by_hand('if it does', topic)}"
                 )
@@ -291,15 +328,124 @@ class _Writer:
             if (
                 topic.type != _BOOL
                 and topic.publishers
-                and _stops(topic.name)
+                and topic.name in self._stops
                 and self.graph.belongs(topic, command)
             ):
                 self._say(f"{topic.name} has the type {topic.type}: an estop works with {_BOOL} only")
         for topic in self.graph.shared({_BOOL}):
-            if _stops(topic.name):
+            if topic.name in self._stops:
                 self._say(
                     f"{topic.name} belongs to no robot alone; {_by_hand('for each that it should stop', topic)}"
                 )
+
+    def _add_mode(self, base: TopicFacts) -> None:
+        switches = [
+            topic for topic in self.graph.sources(base, {_BOOL}) if _MODE.search(self.graph.leaf(topic))
+        ]
+        manual = [topic for topic in switches if _MANUAL.fullmatch(self.graph.leaf(topic))]
+        if len(manual) == 1:
+            self._add("mode", base, _silence_of_each(manual[0]), _publishers(manual[0]),
+                      topics={"by": manual[0].name})  # fmt: skip
+            self._say_slow(manual[0], "mode")
+        elif manual:
+            self._leave("mode", base, "several topics say manual mode", manual)
+        for topic in switches:
+            if topic not in manual:
+                self._say(
+                    f"{topic.name}: its name does not say that true means manual mode; if it does: rosrv guard new mode"
+                    f" {base.name} --by {topic.name} --shadow"
+                )
+
+    def _say_slow(self, button: TopicFacts, preset: str) -> None:
+        """Say when the failure of a button is noticed late or never."""
+        rate = button.rate_of_each
+        if not rate:
+            silent = "one of its publishers sends" if button.rate else "it sends"
+            self._say(
+                f"{button.name}: {silent} nothing now: {preset} stops the base until it does; if it sends only changes,"
+                " set silent=0, and its failure is not noticed"
+            )
+        elif rate < _SLOWEST_HZ:
+            self._say(
+                f"{button.name} has a rate of only {rate:.3g} Hz, so its failure is noticed after"
+                f" {_silence_of_each(button)['silent']} s: let it send 5 times a second or more"
+            )
+
+    def not_protected(self) -> Iterator[str]:
+        """Yield what stays without a guard, by command, and then what no guard protects."""
+        bases, arms = self.graph.bases, [*self.graph.arm_velocities, *self.graph.arms]
+        for commands, presets, what, help_ in (
+            ([*bases, *arms], ("estop",), "no button stops {}", self._no_button),
+            (bases, ("separation", "zone"), "no guard stops {} before a person or a thing", self._no_scanner),
+            (bases, ("fence",), "no area bounds {}", None),
+            (bases, ("mode",), "no manual mode slows {}", self._no_mode),
+            (bases, ("enable",), "no enabling device has to be held for {}", self._no_device),
+            (bases, ("overspeed",), "no guard stops {} when the base is measured too fast", self._no_measurement),
+            (arms, (), "no guard stops {} before the arm meets a person or a thing", None),
+        ):  # fmt: skip
+            bare = [one for one in commands if not self._guards(one, presets)]
+            if bare:
+                advised = help_(bare[0]) if help_ else ""
+                yield what.format(_named(bare)) + (f": {advised}" if advised else "")
+        if not (bases or arms):
+            yield "nothing that moves here: no topic commands a base or an arm now"
+        yield _NEVER_PROTECTED
+
+    def _guards(self, command: TopicFacts, presets: Sequence[str]) -> bool:
+        guards = [(one.preset, one.topics) for one in self._loaded]
+        guards += [(one.preset, one.topics) for one in self.found]
+        return any(preset in presets and topics.get("command") == command.name for preset, topics in guards)
+
+    def _no_button(self, command: TopicFacts) -> str:
+        new = f"rosrv guard new estop {command.name} --topic stop="
+        others = [robot for robot in self.graph.robots if command not in robot.commands]
+        there = [
+            topic.name
+            for topic in self.graph.topics
+            if topic.type == _BOOL and topic.name in self._stops and not self.graph.is_below(topic, others)
+        ]
+        if there:
+            return f"if {there[0]} is also its button: {new}{there[0]} --shadow"
+        return (
+            f"let a node send std_msgs/Bool 5 times a second, true while it is pressed: {new}TOPIC --shadow"
+        )
+
+    def _no_scanner(self, command: TopicFacts) -> str:
+        if any(line.startswith(f"separation of {command.name} ") for line in self.left_out):
+            return "the reason is above"
+        clouds = self.graph.sources(command, {_CLOUD})
+        if clouds:
+            return (
+                f"{clouds[0].name} is a PointCloud2, and a guard reads a LaserScan: run pointcloud_to_laserscan, and"
+                " again: rosrv guard suggest"
+            )
+        return (
+            "no LaserScan belongs to its robot alone; if there is one:"
+            f" rosrv guard new separation {command.name} --by TOPIC --shadow"
+        )
+
+    def _no_mode(self, command: TopicFacts) -> str:
+        return (
+            "let a node send std_msgs/Bool, true in manual mode:"
+            f" rosrv guard new mode {command.name} --by TOPIC --shadow"
+        )
+
+    def _no_device(self, command: TopicFacts) -> str:
+        stick = next(
+            (topic.name for topic in self.graph.topics if topic.type == _JOY and topic.publishers), ""
+        )
+        by = f"--by {stick} --shadow button=N" if stick else "--by TOPIC --shadow"
+        return f"where a person drives by hand: rosrv guard new enable {command.name} {by}"
+
+    def _no_measurement(self, command: TopicFacts) -> str:
+        odometries = {topic.name for topic in self.graph.topics if topic.type == "nav_msgs/Odometry"}
+        places = [
+            one.topics["by"]
+            for one in self.found
+            if one.preset == "fence" and one.topics["command"] == command.name
+        ]
+        by = next((place for place in places if place in odometries), "TOPIC")
+        return f"rosrv guard new overspeed {command.name} --by {by} --shadow"
 
     def _add_fence(self, base: TopicFacts) -> None:
         places = self.graph.sources(base, types.POSES)
@@ -338,7 +484,7 @@ class _Writer:
         for avoided in (_SCAN_OF_A_CAMERA, _RAW):
             scans = [topic for topic in scans if not avoided.search(topic.name)] or scans
         merged = [topic for topic in scans if self.graph.derived_from(topic, scans)]
-        sides = [topic for topic in scans if _SIDE.search(topic.name)]
+        sides = [topic for topic in scans if SIDE.search(topic.name)]
         raw = sides if len(sides) > 1 else [topic for topic in scans if topic not in merged] or scans
         for preset, chosen in (("sensor", raw), ("separation", merged or raw)):
             several = len(chosen) > 1
@@ -348,6 +494,8 @@ class _Writer:
                     " these are in that of the map"
                 )
                 continue
+            for scan in merged if preset == "separation" else ():
+                self._say_merged(scan, raw, base)
             for scan in chosen:
                 if 0 < scan.rate < _SLOWEST_HZ:
                     self._leave(preset, base, _slow(scan), [scan])
@@ -366,6 +514,21 @@ class _Writer:
                     "each separation needs the direction and the view of its scanner: set mounted and sector"
                     f" ({', '.join(scan.name for scan in chosen)})"
                 )
+
+    def _say_merged(self, scan: TopicFacts, watched: Sequence[TopicFacts], base: TopicFacts) -> None:
+        origins = self.graph.origins(scan, {*types.SCANS, _CLOUD})
+        if len(origins) < 2:
+            return
+        named = ", ".join(topic.name for topic in origins)
+        alone = [topic.name for topic in origins if topic not in watched]
+        self._say(
+            f"{scan.name} is merged from {named}: if one of them fails it may go on without that part, so "
+            + (
+                f"also watch {', '.join(alone)}: rosrv guard new sensor {base.name} --by {alone[0]} --shadow"
+                if alone
+                else "enforce the sensor of each together with the separation"
+            )
+        )
 
     def _comes_after_motion(self, topic: TopicFacts) -> bool:
         """Whether a particle filter publishes it, which waits for the robot to move."""
@@ -387,7 +550,7 @@ class _Writer:
             level = 1
         else:
             level = 2 if odometry else 3 + (topic.type != "geometry_msgs/PoseStamped")
-        return level, int(bool(_WHEELS.search(topic.name))), -near(topic, base)
+        return level, int(bool(_WHEELS.search(topic.name))), -self.graph.near(topic, base)
 
     def _add(
         self,
@@ -408,7 +571,8 @@ class _Writer:
                     self.in_use.append(guard)
                 return
         source = topics.get("by") or topics.get("stop") or ""
-        parts = [preset, *([] if self._alone else [command.name]), *([source] if several else [])]
+        short = command.name.removesuffix("/follow_joint_trajectory/goal")
+        parts = [preset, *([] if self._alone else [short]), *([source] if several else [])]
         name = next(name for name in _names(parts, command.name) if name not in self._names)
         self._names.add(name)
         alternatives = [topic.name for topic in others if topic.name != topics.get("by")]
@@ -432,6 +596,19 @@ class _Writer:
 
 _OWN_GUARD = {"sensor": ("by",), "separation": ("by",), "estop": ("stop",)}
 """The topics that have a guard of their own each."""
+
+
+_NEVER_PROTECTED = (
+    "never by a guard: persons and things that no sensor of a guard sees; motions that come by no guarded topic; a"
+    " failure of this appliance, its power or its network, for which the driver needs its own timeout and the robot its"
+    " own emergency stop; and nothing is stopped by a guard in shadow mode"
+)
+_MOST_NAMED = 5
+
+
+def _named(topics: Sequence[TopicFacts]) -> str:
+    named = ", ".join(topic.name for topic in topics[:_MOST_NAMED])
+    return f"{named} and {len(topics) - _MOST_NAMED} others" if len(topics) > _MOST_NAMED else named
 
 
 def _stops(topic: str) -> bool:
@@ -463,6 +640,20 @@ def _names(parts: list[str], command: str) -> Iterator[str]:
 
 def _slug(topic: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", topic.lower()).strip("_")
+
+
+def _publishers(topic: TopicFacts) -> dict[str, str]:
+    """Return how many nodes have to be heard, if a guard can know so many."""
+    return {"publishers": f"{len(topic.publishers)}"} if len(topic.publishers) <= _MOST_PUBLISHERS else {}
+
+
+def _silence_of_each(topic: TopicFacts) -> dict[str, str]:
+    """Allow one lost message of the slowest publisher, which also may be late by half a period."""
+    rate = topic.rate_of_each
+    return {"silent": f"{min(max(2.5 / rate, 0.5), 60):.3g}"} if rate > 0 else {}
+
+
+_MOST_PUBLISHERS = 8
 
 
 def _silence(topic: TopicFacts, periods: int, least: float, most: float) -> dict[str, str]:

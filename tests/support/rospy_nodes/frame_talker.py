@@ -1,4 +1,4 @@
-"""Publish given messages at a rate: frame_talker.py.
+"""Publish given messages at a rate, and subscribe to topics: frame_talker.py [TOPIC...].
 
 The first line on the input is a list of streams: {"topic", "kind", "md5sum", "text", "hertz", "frames"}, with the
 messages, in turn, in hexadecimal. Each further line is an order: {"do": "pause"}, after which the event `paused` has
@@ -54,6 +54,8 @@ def publish(streams, turn, playing):
 
 def main():
     init_node("frame_talker")
+    for topic in rospy.myargv()[1:]:
+        rospy.Subscriber(topic, rospy.AnyMsg)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     streams = [Stream(given) for given in json.loads(sys.stdin.readline())]
     turn, playing = threading.Lock(), threading.Event()

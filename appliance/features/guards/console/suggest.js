@@ -19,7 +19,8 @@ export function Suggest({ guards, close }) {
       : !found.length && !loaded ? html`<${Empty} icon="robot" title="No topic now commands a base or an arm">Start the robot's nodes, or name a topic: <code>rosrv guard new --help</code></${Empty}>`
       : html`<ul class="stack">${found.map((/** @type {any} */ one) => html`<${Proposed} key=${one.name} one=${one} guards=${guards} />`)}</ul>
         ${loaded && html`<p class="muted small">Already loaded: <${Given} value=${loaded} most=${400} /></p>`}
-        ${value.left_out.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn"><${Given} value=${one} most=${600} /></${Notice}>`)}`}</${Dialog}>`;
+        ${value.left_out.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn"><${Given} value=${one} most=${600} /></${Notice}>`)}`}
+    ${value?.not_protected.length && html`<h3>Not protected</h3><ul class="stack small">${value.not_protected.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${600} /></li>`)}</ul>`}</${Dialog}>`;
 }
 
 function Proposed(/** @type {{one: any, guards: ReturnType<typeof import("./state.js").useGuards>}} */ { one, guards }) {

@@ -39,6 +39,7 @@ def printed(found: Advice) -> Iterator[str]:
         yield one.command.removeprefix("rosrv guard new ")
         yield from (f"  instead: {', '.join(topics)}" for topics in one.others.values())
     yield from (f"! {sentence}" for sentence in found.left_out)
+    yield from (f"- {sentence}" for sentence in found.not_protected[:-1])
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -46,6 +47,7 @@ def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
     graph = graph_of(robot)
     found = advice(graph)
     assert [*printed(found)] == ROBOTS[robot]["proposal"].splitlines()
+    assert found.not_protected[-1].startswith("never by a guard: ")
     sources = {f"{one.name}.rv": text(one, graph) for one in found.proposals}
     assert len(sources) == len(found.proposals)
     if robot not in sample(ROBOTS, 4):
@@ -64,6 +66,7 @@ def test_the_order_of_topics_and_further_observers_change_nothing(robot: str) ->
         again = advice(mixed)
         assert {one.command for one in again.proposals} == {one.command for one in found.proposals}
         assert {*again.left_out} == {*found.left_out}
+        assert [len(one) for one in again.not_protected] == [len(one) for one in found.not_protected]
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -117,6 +120,79 @@ def test_without_its_source_a_guard_is_left_out(robot: str) -> None:
         again = advice([*moved(graph_of(robot), "b"), *less]).proposals
         assert all(topic.startswith("/a/") for each in again if each.topics["command"].startswith("/a/")
                    for topic in each.topics.values())  # fmt: skip
+
+
+TWIST, STAMPED, ODOMETRY = "geometry_msgs/Twist", "geometry_msgs/TwistStamped", "nav_msgs/Odometry"
+BASE = [
+    TopicFacts("/cmd_vel", TWIST, ("/nav",), ("/base",), 10),
+    TopicFacts("/odom", ODOMETRY, ("/base",), ("/nav",), 10),
+]
+DIRECTIONS = [
+    # a further velocity; the topics that a deadman guards with it; whether a sentence asks about it
+    (TopicFacts("/base/ref", TWIST, ("/dock",), ("/base",)), {"/cmd_vel", "/base/ref"}, False),
+    (TopicFacts("/base/ref", TWIST, (), ("/base",)), {"/cmd_vel", "/base/ref"}, False),
+    (TopicFacts("/base/cmd_vel_out", STAMPED, ("/base",), ("/logger",)), {"/cmd_vel"}, True),
+    (TopicFacts("/base/velocity", TWIST, ("/base",), ("/logger",)), {"/cmd_vel"}, False),
+    (TopicFacts("/wheel_twist", TWIST, ("/encoders",), ("/base",)), {"/cmd_vel"}, True),
+    (TopicFacts("/target", TWIST, ("/camera",), ("/people_tracker",)), {"/cmd_vel"}, False),
+    (TopicFacts("/target", TWIST, ("/camera",), ("/display",)), {"/cmd_vel"}, True),
+    (TopicFacts("/target", TWIST, ("/camera",), ("/rviz",)), {"/cmd_vel"}, False),
+]
+
+
+@pytest.mark.parametrize(("velocity", "guarded", "asked"), DIRECTIONS)
+def test_a_velocity_is_a_command_by_its_direction(
+    velocity: TopicFacts, guarded: set[str], asked: bool
+) -> None:
+    for graph in ([*BASE, velocity], [velocity, *BASE]):
+        found = advice(graph)
+        assert {one.topics["command"] for one in found.proposals if one.preset == "deadman"} == guarded
+        assert any("may be a command" in one for one in found.left_out) == asked
+
+
+def test_a_navigation_that_also_publishes_odometry_commands_the_base() -> None:
+    graph = [
+        TopicFacts("/cmd_vel", TWIST, ("/nav",), ("/base",)),
+        TopicFacts("/odom", ODOMETRY, ("/nav",), ()),
+    ]
+    assert {"deadman", "fence"} <= {one.preset for one in advice(graph).proposals}
+
+
+def test_the_list_of_what_is_not_protected_is_never_empty_and_knows_the_guards_in_use() -> None:
+    for graph in ([], [TopicFacts("/chatter", "std_msgs/String", ("/a",), ("/b",))]):
+        assert len(advice(graph).not_protected) == 2
+    loaded = [
+        LoadedGuard(preset, preset, {"command": "/cmd_vel", "by": "/x"})
+        for preset in ("deadman", "estop", "zone", "fence", "mode", "enable", "overspeed")
+    ]
+    assert len(advice(BASE, loaded).not_protected) == 1
+    for place, guard in enumerate(loaded[1:], 1):
+        assert len(advice(BASE, [*loaded[:place], *loaded[place + 1 :]]).not_protected) == 1 + (
+            guard.preset != "fence"
+        )
+
+
+BUTTONS = [  # the rates of its publishers; the values of the estop; whether a sentence names the rate
+    ((10.0,), "silent=0.5 publishers=1", False),
+    ((10.0, 10.0), "silent=0.5 publishers=2", False),
+    ((1.0,), "silent=2.5 publishers=1", True),
+    ((20.0, 1.0), "silent=2.5 publishers=2", True),
+    ((20.0, 0.0), "publishers=2", True),
+    ((0.0,), "publishers=1", True),
+    ((0.02,), "silent=60 publishers=1", True),
+]
+
+
+@pytest.mark.parametrize(("rates", "values", "said"), BUTTONS)
+def test_a_button_is_as_many_publishers_as_there_are_at_the_slowest_rate(
+    rates: tuple[float, ...], values: str, said: bool
+) -> None:
+    nodes = tuple(f"/button_{place}" for place in range(len(rates)))
+    found = advice([*BASE, TopicFacts("/e_stop", "std_msgs/Bool", nodes, (), sum(rates), (), min(rates))])
+    assert [one.command.partition("--shadow ")[2] for one in found.proposals if one.preset == "estop"] == [
+        values
+    ]
+    assert any("failure" in one for one in found.left_out) == said
 
 
 STOPS = {

@@ -92,6 +92,7 @@ class Robot:
                                 {"silent": "0.2"}, {}, "rosrv guard new fence", {"by": ["/wheels"]})],
                     [LoadedSuggestion("mine", "deadman", {"command": "/cmd_vel"})],
                     ["/estop_enabled: its name does not say whether true stops"],
+                    ["no button stops /cmd_vel"],
                 )  # fmt: skip
             case GuardsWanted():
                 return GuardList(2, "2", [], self.loaded, ["fence acts before rate"])
@@ -310,6 +311,8 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
         "polygon=-2,-2 2,-2 2,2 -2,2; "
         "instead of /odom: /wheels\n"
         "/estop_enabled: its name does not say whether true stops\n"
+        "not protected:\n"
+        "    no button stops /cmd_vel\n"
     )
     robot = Robot(None)
     robot.as_json = True
@@ -318,6 +321,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     assert lines[0] == {"loaded": "mine", "preset": "deadman", "topics": {"command": "/cmd_vel"}}
     assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})
     assert lines[2]["left_out"].startswith("/estop_enabled")
+    assert lines[3:] == [{"not_protected": "no button stops /cmd_vel"}]
 
 
 def test_each_guard_of_the_list_has_its_digest_in_json(capsys: pytest.CaptureFixture[str]) -> None:
