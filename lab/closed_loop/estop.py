@@ -17,7 +17,7 @@ class Button:
 
 
 class EstopWorld(World):
-    """Stop buttons and resets of several nodes: ISO 13850 (stop and reset), ISO 13851 (two hands)."""
+    """Stop buttons and resets of several nodes: stop, manual reset, two hands."""
 
     preset: ClassVar[str] = "estop"
     not_yet: ClassVar[Mapping[str, str]] = {

@@ -17,6 +17,10 @@ def test_every_preset_has_its_evidence() -> None:
     for name, row in EVIDENCE.items():
         assert row.clauses and row.notices and row.fails and row.unit, name
         assert not row.silence or PRESETS[name].parameter(row.silence)
+        for clause in row.clauses:
+            assert clause.startswith("no standard: ") or re.match(
+                r"(ISO|IEC)(/TS)? [\d-]+:20\d\d, (\d+(\.\d+)*|table \w\.\d|clause not known), ", clause
+            ), clause
 
 
 def test_every_test_on_the_page_exists() -> None:
