@@ -15,9 +15,8 @@ def facts_of(graph: Graph) -> list[TopicFacts]:
     for one in graph.topics:
         publishers, subscribers = tuple(each.node for each in one.publishers), tuple(one.subscribers)
         ends = tuple(sorted({hosts[node] for node in (*publishers, *subscribers) if node in hosts}))
-        rates = [each.messages_per_second for each in one.publishers]
-        slowest = min(rates, default=0.0)
-        found.append(TopicFacts(one.name, one.type, publishers, subscribers, sum(rates), ends, slowest))
+        rates = tuple(each.messages_per_second for each in one.publishers)
+        found.append(TopicFacts(one.name, one.type, publishers, subscribers, sum(rates), ends, rates))
     return found
 
 

@@ -69,13 +69,13 @@ class TopicFacts(NamedTuple):
     subscribers: tuple[str, ...]
     rate: float = 0.0
     hosts: tuple[str, ...] = ()
-    slowest: float | None = None
-    """The rate of its slowest publisher, if that is known."""
+    rates: tuple[float, ...] = ()
+    """The messages per second of each publisher, if they are known."""
 
-    @property
-    def rate_of_each(self) -> float:
-        even = self.rate / max(len(self.publishers), 1)
-        return even if self.slowest is None else self.slowest
+    def slowest(self, *, sending: bool = False) -> float:
+        """Return the rate of the slowest publisher, or of the slowest that sends now."""
+        rates = self.rates or (self.rate / max(len(self.publishers), 1),)
+        return min((rate for rate in rates if rate > 0 or not sending), default=0.0)
 
 
 @dataclass(frozen=True)

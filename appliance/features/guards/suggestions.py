@@ -358,8 +358,12 @@ class _Writer:
 
     def _say_slow(self, button: TopicFacts, preset: str) -> None:
         """Say when the failure of a button is noticed late or never."""
-        rate = button.rate_of_each
-        if not rate:
+        rate = button.slowest()
+        if not button.rate and not button.subscribers:
+            self._say(
+                f"no node subscribes to {button.name}, so its rate is not known now: {preset} has the default of silent"
+            )
+        elif not rate:
             silent = "one of its publishers sends" if button.rate else "it sends"
             self._say(
                 f"{button.name}: {silent} nothing now: {preset} stops the base until it does; if it sends only changes,"
@@ -649,7 +653,7 @@ def _publishers(topic: TopicFacts) -> dict[str, str]:
 
 def _silence_of_each(topic: TopicFacts) -> dict[str, str]:
     """Allow one lost message of the slowest publisher, which also may be late by half a period."""
-    rate = topic.rate_of_each
+    rate = topic.slowest()
     return {"silent": f"{min(max(2.5 / rate, 0.5), 60):.3g}"} if rate > 0 else {}
 
 
@@ -657,5 +661,6 @@ _MOST_PUBLISHERS = 8
 
 
 def _silence(topic: TopicFacts, periods: int, least: float, most: float) -> dict[str, str]:
-    """Allow some periods of the present rate."""
-    return {"silent": f"{min(max(periods / topic.rate, least), most):.3g}"} if topic.rate > 0 else {}
+    """Allow some periods of the slowest publisher that sends now: each is judged alone."""
+    rate = topic.slowest(sending=True)
+    return {"silent": f"{min(max(periods / rate, least), most):.3g}"} if rate > 0 else {}

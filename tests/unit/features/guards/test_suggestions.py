@@ -188,11 +188,17 @@ def test_a_button_is_as_many_publishers_as_there_are_at_the_slowest_rate(
     rates: tuple[float, ...], values: str, said: bool
 ) -> None:
     nodes = tuple(f"/button_{place}" for place in range(len(rates)))
-    found = advice([*BASE, TopicFacts("/e_stop", "std_msgs/Bool", nodes, (), sum(rates), (), min(rates))])
+    found = advice([*BASE, TopicFacts("/e_stop", "std_msgs/Bool", nodes, ("/base",), sum(rates), (), rates)])
     assert [one.command.partition("--shadow ")[2] for one in found.proposals if one.preset == "estop"] == [
         values
     ]
     assert any("failure" in one for one in found.left_out) == said
+    command = TopicFacts("/cmd_vel", TWIST, nodes, ("/base",), sum(rates), (), rates)
+    slowest = min((rate for rate in rates if rate), default=0)
+    silent = f"silent={min(max(5 / slowest, 0.2), 2):.3g}" if slowest else "--shadow"
+    assert any(
+        one.command.endswith(f" {silent}") for one in advice([command]).proposals if one.preset == "deadman"
+    )
 
 
 STOPS = {
