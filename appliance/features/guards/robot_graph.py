@@ -109,8 +109,9 @@ class RobotGraph:
     def velocities(self) -> list[TopicFacts]:
         """The topics that command velocities, those between a node and a multiplexer too.
 
-        Their name says so, or a node subscribes to them that carries out, passes on or publishes another command. In a
-        graph without any of these, the subscriber reports how the robot moves.
+        Their name says so; or a node subscribes to them that carries out, passes on or publishes another command; or a
+        node makes them from a command of the same type. In a graph without any of these, the subscriber reports how the
+        robot moves. But a name of a measurement is none of a command.
         """
         directed = [topic for topic in self.topics if topic.type in VELOCITIES and not self._reports(topic)]
         found = [topic for topic in directed if COMMAND.search(topic.name)]
@@ -122,8 +123,8 @@ class RobotGraph:
             more = [
                 topic
                 for topic in others
-                if not _A_MEASUREMENT.search(topic.name) and topic not in found and topic.type in kinds
-                and not (takers.isdisjoint(topic.publishers)
+                if not _A_MEASUREMENT.search(topic.name) and topic not in found
+                and not ((topic.type not in kinds or takers.isdisjoint(topic.publishers))
                          and (takers | senders).isdisjoint(self._carrying_out(topic)))
             ]  # fmt: skip
             found += more

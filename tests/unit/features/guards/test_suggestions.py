@@ -130,7 +130,8 @@ BASE = [
 DIRECTIONS = [
     # a further velocity; the topics that a deadman guards with it; whether a sentence asks about it
     (TopicFacts("/base/ref", TWIST, ("/dock",), ("/base",)), {"/cmd_vel", "/base/ref"}, False),
-    (TopicFacts("/base/ref", TWIST, (), ("/base",)), {"/cmd_vel", "/base/ref"}, False),
+    (TopicFacts("/base/ref", STAMPED, (), ("/base",)), {"/cmd_vel", "/base/ref"}, False),
+    (TopicFacts("/base/out", TWIST, ("/base",), ("/motors",)), {"/cmd_vel"}, False),
     (TopicFacts("/base/cmd_vel_out", STAMPED, ("/base",), ("/logger",)), {"/cmd_vel"}, True),
     (TopicFacts("/base/velocity", TWIST, ("/base",), ("/logger",)), {"/cmd_vel"}, False),
     (TopicFacts("/wheel_twist", TWIST, ("/encoders",), ("/base",)), {"/cmd_vel"}, True),
