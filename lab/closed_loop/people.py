@@ -33,6 +33,10 @@ class SwitchWorld(World):
         self.ready: set[int] = set()
         """Nodes that have stood, or were slow, since the last stop."""
         self.passing = self.sent = 0
+        self.publishers = self.seed % (2 if self.live else 3)
+
+    def unheard(self) -> bool:
+        return len(self.switches) < max(self.publishers, 1)
 
     def drives(self, nodes: tuple[int, ...], speeds: tuple[float, ...]) -> None:
         r = self.random
@@ -95,7 +99,7 @@ class EnableWorld(SwitchWorld):
         self.live = r.random() < 0.15
         self.silent = round(r.uniform(0.1, 0.5), 2)
         self.begun()
-        self.guarded({"silent": self.silent})
+        self.guarded({"silent": self.silent, "publishers": self.publishers})
         self.drives((1,) if self.live or r.random() < 0.5 else (1, 2), (0.5,))
         for node in (3,) if self.live or r.random() < 0.6 else (3, 4):
             self._device(node)
@@ -143,8 +147,8 @@ class EnableWorld(SwitchWorld):
     def _why_not(self, slack: int = 0) -> tuple[str, str] | None:
         """Return the law and the reason that nothing may move."""
         law = "L4" if len(self.switches) > 1 else "L2"
-        if not self.switches:
-            return law, "no device has said a word"
+        if self.unheard():
+            return law, "a device has not said a word"
         if quiet := self.quiet(slack):
             return law, f"the device of node {quiet[0]} is silent"
         for node, one in self.switches.items():
@@ -219,7 +223,9 @@ class ModeWorld(SwitchWorld):
         self.silent = 1.0 if self.live else r.choice((0.0, 0.3, 1.0))
         self.most, self.turn = round(r.uniform(0.1, 0.5), 2), round(r.uniform(0.2, 1), 2)
         self.begun()
-        self.guarded({"vMax": self.most, "wMax": self.turn, "silent": self.silent})
+        self.guarded({
+            "vMax": self.most, "wMax": self.turn, "silent": self.silent, "publishers": self.publishers,
+        })  # fmt: skip
         self.drives(
             (1,) if self.live or r.random() < 0.5 else (1, 2),
             (1.5,) if self.live else (self.most * 0.9, 0.7, 1.5, 9.0, 1e300, math.inf, math.nan),
@@ -269,8 +275,8 @@ class ModeWorld(SwitchWorld):
 
     def _why_not(self, slack: int = 0) -> tuple[str, str] | None:
         law = "L4" if len(self.switches) > 1 else "L2"
-        if not self.switches:
-            return law, "no node has said the mode"
+        if self.unheard():
+            return law, "a node has not said the mode"
         if quiet := self.quiet(slack):
             return law, f"node {quiet[0]}, which says the mode, is silent"
         for node, one in self.switches.items():

@@ -117,6 +117,7 @@ class World:
     def __init__(
         self, seed: int, change: Change = unchanged, trace: Callable[[str], None] | None = None
     ) -> None:
+        self.seed = seed
         self.random = random.Random(f"{type(self).__name__} {seed}")  # noqa: S311  a seed gives the same world again
         self.report = Report()
         self.now = 0
