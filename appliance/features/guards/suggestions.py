@@ -313,11 +313,11 @@ class _Writer:
                 several=len(stops) > 1,
                 topics=topics,
             )
-            self._say_slow(stop, "estop")
+            self._say_buttons(stop, "estop")
             if not resets:
                 self._say(
-                    f"no node sends on {topics.get('reset', _RESET_TOPIC)}: after a press of a button the robot stays"
-                    " stopped until one sends true there; for another topic add --topic reset=TOPIC"
+                    f"no node publishes {topics.get('reset', _RESET_TOPIC)}: after a press of a button the robot stays"
+                    " stopped until a node sends true there; for another topic add --topic reset=TOPIC"
                 )
         for topic in switches:
             if topic not in resets and _STOP.search(topic.name) and topic.name not in self._stops:
@@ -346,7 +346,7 @@ class _Writer:
         if len(manual) == 1:
             self._add("mode", base, _silence_of_each(manual[0]), _publishers(manual[0]),
                       topics={"by": manual[0].name})  # fmt: skip
-            self._say_slow(manual[0], "mode")
+            self._say_buttons(manual[0], "mode")
         elif manual:
             self._leave("mode", base, "several topics say manual mode", manual)
         for topic in switches:
@@ -356,9 +356,14 @@ class _Writer:
                     f" {base.name} --by {topic.name} --shadow"
                 )
 
-    def _say_slow(self, button: TopicFacts, preset: str) -> None:
-        """Say when the failure of a button is noticed late or never."""
+    def _say_buttons(self, button: TopicFacts, preset: str) -> None:
+        """Say when the failure of a button is noticed late or never, and which nodes are its buttons."""
         rate = button.slowest()
+        if len(button.publishers) > 1:
+            self._say(
+                f"{button.name} comes from {', '.join(button.publishers[:_MOST_NAMED])}: {preset} waits for"
+                f" {len(button.publishers)} nodes; if not each is a button, set publishers"
+            )
         if not button.rate and not button.subscribers:
             self._say(
                 f"no node subscribes to {button.name}, so its rate is not known now: {preset} has the default of silent"
