@@ -114,6 +114,12 @@ def _none_if_empty(value: object) -> object:
     return None if value == "" else value  # compose passes an unset variable as ""
 
 
+def _checked_topic(text: str) -> str:
+    if text and _NODE_NAME.fullmatch(text) is None:
+        raise ValueError(f"{text!r} is not a global topic name, for example /rosrv/heartbeat")
+    return text
+
+
 def _checked_name(text: str) -> str:
     if _NODE_NAME.fullmatch(text) is None:
         raise ValueError(f"{text!r} is not a global node name, for example /rosrv")
@@ -221,6 +227,19 @@ class Relay:
     budget: Milliseconds = key(
         default=10.0,
         description="milliseconds of processor time that monitors may take for one message; more is a fault",
+    )
+    late: Annotated[float, Field(ge=1.0, le=100.0, allow_inf_nan=False)] = key(
+        default=20.0,
+        description="milliseconds after which a tick of a guard, or a message that it judged, is late: an alarm",
+    )
+    heartbeat: Annotated[str, AfterValidator(_checked_topic)] = key(
+        default="",
+        description="topic (std_msgs/Bool) of the heartbeat, a square wave of 10 Hz while every guard can act",
+    )
+    heartbeat_line: str = key(
+        default="",
+        pattern=r"^(/dev/[A-Za-z0-9_./-]{1,200})?$",
+        description="serial line of the heartbeat, such as /dev/ttyUSB0: 9600 baud, 0x55 and 0xAA in turn",
     )
 
 

@@ -27,6 +27,7 @@ from appliance.relay.connections.upstream import PublisherConnection
 from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import GrantTable, PeerGrant
 from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.heartbeat import Heartbeat
 from appliance.relay.monitors.interceptor import Interceptor, MonitorOrder
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.ranked_topics import RankedTopics
@@ -56,6 +57,7 @@ class DataPlane:
             holder=lambda host: host if self._table.is_registered(host) else "",
             payer=self._table.payer,
             publishers=lambda topic: [relayed.point for relayed in self._publications(topic)],
+            late=limits.late / 1000,
         )
         self._context = RelayContext.of(loop, limits, self._reporter, self.interceptor, self._table)
         self.memory = self._context.memory
@@ -84,6 +86,14 @@ class DataPlane:
         self._topic_taps = TopicTaps(self._reporter.send)
         self._sink: MessageSink | None = None
         self._tidying: Iterator[tuple[int, RelayedTopic | ServiceClient]] = iter(())
+        self.heartbeat = Heartbeat(
+            loop,
+            limits,
+            self.interceptor,
+            publish=lambda data: self._publish(limits.heartbeat, data),
+            topics=self.topics.values,
+            unwritten=self._unwritten_stop,
+        )
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: LoopLink | None) -> None:
@@ -136,6 +146,7 @@ class DataPlane:
 
     def close(self) -> None:
         self.interceptor.close()
+        self.heartbeat.close()
         self.ports.close_all()
         for topic in self.topics.values():
             topic.cut_all("the relay ends")
@@ -218,6 +229,7 @@ class DataPlane:
             clock=self._loop.clock,
             share=self.memory.latched.of(host),
             fresh=not self._table.restating,
+            late=self._limits.late / 1000,
             limited=lambda part, messages, size: self._reporter.limited(
                 (key, topic, part, host, name), messages, size
             ),
@@ -342,6 +354,13 @@ class DataPlane:
         for relayed in list(self.topics.values()):
             if relayed.topic == commands and relayed.upstream is not publisher:
                 relayed.supersede(stop)
+
+    def _unwritten_stop(self) -> str:
+        """Return which subscriber has not taken the last stop of a guard, or an empty text."""
+        for topic, publisher in self._own.items():
+            if self.interceptor.has_stoppers(topic) and (waiting := publisher.waiting()):
+                return f"{waiting} does not take the stop on {topic}"
+        return ""
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
         relayed = self.topics.pop((key, topic), None)
@@ -535,11 +554,18 @@ class DataPlane:
         self.ports.left(farewell.host)
 
     def _rows(self) -> list[messages.TopicTraffic]:
-        of_topics = (topic.traffic() for topic in self.topics.values())
+        of_topics = (self._traffic(topic) for topic in self.topics.values())
         of_services = (service.row(*entry) for entry, service in self._services.items())
         rows = [*self._last_rows, *filter(None, of_topics), *filter(None, of_services)]
         self._last_rows = []
         return rows
+
+    def _traffic(self, topic: RelayedTopic) -> messages.TopicTraffic | None:
+        longest, row = topic.counters.longest / 1e9, topic.traffic()
+        if row is not None and row.delays and (judges := self.interceptor.judges(topic.topic)):
+            what = f"a message of {topic.topic}"
+            self.interceptor.observer.timed(judges, what, sum(row.delays), longest, late=0)
+        return row
 
     def _tick(self) -> None:
         self._tidying = enumerate([*self.topics.values(), *self.clients])

@@ -90,6 +90,7 @@ class _Payer:
         "later",
         "later_first",
         "name",
+        "since",
         "spent",
         "watched",
     )
@@ -101,6 +102,7 @@ class _Payer:
         self.crowd: select.epoll | None = None  # of its descriptors beyond `_DIRECT`
         self.crowd_ready = self.costly = False
         self.events: dict[int, int] = {}  # ready events by descriptor, in order
+        self.since: dict[int, float] = {}  # when each of these was first found
         self.later: deque[Callable[[], None]] = deque()
         self.later_first = False
 
@@ -165,6 +167,9 @@ class EventLoop:
         self._processor_time = processor_time
         self._since = _UNKNOWN  # when the running handler began
         self._alone = False  # whether the running handler's descriptor is the only ready one
+        self._longest = 0.0
+        self.waited = 0.0
+        """The seconds between the report that the running handler's descriptor is ready, and the call."""
         self.clock = clock.now
 
     def watch(
@@ -198,6 +203,7 @@ class EventLoop:
         watched.epoll.modify(descriptor, events)
         if watched.payer is not None:
             watched.payer.events.pop(descriptor, None)
+            watched.payer.since.pop(descriptor, None)
 
     def unwatch(self, descriptor: int) -> None:
         watched = self._watched.pop(descriptor, None)
@@ -208,6 +214,7 @@ class EventLoop:
         payer = watched.payer
         if payer is not None:
             payer.events.pop(descriptor, None)
+            payer.since.pop(descriptor, None)
             payer.watched -= 1
             payer.direct -= watched.epoll is self._epoll
 
@@ -253,6 +260,11 @@ class EventLoop:
         if self._alone:
             self._floor = max(self._floor, found.spent)
 
+    def take_longest(self) -> float:
+        """Return the longest time in seconds that a turn took since the last call: all else waited for it."""
+        longest, self._longest = self._longest, 0.0
+        return longest
+
     def stop(self) -> None:
         self._running = False
 
@@ -269,12 +281,16 @@ class EventLoop:
                 longest = left if left > 0 else 0
         waiting = self._waiting
         found = self.pump.wait(0 if waiting else longest, self._room, not waiting)
+        began = self.clock()
         if len(found) == 1 and not waiting and found[0][0] in self._watched:
             self._serve_alone(*found[0])
         elif found or waiting:
-            self._serve_many(found)
-        if timers and timers[0][0] <= self.clock():
+            self._serve_many(found, began)
+        now = self.clock()
+        if timers and timers[0][0] <= now:
             self._call_due()
+            now = self.clock()
+        self._longest = max(self._longest, now - began)
         if self._discarded:
             self._close_discarded()
 
@@ -313,6 +329,7 @@ class EventLoop:
 
     def _serve_alone(self, number: int, events: int) -> None:
         self._since, began = _UNKNOWN, self.pump.began or self.clock()
+        self.waited = 0.0
         handler, payer, _ = self._watched[number]
         self._alone = True
         handler(events)
@@ -324,7 +341,7 @@ class EventLoop:
             payer.costly = used > _COSTLY
             self._floor = max(self._floor, payer.spent)
 
-    def _serve_many(self, found: list[tuple[int, int]]) -> None:
+    def _serve_many(self, found: list[tuple[int, int]], now: float) -> None:
         ready = dict(self._waiting)
         for number, events in found:
             watched = self._watched.get(number)
@@ -334,6 +351,7 @@ class EventLoop:
                     payer.crowd_ready = True
                 else:
                     payer.events[number] = events
+                    payer.since.setdefault(number, now)
                 ready[payer.name] = payer
             elif watched is not None:
                 self._since = _UNKNOWN
@@ -395,8 +413,10 @@ class EventLoop:
         while ready and self._since - began < QUANTUM:
             number = next(iter(ready))
             events = ready.pop(number)
+            since = payer.since.pop(number, None)
             watched = self._watched.get(number)
             if watched is not None:
+                self.waited = 0.0 if since is None else self.clock() - since
                 watched.handler(events)
                 self._charge(payer)
 

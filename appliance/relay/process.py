@@ -47,6 +47,7 @@ class RelayProcess:
         self._lifeline = LoopLink(
             self._loop, Channel(lifeline, messages.Lifeline), self._obey, self._supervisor_gone
         )
+        self._engine.heartbeat.line_wanted = lambda: self._lifeline.send(messages.HeartbeatLineWanted())
         self._control: LoopLink | None = None
         self._earlier: list[memoryview] = []
 
@@ -79,6 +80,10 @@ class RelayProcess:
             self._engine.copy_to(open_sink(message.terms, descriptors[0], self._engine.interceptor.now))
         elif isinstance(message, messages.StateGiven):
             self._keep_state(message, descriptors[0])
+        elif isinstance(message, messages.HeartbeatGiven) and message.line:
+            self._engine.heartbeat.use_line(descriptors[0])
+        elif isinstance(message, messages.HeartbeatGiven):
+            self._engine.heartbeat.share(mapped(descriptors[0], writable=True), self._index)
         else:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
 

@@ -45,6 +45,15 @@ class RelayLimits:
     budget: float = 10.0
     """Milliseconds of processor time that monitors may take for one message, request or reply."""
 
+    late: float = 20.0
+    """Milliseconds after which a tick of a monitor, or a message that it judged, counts as late."""
+
+    heartbeat: str = ""
+    """The topic of the heartbeat, or empty."""
+
+    heartbeat_line: str = ""
+    """The serial line of the heartbeat, or empty."""
+
     stall_seconds: float = 10.0
     """The seconds without progress after which the transfer of a large message is cut."""
 

@@ -70,6 +70,8 @@ class Rollout:
     slices: int
     parts: Parts
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
+    unfit: dict[int, str] = field(default_factory=dict)
+    """Why the part of a relay in the heartbeat is off, or an empty text; without a relay that has not reported."""
     _now: InForce = field(default_factory=InForce)
     # The relays' parts of the specifications in force, and of specifications being tried.
     compiled_parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
@@ -348,6 +350,7 @@ class Rollout:
             inherited.at,
             {name: why for name, why in revision.checked.unbuilt.items() if name in names.monitors},
             {name: values for name, values in given.items() if name in names.monitors},
+            tuple(revision.checked.left_out),
         )
 
     # --- messages of the relays ---
@@ -360,12 +363,13 @@ class Rollout:
                 self._left.pop(number).set_result(message)
             case messages.SpecificationsRefused(number, findings, statement):
                 self._refused(relay, number, findings, statement)
-            case messages.MonitorsCounted(rows):
-                self._rows[relay] = rows
+            case messages.MonitorsCounted(rows, unfit):
+                self._rows[relay], self.unfit[relay] = rows, unfit
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
         """Answer for a relay that ended, perhaps because of specifications that it has not answered."""
+        self.unfit[relay] = "a relay process ended"
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process exited during the load: try again"])
 

@@ -28,6 +28,7 @@ from appliance.network.firewall.iptables import load_modules
 from appliance.network.namespaces import Namespace, NetworkError, has_privileges
 from appliance.supervisor import signals
 from appliance.supervisor.errors import PortInUseError, StartError
+from appliance.supervisor.heartbeat_wiring import HeartbeatWiring
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
 from appliance.supervisor.lapse_answers import answer_for_control
 from appliance.supervisor.machine_work import MachineWork
@@ -480,6 +481,7 @@ def _supervise(
             listeners=listeners,
             memories=memories(settings.sections, settings.relays),
             memory=MonitorMemory(state.path, settings.relays),
+            heartbeat=HeartbeatWiring(settings.relays, settings.relay.heartbeat_line),
             stands_by=say_standing_by,
             gate=pairing.gate if pairing is not None else ServiceGate,
             work=work,

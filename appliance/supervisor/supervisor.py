@@ -32,6 +32,7 @@ from appliance.ipsec.strongswan import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.heartbeat_wiring import HeartbeatWiring
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
@@ -86,6 +87,10 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.MachineWorkWanted,
     messages.EndAgreed,
 )
+_FROM: dict[str, tuple[type[messages.Message], ...]] = {
+    "control": _FROM_CONTROL,
+    "relay": (messages.HeartbeatLineWanted,),
+}
 
 log = structlog.get_logger()
 
@@ -117,6 +122,7 @@ class Supervisor:
         listeners: Mapping[str, socket.socket] | None = None,
         memories: Sequence[SharedMemory] = (),
         memory: MonitorMemory | None = None,
+        heartbeat: HeartbeatWiring | None = None,
         stands_by: Callable[[], None] = lambda: None,
         gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
         work: MachineWork | None = None,
@@ -137,7 +143,7 @@ class Supervisor:
         self.kept.keep(ADMIN, admin.detach())
         self._listeners = dict(listeners or {})
         self._memories = memories
-        self._memory = memory
+        self._memory, self._heartbeat, self._line_failed = memory, heartbeat, ""
         self._ready = ready
         self.is_ready = False
         self._stands_by = stands_by
@@ -195,6 +201,8 @@ class Supervisor:
                 shared.close()
             if self._memory is not None:
                 self._memory.close()
+            if self._heartbeat is not None:
+                self._heartbeat.close()
 
     def stop(self, failure: str | None = None) -> None:
         if not self.stopping.is_set():
@@ -305,6 +313,8 @@ class Supervisor:
             self._memory.messages_for(slot.role.name, slot.index) if self._memory else ()
         ):
             slot.process.send(state, (descriptor,))
+        for memory, descriptor in self._heartbeat.messages_for(slot.role.name) if self._heartbeat else ():
+            slot.process.send(memory, (descriptor,))
         self._link(slot)
         self._tell_processes()
 
@@ -330,7 +340,7 @@ class Supervisor:
 
     def _received(self, process: ProcessHandle, message: object, descriptors: tuple[int, ...]) -> None:
         decisive = self._gate.accepts.get(process.role, ())
-        allowed = _FROM_ANY + decisive + (_FROM_CONTROL if process.role == "control" else ())
+        allowed = _FROM_ANY + decisive + _FROM.get(process.role, ())
         if not isinstance(message, allowed):
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -345,10 +355,24 @@ class Supervisor:
                 self._child_ready(process, detail)
             case messages.Failed(said, output):
                 self._cannot_serve(process, _printable(said), output)
+            case messages.HeartbeatLineWanted() if self._heartbeat is not None:
+                self._give_line(process, self._heartbeat)
             case _ if isinstance(message, decisive):
                 self._gate.heard(message)
             case _:
                 self.control_said(process, message, descriptors)
+
+    def _give_line(self, process: ProcessHandle, heartbeat: HeartbeatWiring) -> None:
+        try:
+            line, reason = heartbeat.open_line(), ""
+        except OSError as error:
+            line, reason = -1, str(error)
+        if reason and reason != self._line_failed:
+            log.error("the serial line of the heartbeat cannot be opened", reason=reason)
+        self._line_failed = reason
+        if line >= 0:
+            process.send(messages.HeartbeatGiven(line=True), (line,))
+            os.close(line)
 
     def _sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
         """Note the limits of a process, which only its first message may report."""

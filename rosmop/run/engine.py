@@ -537,6 +537,32 @@ class MonitorSet:
         monitor.hold(why)
         self._agenda.schedule()
 
+    def acting(self) -> list[str]:
+        """Return the enabled specifications that may stop, change or withhold messages."""
+        return [monitor.name for monitor in self._monitors if monitor.enabled and _acts(monitor)]
+
+    def judges(self, topic: str) -> list[str]:
+        """Return the specifications with an enabled event on a topic."""
+        steps = self.steps.get(topic, ())
+        return list(dict.fromkeys(step.monitor.name for step in steps if not isinstance(step, Tap)))
+
+    def unfit(self) -> str:
+        """Return why one of the specifications that may stop, change or withhold messages cannot judge now, or an
+        empty text. Those in shadow mode do not count.
+        """
+        for monitor in self._monitors:
+            if not _acts(monitor):
+                continue
+            if not monitor.enabled:
+                return f"{monitor.name} is disabled"
+            if monitor.held:
+                return f"{monitor.name} holds its topics{f': {monitor.why_held}' if monitor.why_held else ''}"
+            if monitor.broken:
+                return f"{monitor.name}: its initial values or `init` faulted"
+            if awaits := monitor.awaits:
+                return f"{monitor.name} waits until it hears {awaits}"
+        return ""
+
     def stoppers(self, topic: str) -> list[str]:
         return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
 
@@ -958,6 +984,10 @@ def _stopping(compiled: Compiled) -> Iterator[str]:
             writes = any(isinstance(one, nodes.WriteBack) and one.writes for one in parts)
             if not writes and any(isinstance(one, nodes.StopMessage) for one in parts):
                 yield f"{code.name}.{event.name}"
+
+
+def _acts(monitor: MonitorInstance) -> bool:
+    return bool(monitor.code.acts_on or monitor.safes or monitor.code.withholdings)
 
 
 def _slice_parts(group: MonitorGroup) -> list[tuple[str, SliceParts]]:

@@ -83,6 +83,10 @@ EVENTS: dict[str, str] = {
     " of control, every guard. `detail` has its preset with the version, `origin` (`current`, `older` or `changed`),"
     " the values in force, those `below` the standard, and the `digest` that binds them, as in"
     " `rosrv guard list --json`.",
+    "guard late": "A guard acted more than `relay.late` later than it was due. It is recorded again when the guard was"
+    " in time for a minute.",
+    "heartbeat begun": "The heartbeat is on: every guard can act.",
+    "heartbeat ended": "The heartbeat is off, for the reason in the record.",
     "guard bypassed": "A node took a guarded command from a publisher that the appliance did not give it, twice in a"
     " row; `detail` has `node`, `host` and `publishers`. It is recorded again when this has ended and begins again.",
     "monitor resumed": "The topics that a monitor held after a restart resume; `detail` has who ordered it.",
@@ -247,7 +251,8 @@ SEVERITIES: dict[str, Severity] = {
             "appliance started", "appliance stopped", "bundle in force", "bundle ordered", "clock not synchronised",
             "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
-            "host enrolled", "host renewed", "hosts reloaded", "driver checked", "guard loaded", "monitor resumed",
+            "host enrolled", "host renewed", "hosts reloaded", "driver checked", "guard loaded", "heartbeat begun",
+            "monitor resumed",
             "monitor set",
             "policy loaded", "rights changed", "stop ended",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
@@ -261,7 +266,7 @@ SEVERITIES: dict[str, Severity] = {
             "authority refused", "motion not stopped", "bundle metadata rejected", "bundle refused",
             "graph restored",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "ended by the clock",
-            "definitions differ", "enrolment refused",
+            "definitions differ", "enrolment refused", "guard late",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
             "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
             "policy refused", "process died", "recording missed", "renewal refused", "rest certificate replaced",
@@ -269,7 +274,7 @@ SEVERITIES: dict[str, Severity] = {
         ),
         Severity.ALARM: (
             "adoption failed", "firewall restored", "fleet not joined", "forwarding gap", "guard bypassed",
-            "monitor not built",
+            "heartbeat ended", "monitor not built",
             "monitors restarted", "policy file refused", "probe failed", "process failing", "protection forgotten",
             "publication refused", "records lost",
             "topics held",

@@ -293,6 +293,17 @@ class StateGiven(Message):
     ended_at: int = 0
 
 
+class HeartbeatGiven(Message):
+    """For a relay: the memory in which relays say that they are fit, or (`line`) the serial line of the heartbeat."""
+
+    descriptors: ClassVar[int] = 1
+    line: bool = False
+
+
+class HeartbeatLineWanted(Message):
+    """A relay asks for the serial line of the heartbeat, which it lacks."""
+
+
 class LeaseHeld(Message):
     """This appliance is active until `until` (seconds of CLOCK_BOOTTIME).
 
@@ -323,7 +334,8 @@ Lifeline = (
     | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
     | OwnNetworkWanted | OwnNetworkOpened
     | MachineWorkWanted | MachineWorkDone | EndAnnounced | EndAgreed
-    | MemoryGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
+    | MemoryGiven | StateGiven | HeartbeatGiven | HeartbeatLineWanted | RouteFound | LogHeld | CompilerWanted
+    | ApplianceStopRequested
     | SignatureWanted | SignatureMade
     | LeaseHeld | LeaseEnded | Activated | ServicePaused
 )  # fmt: skip

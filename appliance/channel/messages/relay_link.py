@@ -314,6 +314,7 @@ class SpecificationsStated(Message):
     ignores its own memory.
 
     `unbuilt` has the monitors whose files have errors. They hold their topics unless they are declared `begin`.
+    `left_out` are files with errors whose monitors do not run at all.
     """
 
     revision: int
@@ -331,6 +332,7 @@ class SpecificationsStated(Message):
     left_at: int = 0
     unbuilt: dict[str, str] = msgspec.field(default_factory=dict)
     given: dict[str, dict[str, GivenValue]] = msgspec.field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
 
 
 class StateWanted(Message):
@@ -544,7 +546,8 @@ class MonitorRow(msgspec.Struct, array_like=True):
 
     In shadow mode, drops and changes are those that it would have made, and `missed` counts messages that it would
     have received if it were in force. `withholds`: it withholds a topic from hosts now. `awaits`: the nodes without
-    whose messages it does not go on.
+    whose messages it does not go on. `timed` counts its ticks and the messages that it let pass, `late` those beyond
+    `relay.late`; `latest` is the longest delay in seconds.
     """
 
     name: str
@@ -561,12 +564,19 @@ class MonitorRow(msgspec.Struct, array_like=True):
     slice_limit: int = 0
     withholds: bool = False
     awaits: str = ""
+    timed: int = 0
+    late: int = 0
+    latest: float = 0.0
 
 
 class MonitorsCounted(Message):
-    """The counters of monitors, sent after a change, at most once a second."""
+    """The counters of monitors, sent after a change, at most once a second.
+
+    `unfit` is why this relay's part of the heartbeat is off, or empty.
+    """
 
     rows: list[MonitorRow]
+    unfit: str = ""
 
 
 class LookWanted(Message):

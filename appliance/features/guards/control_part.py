@@ -11,11 +11,12 @@ from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph
 from appliance.channel.answers.status import ProcessInfo
-from appliance.channel.messages import MonitorEvent
+from appliance.channel.messages import MonitorEvent, OwnHeaderStated
 from appliance.control.core import ControlPart, Core
 from appliance.control.errors import SenselessError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.guards.driver_outcomes import sentence_of
+from appliance.features.guards.fitness import GuardFitness
 from appliance.features.guards.guard_answers import DriverCheck
 from appliance.features.guards.guard_facts import facts_of
 from appliance.features.guards.guard_orders import GuardOrders
@@ -179,9 +180,22 @@ class DriverChecks:
         return text + "".join(f"\norder {name} < {NAME};" for name in self._monitors.checked.monitors) + "\n"
 
 
+_BOOL = ("std_msgs/Bool", "8b94c1b53db61fb6aed406028ad6332a", "bool data\n")
+"""The type of the heartbeat's topic, its md5sum and its definition."""
+
+
 async def begin(core: Core) -> ControlPart:
-    orders = GuardOrders(core.specifications, core.graph.present, core.graph.connections, core.trail)
+    relay = core.settings.relay
+    fitness = GuardFitness(core.specifications, relay, core.settings.relays, core.trail, core.store)
+    if relay.heartbeat:
+        core.relay.publish_only("guards", [OwnHeaderStated(relay.heartbeat, *_BOOL, latching=False)])
+    orders = GuardOrders(core.specifications, core.graph.present, core.graph.connections, core.trail, fitness)
     checks = DriverChecks(core.specifications, core.trail, core.graph.present, core.links.processes)
+
+    async def save() -> None:
+        fitness.save()
+
+    core.links.before_end(save)
     return ControlPart(
         (*orders.methods(), *checks.methods()),
         {

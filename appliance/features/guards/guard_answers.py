@@ -61,6 +61,23 @@ class LastStop(msgspec.Struct, frozen=True):
     publisher_node: Annotated[str, doc("the node of that publisher")] = ""
 
 
+class GuardTimes(msgspec.Struct, frozen=True):
+    """How late a guard has acted, over restarts, since it was first measured with this limit.
+
+    Measured are its ticks, from when they are due until their messages are written to the sockets, and the messages on
+    its topics that passed, from their receipt until then.
+    """
+
+    since: Annotated[Moment, doc("the first measurement, in seconds since the epoch")]
+    seconds: Annotated[float, doc("how long it was in force since then, and measured")]
+    timed: Annotated[int, doc("ticks and messages")]
+    late: Annotated[
+        int, doc("those beyond the limit, and times when its relay was busy or stopped for longer")
+    ]
+    latest: Annotated[float, doc("the longest delay, in seconds")]
+    limit: Annotated[float, doc("the limit in seconds, `relay.late`")]
+
+
 class GuardRow(msgspec.Struct, frozen=True):
     """A loaded guard."""
 
@@ -117,6 +134,9 @@ class GuardRow(msgspec.Struct, frozen=True):
     digest: Annotated[
         str, doc("binds its preset, text and values: the same digest is the same guard, with the same values")
     ] = ""
+    times: Annotated[GuardTimes | None, doc("how late it has acted, or null if it was not in force yet")] = (
+        None
+    )
 
 
 class GuardList(msgspec.Struct, frozen=True):

@@ -14,6 +14,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.guards import requests as guard_requests
 from appliance.features.guards.evidence import guard_digest
+from appliance.features.guards.fitness import GuardFitness
 from appliance.features.guards.guard_answers import (
     GuardList,
     GuardPlan,
@@ -191,8 +192,10 @@ class GuardOrders:
         graph: Callable[[], Graph],
         connections: ConnectedNodes,
         trail: AuditTrail,
+        fitness: GuardFitness,
     ) -> None:
         self._monitors, self._graph, self._trail = monitors, graph, trail
+        self._fitness = fitness
         self.placement = Placement(self._guarded_commands, graph, connections, self._note_bypass)
         self._acts: dict[str, int] = {}
         self._acted_at: dict[str, float] = {}
@@ -228,6 +231,7 @@ class GuardOrders:
         acting, now = [name for name in guards if self._state(name) == "stopping"], clock.wall()
         self._acting_since = {name: self._acting_since.get(name, now) for name in acting}
         self._record_loaded()
+        self._fitness.look(guards)
 
     def _record_loaded(self) -> None:
         """Record the guards whose text or values are others than before, after any change; at the start: all."""
@@ -256,7 +260,8 @@ class GuardOrders:
 
     def state(self) -> GuardsState | None:
         guards, place, former = self._guards(), self.placement, self._former()
-        if not guards and not former:
+        fitness = self._fitness
+        if not guards and not former and fitness.heartbeat is None:
             return None
         switches = self._monitors.switches
         return GuardsState(
@@ -269,6 +274,9 @@ class GuardOrders:
              if name not in switches.said and not switches.enabled(name)},
             [*self._older(guards)],
             former,
+            dict(fitness.late),
+            fitness.times,
+            fitness.heartbeat,
         )  # fmt: skip
 
     def _older(self, guards: Mapping[str, Preset]) -> Iterator[OlderGuard]:
@@ -531,4 +539,5 @@ class GuardOrders:
             digest=guard_digest(PRESETS[preset.name], text, values_of(given)),
             afresh=monitors.afresh(name) or "absent",
             awaits=row.awaits if (row := monitors.rollout.rows.get(name)) is not None else "",
+            times=self._fitness.times.get(name),
         )

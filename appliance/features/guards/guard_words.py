@@ -1,8 +1,10 @@
 """Describe a guard's state for a person."""
 
+from datetime import UTC, datetime
+
 from appliance.base.counted import counted
 from appliance.cli.output import moment
-from appliance.features.guards.guard_answers import GuardRow
+from appliance.features.guards.guard_answers import GuardRow, GuardTimes
 
 
 def origin_in_words(row: GuardRow) -> str:
@@ -49,6 +51,16 @@ def afresh_in_words(row: GuardRow) -> str:
         return f"it is only in the state directory, not in the folder of specifications: {write}"
     then = {"on": "in force", "shadow": "in shadow mode", "off": "disabled"}[row.afresh]
     return f"its state is not in {row.file}, so with a new state directory it would be {then}: {write}"
+
+
+def times_in_words(times: GuardTimes) -> str:
+    """Say how late a guard has been, with what was measured, and since when."""
+    since = datetime.fromtimestamp(times.since, UTC)
+    span = f"{times.seconds / 3600:.1f} h" if times.seconds >= 3600 else f"{times.seconds / 60:.0f} min"
+    return (
+        f"in {span} in force since {since:%Y-%m-%d %H:%MZ}, {times.late:,} of {times.timed:,} ticks and messages came"
+        f" more than {times.limit * 1e3:g} ms late, the latest {times.latest * 1e3:.1f} ms"
+    )
 
 
 def _last_stop(row: GuardRow) -> str:

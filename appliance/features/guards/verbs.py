@@ -28,7 +28,12 @@ from appliance.cli.output import refuse_beside_dry_run, say_json, say_row, usage
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.guards.guard_answers import GuardList, GuardRow
 from appliance.features.guards.guard_facts import preset_row, values_of
-from appliance.features.guards.guard_words import afresh_in_words, origin_in_words, state_in_words
+from appliance.features.guards.guard_words import (
+    afresh_in_words,
+    origin_in_words,
+    state_in_words,
+    times_in_words,
+)
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
@@ -105,10 +110,13 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
                       "origin": row.origin, "afresh": row.afresh, "below": row.below,
-                      "digest": row.digest, "last_stop": msgspec.to_builtins(row.last_stop)})  # fmt: skip
+                       "digest": row.digest, "last_stop": msgspec.to_builtins(row.last_stop),
+                       "times": row.times})  # fmt: skip
         else:
             about = f"guard {row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())},"
             say_row([about, state_in_words(row)], gap=" ")
+            if row.times is not None:
+                say(f"    {times_in_words(row.times)}")
             for value in filter(None, [*row.below, afresh_in_words(row)]):
                 say(f"    {value}", "yellow")
     for warning in body.warnings:

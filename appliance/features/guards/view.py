@@ -1,14 +1,16 @@
 """Show in the status which guards limit or stop the robot now."""
 
 import datetime
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 import msgspec
 
 from appliance.base import clock
+from appliance.base.metric import counter, gauge
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.features.view import AlarmKind, FeatureView, Pieces, StateView, Trouble
+from appliance.features.guards.guard_answers import GuardTimes
+from appliance.features.view import AlarmKind, FeatureView, Pieces, Samples, StateView, Trouble
 
 _BEGINS_SECONDS = 10.0
 
@@ -65,6 +67,13 @@ class GuardsState(msgspec.Struct, frozen=True):
     former: Annotated[
         dict[str, str], doc("monitors that were guards before 0.4, by name, with what to do about each")
     ] = {}
+    late: Annotated[
+        dict[str, str], doc("guards that acted too late in the last minute, each as a sentence")
+    ] = {}
+    times: Annotated[dict[str, GuardTimes], doc("how late each guard has acted, over restarts")] = {}
+    heartbeat: Annotated[
+        str | None, doc("why the heartbeat is off, an empty text while it is on, or null if none is set")
+    ] = None
 
 
 def _since(guard: ActingGuard) -> str:
@@ -95,6 +104,10 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
         yield Trouble(f"guard-older:{old.name}", text, "monitors")
     for name, text in state.former.items():
         yield Trouble(f"guard-older:{name}", text, "monitors")
+    for name, sentence in state.late.items():
+        yield Trouble(f"guard-late:{name}", f"the guard {name} {sentence}: rosrv guard list", "monitors")
+    if state.heartbeat:
+        yield Trouble("heartbeat-off", f"the heartbeat is off: {state.heartbeat}", "monitors")
     for one in state.bypassed:
         text = (
             f"{one.node} takes {one.topic} from {', '.join(one.publishers)}, past its guards: end that process, and"
@@ -119,6 +132,33 @@ def _line(state: GuardsState) -> tuple[str, Pieces]:
     return "guards", [(f"{state.loaded} loaded", ""), *acting]
 
 
+_METRICS = (
+    counter(
+        "rosrv_guard_timed_total",
+        "ticks and messages of a guard whose delay was measured, over restarts",
+        "guard",
+    ),
+    counter(
+        "rosrv_guard_late_total", "those of them that came later than `relay.late`, over restarts", "guard"
+    ),
+    gauge(
+        "rosrv_heartbeat",
+        "1 while the heartbeat of the guards is on, 0 while it is off; absent if none is set",
+    ),
+)
+
+
+def _samples(state: GuardsState) -> Mapping[str, Samples]:
+    times = state.times.items()
+    found: dict[str, Samples] = {
+        "rosrv_guard_timed_total": [((name,), one.timed) for name, one in times],
+        "rosrv_guard_late_total": [((name,), one.late) for name, one in times],
+    }
+    return (
+        found if state.heartbeat is None else {**found, "rosrv_heartbeat": [((), int(not state.heartbeat))]}
+    )
+
+
 GUARDS_VIEW = FeatureView(
     "guards",
     (
@@ -133,8 +173,16 @@ GUARDS_VIEW = FeatureView(
                 "guard-bypassed": AlarmKind("alarm", "end the process that commands past the guard"),
                 "guard-elsewhere": AlarmKind("warning", "measure whether the driver stops the base"),
                 "guard-unanswered": AlarmKind("notice", "its node does not answer now"),
+                "guard-late": AlarmKind(
+                    "warning", "find what keeps the relay or the machine busy; it ends after a minute"
+                ),
+                "heartbeat-off": AlarmKind(
+                    "alarm", "bring the guard that it names into force: the drive gets no enable"
+                ),
             },
             alarms=_alarms,
+            metrics=_METRICS,
+            samples=_samples,
             line=_line,
         ),
     ),

@@ -41,5 +41,9 @@ class OwnTopicPublisher(Upstream):
         if self._current is not None:
             self._topic.published(Batch(memoryview(encode_frame(data)), 1, 0, owned=True))
 
+    def waiting(self) -> str:
+        """Return the name of a subscriber whose socket has not taken all messages, or an empty text."""
+        return next((one.caller_id for one in self._topic.members if one.descriptor < 0), "")
+
     def close(self) -> None:
         self._current = None

@@ -28,6 +28,7 @@ While *all* subscribers are behind, the relay stops reading the publisher for at
 that the scheduler paused for some milliseconds loses nothing.
 """
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -253,6 +254,7 @@ class RelayedTopic:
         clock: Callable[[], float],
         share: HostMemory,
         fresh: bool,
+        late: float = math.inf,
         limited: Callable[[Part, int, int], None],
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
@@ -273,7 +275,8 @@ class RelayedTopic:
         self.flow = PublicationRateLimit(share, limited)
         self.plain = Version()
         """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
-        self.counters = Traffic()
+        self.counters = Traffic(late)
+        self._late, self._waited, self._told = late, 0.0, 0
         self.latch = LatchedMessage(share, make_room, lambda size: refused(LatchRefused(key, topic, size)))
         self._served = ServedSubscribers(over)
         self._state = TopicState.UNKNOWN
@@ -665,6 +668,16 @@ class RelayedTopic:
             for member in self._served.row:
                 if member in members:
                     self._served.deliver(passing, member)
+
+    def waited(self, seconds: float) -> None:
+        """Note that messages waited in the publisher's socket because the relay served others."""
+        self._waited = max(self._waited, seconds)
+
+    def take_late(self) -> tuple[int, float]:
+        """Return the late messages since the last call, and the longest delay or wait in seconds."""
+        late, self._told = self.counters.late - self._told, self.counters.late
+        waited, self._waited = self._waited, 0.0
+        return late + (waited > self._late), max(self.counters.longest / 1e9, waited)
 
     def traffic(self) -> TopicTraffic | None:
         if self._reported and not self.counters.messages and not self._served.dropped:

@@ -114,6 +114,8 @@ class UpstreamReader:
         self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer, self._pumped)
 
     def _ready(self, _events: int) -> None:
+        if self._loop.waited:
+            self._topic.waited(self._loop.waited)
         left = self._pumped.step()
         if left is None:
             return

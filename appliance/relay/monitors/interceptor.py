@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from ipaddress import ip_address, ip_network
@@ -123,7 +124,8 @@ class Interceptor:
     `changed(topics)` is called when monitors may want other topics; `topics` are those whose messages may now be
     judged differently (None: all). `holder(host)` is charged for the slices that a host's messages create,
     `payer(host)` for their processor time. `publishers(topic)` returns the nodes that publish a topic now. A message
-    that takes more than `budget` seconds of processor time is cut off, which is a fault.
+    that takes more than `budget` seconds of processor time is cut off, which is a fault. A monitor that acts more than
+    `late` seconds later than due is late.
     """
 
     def __init__(
@@ -137,8 +139,11 @@ class Interceptor:
         holder: Callable[[str], str] = str,
         payer: Callable[[str], str] = str,
         publishers: Callable[[str], Sequence[ObservationPoint]] = lambda _topic: (),
+        late: float = math.inf,
     ) -> None:
         self._loop = loop
+        self.late = late
+        self._erroneous: tuple[str, ...] = ()
         self.budget = budget
         self.over = loop.over
         self._reporter = reporter
@@ -164,7 +169,13 @@ class Interceptor:
         self._publish = publish
         self._keeper: StateKeeper | None = None
         self.observer = Observer(
-            self.observations, self._published, self.senders, held=self._tell_held, publishers=publishers
+            self.observations,
+            self._published,
+            self.senders,
+            held=self._tell_held,
+            now=self.now,
+            bound=late,
+            publishers=publishers,
         )
         self._shadow_observer = Observer(self.observations, lambda _published: None, self.senders, "shadow ")
         self.shadow = ShadowMonitors(loop, self.now, self._shadow_observer)
@@ -184,6 +195,7 @@ class Interceptor:
             self._leave(message)
             return
         self._switches, self._given = dict(message.enabled), dict(message.given)
+        self._erroneous = (*message.left_out, *message.unbuilt)
         if not self._loader.busy:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
                 self._taken(message, [], frozenset())
@@ -299,6 +311,28 @@ class Interceptor:
             self.monitors.resume(monitor.name)
         self.keep_all()
         return self.monitors.topics_of(held)
+
+    def unfit(self) -> str:
+        """Return why a monitor in force cannot act now, or an empty text."""
+        monitors = self.monitors
+        if self.blocked or self._stated is None:
+            return self.blocked or "the relay has no specifications yet"
+        if self._erroneous:
+            return f"{self._erroneous[0]} has an error, and does not run"
+        if monitors is None:
+            return ""
+        if monitors.next_due is not None and self.now() - monitors.next_due > self.late * 1e9:
+            return "ticks of the monitors are overdue"
+        return monitors.unfit()
+
+    @property
+    def acting(self) -> list[str]:
+        """The monitors in force that may stop, change or withhold messages."""
+        return [] if self.monitors is None else self.monitors.acting()
+
+    def judges(self, topic: str) -> list[str]:
+        """Return the monitors in force that judge or observe a topic."""
+        return [] if self.monitors is None else self.monitors.judges(topic)
 
     def has_stoppers(self, topic: str) -> bool:
         return self.monitors is not None and bool(self.monitors.stoppers(topic))
@@ -447,6 +481,7 @@ class Interceptor:
             self.invalidate_prepared()
         self._prepared.clear()
         self.observations.tick()
+        self.observer.forget_latest()
         self.time_budgets.forget_recovered(self.now())
 
     def close(self) -> None:

@@ -79,6 +79,8 @@ class Observations:
     """The events of monitors, sent in batches; `rows()` returns the counters of all monitors."""
 
     def __init__(self, loop: EventLoop, reporter: Reporter, rows: Callable[[], Iterable[MonitorRow]]) -> None:
+        self.unfit = ""
+        """Why this relay's part of the heartbeat is off."""
         self._loop = loop
         self._reporter = reporter
         self._rows = rows
@@ -87,7 +89,7 @@ class Observations:
         self._waiting: deque[MonitorEvent] = deque()
         self._lost = 0
         self._timer: LoopTimer | None = None
-        self._counted: list[MonitorRow] = []
+        self._counted: MonitorsCounted | None = None
 
     def note(
         self,
@@ -172,7 +174,7 @@ class Observations:
         self.tell_counters()
 
     def repeat(self) -> None:
-        self._counted = []
+        self._counted = None
         self.flush()
 
     def _key(self, kind: str, monitor: str, point: ObservationPoint, distinction: str, *, safe: bool) -> _Key:
@@ -223,10 +225,10 @@ class Observations:
     def tell_counters(self) -> None:
         if not self._reporter.attached:
             return
-        rows = list(self._rows())
-        if rows != self._counted:
-            self._counted = rows
-            self._reporter.send(MonitorsCounted(rows))
+        counted = MonitorsCounted(list(self._rows()), self.unfit)
+        if counted != self._counted:
+            self._counted = counted
+            self._reporter.send(counted)
 
 
 def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:

@@ -5,7 +5,8 @@ A change by several monitors is one record under the last of them, but counts fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -61,14 +62,19 @@ class Observer:
         prefix: str = "",
         *,
         held: Callable[[], None] = lambda: None,
+        now: Callable[[], int] = lambda: 0,
+        bound: float = math.inf,
         publishers: Callable[[str], Sequence[ObservationPoint]] = lambda _topic: (),
     ) -> None:
         """`held()` is called when monitors have begun to hold their topics.
 
+        `now()` is the monitors' time. A tick is late `bound` seconds after it was due.
         `publishers(topic)` returns the nodes that publish a topic now.
         """
-        self._held = held
+        self._held, self._now, self._bound = held, now, bound
         self._publishers = publishers
+        self.failed = ""
+        """The last fault, or delay beyond the bound, of a monitor that acts, since `take_failed`."""
         self._monitors: MonitorSet | None = None
         self.senders = senders
         self._second = _Second()
@@ -115,6 +121,29 @@ class Observer:
             return False
         self._second.explained += 1
         return True
+
+    def timed(
+        self, monitors: Iterable[str], what: str, count: int, longest: float, late: int | None = None
+    ) -> None:
+        """Count what monitors did; `longest` is the longest delay in seconds, `late` the number beyond the bound."""
+        beyond = count * (longest > self._bound) if late is None else late
+        for name in monitors:
+            row = self._counter(name)
+            row.timed += count
+            row.late += beyond
+            row.latest = max(row.latest, longest)
+            if beyond and self._acts(name):
+                self.failed = (
+                    f"{name}: {what} came {longest * 1e3:.0f} ms late (limit {self._bound * 1e3:g} ms)"
+                )
+
+    def forget_latest(self) -> None:
+        for row in self._counters.values():
+            row.latest = 0.0
+
+    def take_failed(self) -> str:
+        failed, self.failed = self.failed, ""
+        return failed
 
     def collect_later(self, counts: FastPathCounts) -> None:
         counts.begun = True
@@ -181,6 +210,9 @@ class Observer:
         monitors = self._monitors
         return not self._prefix and monitors is not None and monitors.sends_safe(monitor, topic, data)
 
+    def _acts(self, monitor: str) -> bool:
+        return bool(self._monitors and not self._prefix and monitor in self._monitors.acting())
+
     def _only_stops(self, event: str) -> bool:
         return bool(self._monitors and not self._prefix and self._monitors.only_stops(event))
 
@@ -236,6 +268,8 @@ class Observer:
             self._send(earlier)
         for published in outcome.sent():
             self._publish(published)
+        if outcome.timer is not None and not self._prefix:
+            self.timed([_monitor(outcome.timer)], "a tick", 1, (self._now() - outcome.time) / 1e9)
         for judged in outcome.judged.values():
             self._send(judged)
 
@@ -461,6 +495,8 @@ class Observer:
                 who = f"{point.caller_id or 'a monitor'}{f' of {point.host}' if point.host else ''}"
                 text = f"a message of {who} on {point.resource} was not judged: {fault.text}"
                 self._unjudged[fault.monitor] = outcome.time, text
+            if self._acts(fault.monitor):
+                self.failed = f"{fault.monitor} had a fault: {where}: {fault.text}"
             self._observations.note(
                 f"{self._prefix}fault",
                 fault.monitor,

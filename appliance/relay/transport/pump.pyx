@@ -158,15 +158,17 @@ cdef class Traffic:
     """The messages of one topic: how many passed since the last `take`, and the number of the next one.
 
     The delay of a batch runs from its receipt until it is handed to the subscribers' sockets; each message of the batch
-    counts. Time in the queue of a slow subscriber does not count.
+    counts. Time in the queue of a slow subscriber does not count. `late` counts those delayed by more than `bound`
+    seconds, and never begins again; `longest` is the longest delay since the last `take` (ns).
     """
 
-    cdef readonly int64_t messages, size, following
+    cdef readonly int64_t messages, size, following, late, longest
     cdef int64_t _counts[_BOUNDS + 1]
-    cdef int64_t _nanoseconds
+    cdef int64_t _nanoseconds, _bound
 
-    def __cinit__(self):
+    def __cinit__(self, double bound=1e9):
         self.following = 1
+        self._bound = <int64_t>(min(bound, 1e9) * 1e9)
 
     def add(self, messages: int, size: int) -> None:
         """Count messages, and their bytes."""
@@ -187,12 +189,15 @@ cdef class Traffic:
             number += 1
         self._counts[number] += messages
         self._nanoseconds += nanoseconds * messages
+        self.longest = max(self.longest, nanoseconds)
+        if nanoseconds > self._bound:
+            self.late += messages
 
     def take(self) -> tuple[int, int, list[int], float]:
         """Return and reset the messages, their bytes, the counts of delays (empty: none) and their sum in seconds."""
         counts = [self._counts[number] for number in range(_BOUNDS + 1)]
         taken = self.messages, self.size, counts if any(counts) else [], self._nanoseconds / 1e9
-        self.messages = self.size = self._nanoseconds = 0
+        self.messages = self.size = self._nanoseconds = self.longest = 0
         for number in range(_BOUNDS + 1):
             self._counts[number] = 0
         return taken

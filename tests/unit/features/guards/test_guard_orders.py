@@ -16,11 +16,14 @@ from appliance.channel.messages import (
     MonitorsReported,
     SpecificationsTaken,
 )
+from appliance.configuration.settings import Relay
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.guards import requests as guard_requests
+from appliance.features.guards.fitness import GuardFitness
 from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_facts import values_of
 from appliance.features.guards.guard_orders import GuardOrders
+from appliance.features.guards.guard_words import times_in_words
 from appliance.features.guards.presets import PRESETS, Guard, former_guard, text_of
 from appliance.features.guards.released import released
 from appliance.features.guards.robot_graph import GOAL
@@ -63,11 +66,29 @@ async def monitors(tmp_path: Path) -> AsyncIterator[SpecificationManager]:
         yield monitors
 
 
+class Settings:
+    """The settings of a store that a restart keeps."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, str] = {}
+
+    def settings(self) -> dict[str, str]:
+        return self.rows
+
+    def save_setting(self, name: str, value: str) -> None:
+        self.rows[name] = value
+
+
 def orders_of(
-    monitors: SpecificationManager, trail: AuditTrail | None = None, graph: Graph | None = None
+    monitors: SpecificationManager,
+    trail: AuditTrail | None = None,
+    graph: Graph | None = None,
+    store: Any = None,
+    relay: Relay | None = None,
 ) -> GuardOrders:
-    present = Graph([], [], []) if graph is None else graph
-    return GuardOrders(monitors, lambda: present, Connections(), trail or FakeTrail())
+    present, trail = Graph([], [], []) if graph is None else graph, trail or FakeTrail()
+    fitness = GuardFitness(monitors, relay or Relay(), 1, trail, store or Settings())
+    return GuardOrders(monitors, lambda: present, Connections(), trail, fitness)
 
 
 @pytest.fixture
@@ -187,6 +208,79 @@ async def test_each_change_of_a_guard_is_recorded_with_its_digest(monitors: Spec
     _, second = recorded()
     assert second["digest"] == (await row(orders)).digest != first["digest"]
     assert second["values"]["polygon"] == "0,0 2,0 2,2"
+
+
+def timed(monitors: SpecificationManager, count: int, late: int = 0, latest: float = 0.001) -> None:
+    row = MonitorRow("fence", "fence.rv", timed=count, late=late, latest=latest)
+    monitors.received(MonitorsCounted([row]))
+
+
+async def test_delays_of_a_guard_add_up_over_restarts_of_the_relay_and_of_control(
+    monitors: SpecificationManager,
+) -> None:
+    store, relay = Settings(), Relay(late=20.0)
+    orders = orders_of(monitors, store=store, relay=relay)
+    for count in (100, 200, 50):  # at the last report the relay is another one
+        timed(monitors, count, late=count // 100, latest=count / 1e4)
+        let_time_pass(1.0)
+        orders.look()
+    let_time_pass(60.0)
+    orders.look()
+    again = orders_of(monitors, store=store, relay=relay)
+    timed(monitors, 90)
+    again.look()
+    times = (await row(again)).times
+    assert times is not None
+    assert (times.timed, times.late, times.latest, times.limit) == (250 + 90, 2, 0.02, 0.02)
+    assert 1.0 <= times.seconds <= 4.0
+    assert "2 of 340 ticks and messages came more than 20 ms late, the latest 20.0 ms" in times_in_words(
+        times
+    )
+    other = orders_of(monitors, store=store, relay=Relay(late=50.0))
+    timed(monitors, 10)
+    other.look()
+    assert (times := (await row(other)).times) is not None and (times.timed, times.limit) == (10, 0.05)
+
+
+async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: SpecificationManager) -> None:
+    trail = FakeTrail()
+    orders = orders_of(monitors, trail)
+
+    def alarms() -> list[str]:
+        orders.look()
+        state = orders.state()
+        assert state is not None
+        return [one.text for one in GUARDS_VIEW.states[0].alarms(state) if one.kind == "guard-late:fence"]
+
+    timed(monitors, 100)
+    assert alarms() == []
+    for second in range(1, 4):
+        timed(monitors, 100 + second, late=second, latest=0.04 + second / 1000)
+        found = alarms()
+    assert found == [
+        "the guard fence acted up to 43 ms late (limit 20 ms), 3 times in the last minute: rosrv guard list"
+    ]
+    assert [one.event for one in trail.records].count("guard late") == 1
+    let_time_pass(60.0)
+    assert alarms() == []
+
+
+async def test_the_heartbeat_is_off_for_the_reason_of_a_relay(monitors: SpecificationManager) -> None:
+    trail = FakeTrail()
+    orders = orders_of(monitors, trail, relay=Relay(heartbeat="/rosrv/heartbeat"))
+    reasons = []
+    for unfit in (None, "", "fence is disabled", "fence is disabled", ""):
+        if unfit is not None:
+            monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv")], unfit))
+        orders.look()
+        state = orders.state()
+        assert state is not None
+        reasons.append(state.heartbeat)
+    assert reasons == ["a relay process is starting", "", "fence is disabled", "fence is disabled", ""]
+    events = [one.event for one in trail.records if one.event.startswith("heartbeat")]
+    assert events == ["heartbeat begun", "heartbeat ended", "heartbeat begun"]
+    monitors.rollout.lost(0)
+    assert orders.state().heartbeat == "a relay process ended"  # type: ignore[union-attr]  # a heartbeat is set
 
 
 async def test_a_guard_names_the_nodes_that_it_awaits(

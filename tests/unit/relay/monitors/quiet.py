@@ -1,5 +1,6 @@
 """Monitors without sockets, threads and clocks, with statements and messages as input and reports as output."""
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -65,7 +66,7 @@ class Reports(Reporter):
 
 
 class QuietMonitors:
-    def __init__(self, publish: Callable[[str, bytes], None] | None = None) -> None:
+    def __init__(self, publish: Callable[[str, bytes], None] | None = None, late: float = math.inf) -> None:
         self.reports = Reports()
         self.published: list[tuple[str, bytes]] = []
         self.called: list[Published] = []
@@ -77,6 +78,7 @@ class QuietMonitors:
             budget=1.0,
             publish=self._publish,
             changed=lambda _topics: None,
+            late=late,
         )
 
     def _publish(self, message: Published) -> None:
