@@ -84,7 +84,9 @@ class _Payer:
     __slots__ = (
         "costly",
         "crowd",
+        "crowd_full",
         "crowd_ready",
+        "crowd_since",
         "direct",
         "events",
         "later",
@@ -100,7 +102,8 @@ class _Payer:
         self.spent = spent
         self.watched = self.direct = 0
         self.crowd: select.epoll | None = None  # of its descriptors beyond `_DIRECT`
-        self.crowd_ready = self.costly = False
+        self.crowd_ready = self.crowd_full = self.costly = False
+        self.crowd_since = 0.0  # when the present events of the crowd were first found
         self.events: dict[int, int] = {}  # ready events by descriptor, in order
         self.since: dict[int, float] = {}  # when each of these was first found
         self.later: deque[Callable[[], None]] = deque()
@@ -348,6 +351,7 @@ class EventLoop:
             payer = self._crowds.get(number) if watched is None else watched.payer
             if payer is not None:
                 if watched is None:
+                    payer.crowd_since = payer.crowd_since if payer.crowd_full else now
                     payer.crowd_ready = True
                 else:
                     payer.events[number] = events
@@ -409,7 +413,11 @@ class EventLoop:
         ready = payer.events
         if payer.crowd_ready and payer.crowd is not None:
             payer.crowd_ready = False
-            ready.update(payer.crowd.poll(0, _EVENTS_PER_TURN))
+            found = payer.crowd.poll(0, _EVENTS_PER_TURN)
+            payer.crowd_full = len(found) == _EVENTS_PER_TURN
+            ready.update(found)
+            for number, _events in found:
+                payer.since.setdefault(number, payer.crowd_since)
         while ready and self._since - began < QUANTUM:
             number = next(iter(ready))
             events = ready.pop(number)

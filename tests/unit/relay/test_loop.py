@@ -61,6 +61,7 @@ class Costs:
         self.used = 0
         self.loop = EventLoop(lambda: self.used)
         self.order: list[str] = []
+        self.waits: list[float] = []
         self._open: list[socket.socket] = []
 
     def ready(self, payer: str, cost: int, times: float = float("inf")) -> socket.socket:
@@ -73,6 +74,7 @@ class Costs:
             nonlocal left
             self.used += cost
             self.order.append(payer)
+            self.waits.append(self.loop.waited)
             left -= 1
             if left <= 0:
                 self.loop.unwatch(ours.fileno())
@@ -148,6 +150,18 @@ def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
     costs.turns_until(lambda: costs.order.count("guest") > 4)
     with pytest.raises(KeyError):
         costs.loop.change(later.fileno(), READ)  # the handler was served, and unwatched itself
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("others", [3, 200])
+def test_the_wait_of_a_descriptor_counts_from_its_first_report(costs: Costs, others: int) -> None:
+    """Each handler takes a quantum, a millisecond: the last of a host's descriptors waits for all others."""
+    costs.loop.clock = lambda: costs.used / 1e9
+    for _ in range(others + 1):
+        costs.ready("guest", QUANTUM, 1)
+    costs.turns_until(lambda: len(costs.waits) > others)
+    assert max(costs.waits) == pytest.approx(others * QUANTUM / 1e9, rel=0.05)
+    assert costs.loop.take_longest() >= QUANTUM / 1e9 and costs.loop.take_longest() == 0
 
 
 @pytest.mark.nightly
