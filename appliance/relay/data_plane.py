@@ -91,7 +91,7 @@ class DataPlane:
             limits,
             self.interceptor,
             publish=lambda data: self._publish(limits.heartbeat, data),
-            topics=self.topics.values,
+            topics=lambda: [topic for topic in self.topics.values() if topic.is_judged],
             unwritten=self._unwritten_stop,
         )
         loop.after(limits.report_every, self._tick)

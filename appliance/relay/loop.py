@@ -170,9 +170,9 @@ class EventLoop:
         self._processor_time = processor_time
         self._since = _UNKNOWN  # when the running handler began
         self._alone = False  # whether the running handler's descriptor is the only ready one
-        self._longest = 0.0
+        self._longest = self._began = 0.0
         self.waited = 0.0
-        """The seconds between the report that the running handler's descriptor is ready, and the call."""
+        """The seconds since an earlier turn found the running handler's descriptor ready; 0: the present turn did."""
         self.clock = clock.now
 
     def watch(
@@ -284,9 +284,9 @@ class EventLoop:
                 longest = left if left > 0 else 0
         waiting = self._waiting
         found = self.pump.wait(0 if waiting else longest, self._room, not waiting)
-        began = self.clock()
+        began = self._began = self.clock()
         if len(found) == 1 and not waiting and found[0][0] in self._watched:
-            self._serve_alone(*found[0])
+            self._serve_alone(*found[0], began)
         elif found or waiting:
             self._serve_many(found, began)
         now = self.clock()
@@ -330,8 +330,8 @@ class EventLoop:
                     self.pump.put(payer.crowd.fileno(), None)
                     payer.crowd.close()
 
-    def _serve_alone(self, number: int, events: int) -> None:
-        self._since, began = _UNKNOWN, self.pump.began or self.clock()
+    def _serve_alone(self, number: int, events: int, now: float) -> None:
+        self._since, began = _UNKNOWN, self.pump.began or now
         self.waited = 0.0
         handler, payer, _ = self._watched[number]
         self._alone = True
@@ -424,7 +424,7 @@ class EventLoop:
             since = payer.since.pop(number, None)
             watched = self._watched.get(number)
             if watched is not None:
-                self.waited = 0.0 if since is None else self.clock() - since
+                self.waited = 0.0 if since is None or since == self._began else self.clock() - since
                 watched.handler(events)
                 self._charge(payer)
 

@@ -277,6 +277,7 @@ class RelayedTopic:
         """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
         self.counters = Traffic(late)
         self._late, self._waited, self._told = late, 0.0, 0
+        self.is_judged = False
         self.latch = LatchedMessage(share, make_room, lambda size: refused(LatchRefused(key, topic, size)))
         self._served = ServedSubscribers(over)
         self._state = TopicState.UNKNOWN
@@ -395,6 +396,7 @@ class RelayedTopic:
         """
         self._is_command |= guarded
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
+        self.is_judged = through is not None
         self.differs()
         if wanted == before.wanted:
             return

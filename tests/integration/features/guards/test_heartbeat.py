@@ -1,7 +1,9 @@
 """The heartbeat in a deployed appliance falls on each fault, on a topic and on a serial line (a pseudo-terminal)."""
 
 import contextlib
+import itertools
 import json
+import math
 import os
 import signal
 import struct
@@ -17,6 +19,7 @@ import pytest
 from appliance.channel import admin
 from appliance.channel.admin import StatusWanted
 from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.requests import GuardSet
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.guards.guarded_robot import GARBAGE, VELOCITY, Stream, scans, stream
@@ -286,3 +289,44 @@ def test_the_heartbeat_falls_on_each_fault(
     latest = {name: max(one[name] for one in found) for name in found[0]}
     record_property("latest", json.dumps({"fault": fault.__name__, "times": len(found), **latest}))
     assert all(at <= WITHIN for at in latest.values()), found
+
+
+def control_killed(beating: Beating) -> None:
+    killed = beating.appliance.kill("control")
+    eventually(lambda: set(beating.appliance.pids("control")) - {killed}, "control runs again")
+
+
+def value_set(beating: Beating) -> None:
+    beating.appliance.ask(GuardSet("deadman", {"silent": "0.9"}))
+
+
+def guard_tried(beating: Beating) -> None:
+    """Load a guard in shadow mode, and remove it."""
+    speed = text_of(Guard("speed", PRESETS["speed"]))
+    beating.appliance.ask(admin.MonitorLoad({"speed.rv": speed}, shadow=True))
+    beating.appliance.ask(admin.MonitorRemove(["speed.rv"]))
+
+
+def robot_stopped(beating: Beating) -> None:
+    """The driver falls silent, so the guard stops the base: it does its work."""
+    beating.driver.send(json.dumps({"do": "pause"}))
+    beating.appliance.recorded(event="stop begun")
+    beating.driver.send(json.dumps({"do": "resume"}))
+
+
+@pytest.mark.parametrize("act", [control_killed, value_set, guard_tried, robot_stopped])
+def test_the_heartbeat_goes_on_while_guards_can_act(beating: Beating, act: Callable[[Beating], None]) -> None:
+    """Nothing but a delay of this machine ends it."""
+    beating.beats()
+    beating.appliance.ignore_earlier_records()
+    began = time.monotonic()
+    act(beating)
+    threading.Event().wait(OBSERVED)
+    gaps = {
+        name: max((b - a for a, b in itertools.pairwise([began, *found])), default=math.inf)
+        for name, found in beating.since(began).items()
+    }
+    ended = [one["reason"] for one in beating.appliance.audit(event="heartbeat ended")]
+    assert all("ms late" in one for one in ended)
+    assert ended or max(gaps.values()) < 2 * WITHIN, gaps
+    beating.beats()
