@@ -1,7 +1,8 @@
 """The interface between a module and its runner: addresses in its memory, results of its calls, and data about it.
 
 A variable of the set is 8 bytes at its address: a number, or the address and length of a string or an array of
-numbers (`strings_codegen.py`).
+numbers or strings (`strings_codegen.py`). An array of strings is a table (i32) of the addresses of strings, each with
+its length (i32) before its bytes, as in a message.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,15 +16,21 @@ from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 
-POSITION, UNDO, SAID, NOW, SURE, REST, ALTERED, FIRST = 0, 8, 12, 16, 24, 32, 40, 48
+POSITION, UNDO, SAID, NOW, SURE, REST, ALTERED, USED, MARK, FIRST = 0, 8, 12, 16, 24, 32, 40, 44, 48, 56
 """Addresses of: the current frame; the ends of the log and of the lines; the time; the end of the lines of earlier
 messages; the number (i64) of bytes of the message that are not shown to the module; whether an earlier event changed
-the message (i32); allocated memory.
+the message (i32); the bytes of `ARENA` that this call uses, and those that it used when the current message began;
+allocated memory.
 """
+
+ARENA = 256 << 10
+"""The bytes for tables of strings and messages, and for changed arrays. A message that finds it full is left."""
 
 MOST_KEPT = 1024
 
 MOST_KEPT_ARRAY = 16 << 10
+
+MOST_TEXTS = 256
 
 BEYOND = 0xFFFFFFFF
 """Stands for the length of a string or array that is longer than `most_kept`."""
@@ -37,7 +44,22 @@ def kept_size(kind: Type) -> int:
     return struct_size(code) if code is not None and len(code) == 1 else 0
 
 
+def is_texts(kind: Type) -> bool:
+    return isinstance(kind, value_types.VectorType) and isinstance(kind.element, value_types.StringType)
+
+
+def is_kept(kind: Type) -> bool:
+    return is_texts(kind) or kept_size(kind) > 0
+
+
+def room_of(kind: Type) -> int:
+    """Return the bytes of the longest string or array that is kept. An array of strings has its table first."""
+    return MOST_KEPT_ARRAY if is_texts(kind) else most_kept(kind) * kept_size(kind)
+
+
 def most_kept(kind: Type) -> int:
+    if is_texts(kind):
+        return MOST_TEXTS
     return MOST_KEPT if isinstance(kind, value_types.StringType) else MOST_KEPT_ARRAY // kept_size(kind)
 
 
@@ -79,7 +101,7 @@ class Cells:
 
     @property
     def kept(self) -> Sequence[int]:
-        return [at for at, kind in self.variables.values() if kept_size(kind)]
+        return [at for at, kind in self.variables.values() if is_kept(kind)]
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,14 @@ from rosmop.fast.abi import (
     ALTERED,
     AREA,
     LEFT,
+    MARK,
     NOW,
     POSITION,
     SAID,
     SURE,
     TOLD,
     UNDO,
+    USED,
     Cells,
     CompiledModule,
     TopicCode,
@@ -419,6 +421,7 @@ class TopicCodegen:
             store(I64, NOW, local_get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
             store(I32, SAID, constant(I32, self._writer.said)) if self._says else b"",
+            store(I32, USED, constant(I32, 0)) if self._writer.has_arena else b"",
             _set(_TOLD, load(I64, self._cells.source + 8)),
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
@@ -458,6 +461,7 @@ class TopicCodegen:
         """
         code = store(I32, POSITION, local_get(_AT)) + store(I32, UNDO, constant(I32, self._log))
         code += store(I32, SURE, load(I32, SAID)) if self._says else b""
+        code += store(I32, MARK, load(I32, USED)) if self._writer.has_arena else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:

@@ -17,12 +17,12 @@ from math import inf
 from types import MappingProxyType
 from typing import Any
 
-from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells, kept_size
+from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells, is_kept, is_texts
 from rosmop.fast.arithmetic import in_seconds, to_floating
 from rosmop.fast.codegen_access import loaded, root_of
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine, is_text
 from rosmop.fast.memory_layout import LINES, MemoryLayout, NotCompiledError, is_signed, machine_type
-from rosmop.fast.strings_codegen import StringCodegen, settling
+from rosmop.fast.strings_codegen import StringCodegen, moved_texts, settling
 from rosmop.fast.wasm import (
     DROP,
     F32,
@@ -191,7 +191,10 @@ class ModuleCodegen(MemoryLayout):
         return None if written is None else written.number
 
     def settling(self, cells: Cells) -> int:
-        cells.settle = self._added((), settling(self, cells)).number
+        copy_texts = b""
+        if any(is_texts(kind) for _, kind in cells.variables.values()):
+            copy_texts = call(self.routine((moved_texts,), (I32, I32, I32), moved_texts, I32))
+        cells.settle = self._added((), settling(self, cells, copy_texts)).number
         return cells.settle
 
     def _added(self, parameters: tuple[int, ...], code: bytes, result: int = I32) -> WasmFunction:
@@ -488,8 +491,9 @@ class _FunctionCodegen(StringCodegen):
         return load(machine, self._writer.variable(node.name, node.type))
 
     def _assigned_to(self, node: nodes.Assign) -> bytes:
-        is_kept = node.name in self._writer.shared and kept_size(node.type)
-        if isinstance(node.type, value_types.StringType) or is_kept:
+        if isinstance(node.type, value_types.StringType) or (
+            node.name in self._writer.shared and is_kept(node.type)
+        ):
             return self._assigned_text(node)
         if isinstance(node.type, value_types.VectorType | value_types.RecordType):
             return self._named_in_place(node)
@@ -690,6 +694,7 @@ class _FunctionCodegen(StringCodegen):
         with self._apart(*node.arguments):
             for name, argument in zip(function.parameters, node.arguments, strict=True):
                 if _has_place(argument.type):
+                    self._keep_name(argument)
                     parameters |= {f"place of {name}": I32, f"count of {name}": I64}
                     code += b"".join(self._elements(argument))
                 elif isinstance(argument.type, value_types.RecordType):
@@ -707,6 +712,7 @@ class _FunctionCodegen(StringCodegen):
     def _return(self, node: nodes.Return) -> bytes:
         kind, code, answer = node.value.type, b"", constant(I32, 0)
         if _has_place(kind):
+            self._keep_name(node.value)
             code, place, count = self._noted(b"".join(self._elements(node.value)))
             answer = place + I64_EXTEND_I32_U + count + constant(I64, 32) + I64_SHL + I64_OR
         elif kind != value_types.VOID:
@@ -799,6 +805,8 @@ _SPECIAL: Mapping[str, Callable[[_FunctionCodegen, nodes.Call], bytes]] = Mappin
             ("h_min", "h_max", "h_fmin", "h_fmax", "h_fminf", "h_fmaxf"), _FunctionCodegen._least
         ),
         "a_part": _FunctionCodegen._with_part,
+        "a_put": _FunctionCodegen._put,
+        "l_clear": _FunctionCodegen._cleared,
         "l_element": _FunctionCodegen._element_at,
         "l_nearest": _FunctionCodegen._nearest,
     }

@@ -1,19 +1,21 @@
 """Code that reads a message: positions, numbers, and strings, arrays and messages in place.
 
-Local variables hold the address and the number of elements; for an array of strings, the address of a table
-of their addresses.
+Local variables hold the address and the number of elements. For an array of strings, this is the address of a table of
+their addresses; for messages of variable size, of a table of rows (`MemoryLayout.row`). The address of such a message
+is that of its row.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rosmop.fast.abi import REST
+from rosmop.fast.abi import ARENA, MOST_TEXTS, REST, USED
 from rosmop.fast.arithmetic import ArithmeticCodegen
 from rosmop.fast.memory_layout import NotCompiledError, machine_type
 from rosmop.fast.wasm import (
     I32,
     I32_ADD,
     I32_EQZ,
+    I32_GT_U,
     I32_MUL,
     I32_WRAP_I64,
     I64,
@@ -37,6 +39,7 @@ from rosmop.fast.wasm import (
     i32_store,
     i64_load,
     load,
+    store,
 )
 from rosmop.form import nodes
 from rosmop.runtime.times import BILLION
@@ -45,7 +48,9 @@ from rosmop.runtime.wire import MAX_EMPTY
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
-MOST_TEXTS = 256
+MOST_ROWS = 4096
+
+WIDTH = 32  # bytes of a string in C++
 
 _LOADS = {
     "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,
@@ -107,6 +112,12 @@ class MessageAccess(ArithmeticCodegen):
 
     def _read_value(self, node: nodes.ReadValue) -> bytes:
         place, count, start = f"place of {node.name}", f"count of {node.name}", node.at
+        if self._is_row(node.type) or (
+            isinstance(node.type, value_types.VectorType)
+            and node.type.length is None
+            and self._is_row(node.type.element)
+        ):
+            return self._read_rows(node)
         if isinstance(node.type, value_types.RecordType):
             size = self._layout.size(node.type)
             code = self._within(start, size) + self._get("at") + self._position(start)
@@ -131,18 +142,100 @@ class MessageAccess(ArithmeticCodegen):
             f"left {len(self._locals)}",
             f"entry {len(self._locals)}",
         )
-        table = constant(I32, self._layout.take(4 * MOST_TEXTS))
+        place = f"place of {node.name}"
         code = self._count(nodes.Count(node.site, count, node.at, 4))
-        many = self._get(count, I64) + constant(I64, MOST_TEXTS) + I64_GT_U
-        code += self._when(many, self._elsewhere) + self._get(count, I64) + self._set(left, I64)
-        code += self._position(node.at.plus(4)) + self._set(node.end, I64) + table + self._set(entry)
+        code += self._few(count, MOST_TEXTS) + self._get(count, I64) + self._set(left, I64)
+        code += self._taken(self._get(count, I64) + I32_WRAP_I64 + constant(I32, 4) + I32_MUL, place)
+        code += (
+            self._position(node.at.plus(4)) + self._set(node.end, I64) + self._get(place) + self._set(entry)
+        )
         begin = self._get("at") + self._get(node.end, I64) + I32_WRAP_I64 + I32_ADD
         each = self._get(entry) + begin + i32_store(0)
         each += self._after_text(nodes.AfterText(node.site, node.end, nodes.Spot(node.end, 0)))
         beyond = self._get(node.end, I64) + self._get("size") + I64_EXTEND_I32_U + I64_GT_U
         each += self._when(beyond, self._elsewhere)
         each += self._get(entry) + constant(I32, 4) + I32_ADD + self._set(entry)
-        return code + self._times(left, each) + table + self._set(f"place of {node.name}")
+        return code + self._times(left, each)
+
+    def _few(self, count: str, most: int) -> bytes:
+        return self._when(self._get(count, I64) + constant(I64, most) + I64_GT_U, self._elsewhere)
+
+    def _taken(self, size: bytes, name: str) -> bytes:
+        """Take bytes (i32) of the arena, and name their address."""
+        arena, taken = self._layout.arena(), f"taken {len(self._locals)}"
+        code = load(I32, USED) + self._set(name) + self._get(name) + size + I32_ADD + self._set(taken)
+        code += self._when(self._get(taken) + constant(I32, ARENA) + I32_GT_U, self._elsewhere)
+        code += store(I32, USED, self._get(taken))
+        return code + self._get(name) + constant(I32, arena) + I32_ADD + self._set(name)
+
+    # Messages of variable size
+
+    def _is_row(self, kind: Type) -> bool:
+        return isinstance(kind, value_types.RecordType) and self._layout.varies(kind)
+
+    def _read_rows(self, node: nodes.ReadValue) -> bytes:
+        count, left, entry = (f"{what} of {node.name}" for what in ("count", "left", "entry"))
+        kind, start, code = node.type, node.at, constant(I64, 1) + self._set(count, I64)
+        if isinstance(kind, value_types.VectorType):
+            kind, start = kind.element, start.plus(4)
+            code = self._count(nodes.Count(node.site, count, node.at, self._layout.least(kind)))
+            code += self._few(count, MOST_ROWS)
+        place, row = f"place of {node.name}", constant(I32, self._layout.row(kind))
+        code += self._taken(self._get(count, I64) + I32_WRAP_I64 + row + I32_MUL, place)
+        code += self._get(count, I64) + self._set(left, I64) + self._get(place) + self._set(entry)
+        code += self._position(start) + self._set(node.end, I64)
+        each = self._noted_row(node, kind, entry, 0) + self._get(entry) + row + I32_ADD + self._set(entry)
+        self._brief = False
+        return code + self._times(left, each) + self._within(nodes.Spot(node.end, 0), 0)
+
+    def _noted_row(self, node: nodes.ReadValue, kind: Type, entry: str, offset: int) -> bytes:
+        """Write the row of the message at the end of `node` so far, and move this end behind the message."""
+        address = self._get("at") + self._get(node.end, I64) + I32_WRAP_I64 + I32_ADD
+        code, fixed, offset = self._get(entry) + address + i32_store(offset), 0, offset + 4
+        for field in self._layout.fields(kind):
+            if not self._layout.varies(field):
+                fixed += self._layout.size(field)
+                continue
+            code += self._further(node.end, fixed)
+            if isinstance(field, value_types.RecordType):
+                code += self._noted_row(node, field, entry, offset)
+                offset += self._layout.row(field)
+            else:
+                code += self._passed(node, field)
+            code, fixed, offset = code + self._get(entry) + address + i32_store(offset), 0, offset + 4
+        return code + self._further(node.end, fixed)
+
+    def _further(self, name: str, more: int) -> bytes:
+        return self._get(name, I64) + constant(I64, more) + I64_ADD + self._set(name, I64) if more else b""
+
+    def _passed(self, node: nodes.ReadValue, kind: Type) -> bytes:
+        """Move the end of `node` behind a value of variable size."""
+        here = nodes.Spot(node.end, 0)
+        if isinstance(kind, value_types.StringType):
+            return self._after_text(nodes.AfterText(node.site, node.end, here))
+        if isinstance(kind, value_types.RecordType):
+            return b"".join(
+                self._passed(node, field) if self._layout.varies(field)
+                else self._further(node.end, self._layout.size(field))
+                for field in self._layout.fields(kind)
+            )  # fmt: skip
+        if not isinstance(kind, value_types.VectorType):
+            raise NotCompiledError.of(kind)
+        inner = f"inner {len(self._locals)}"
+        code = constant(I64, kind.length or 0) + self._set(inner, I64)
+        if kind.length is None:
+            code = self._count(nodes.Count(node.site, inner, here, self._layout.least(kind.element)))
+            code += self._further(node.end, 4)
+        if not self._layout.varies(kind.element):
+            size = self._layout.size(kind.element)
+            return code + self._after_elements(nodes.AfterElements(node.site, node.end, here, inner, size))
+        return code + self._times(inner, self._passed(node, kind.element))
+
+    def _place_of_field(self, node: nodes.Item) -> tuple[bytes, bytes]:
+        first, place = self._place(node.base)
+        base, distance = self._layout.place_of_field(node.base.type, node.number)
+        place += b"" if base is None else i32_load(base)
+        return first, place + constant(I32, distance) + I32_ADD
 
     def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
         name = f"text {len(self._locals)}"
@@ -154,7 +247,10 @@ class MessageAccess(ArithmeticCodegen):
         if isinstance(node, nodes.Copy):
             first, place, count = self._elements(node.value)
             element, size = self._layout.element(node.type)
-            machine_type(element)
+            if isinstance(element, value_types.StringType):
+                size = WIDTH
+            else:
+                machine_type(element)
             return first + self._allocated(count + constant(I64, size) + I64_MUL), place, count
         if (
             isinstance(node.type, value_types.StringType)
@@ -162,24 +258,29 @@ class MessageAccess(ArithmeticCodegen):
             and node.function == "l_element"
         ):
             return self._text_at(self._address_of(node))
-        if (
-            isinstance(node, nodes.Item)
-            and isinstance(node.type, value_types.VectorType)
-            and node.type.length is not None
-        ):
-            first, place = self._place(node)
-            return first, place, constant(I64, node.type.length)
+        if isinstance(node, nodes.Item):
+            return self._elements_of_field(node)
         if not isinstance(node, nodes.Read) or f"place of {node.name}" not in self._locals:
             raise NotCompiledError.of(node.type)
         return b"", self._get(f"place of {node.name}"), self._get(f"count of {node.name}", I64)
+
+    def _elements_of_field(self, node: nodes.Item) -> tuple[bytes, bytes, bytes]:
+        element, _ = self._layout.element(node.type)
+        if self._layout.varies(element):
+            raise NotCompiledError.of(node.type)  # it has no table
+        first, place = self._place_of_field(node)
+        if isinstance(node.type, value_types.VectorType) and node.type.length is not None:
+            return first, place, constant(I64, node.type.length)
+        name = f"field {len(self._locals)}"
+        length = self._get(name) + i32_load(0) + I64_EXTEND_I32_U
+        return first + place + self._set(name), self._get(name) + constant(I32, 4) + I32_ADD, length
 
     def _place(self, node: nodes.Expression) -> tuple[bytes, bytes]:
         if isinstance(node, nodes.Copy):
             self._layout.copied(node.type)
             return self._place(node.value)
         if isinstance(node, nodes.Item):
-            first, place = self._place(node.base)
-            return first, place + constant(I32, self._layout.offset(node.base.type, node.number)) + I32_ADD
+            return self._place_of_field(node)
         if isinstance(node, nodes.Call) and node.function == "l_element":
             name, code = f"element {len(self._locals)}", self._address_of(node)
             return code + self._set(name), self._get(name)
@@ -218,8 +319,8 @@ class MessageAccess(ArithmeticCodegen):
 
     def _item(self, node: nodes.Item) -> bytes:
         machine_type(node.type)
-        first, place = self._place(node.base)
-        return first + loaded(place, self._layout.offset(node.base.type, node.number), node.type)
+        first, place = self._place_of_field(node)
+        return first + loaded(place, 0, node.type)
 
 
 def loaded(place: bytes, offset: int, kind: Type) -> bytes:

@@ -1,8 +1,8 @@
 """The layout of a module's memory (see `abi.py`), and the sizes of values there."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from rosmop.fast.abi import FIRST, SENDER, Cells, kept_size
+from rosmop.fast.abi import ARENA, FIRST, SENDER, Cells, is_kept
 from rosmop.fast.deferred_output import OutputLine
 from rosmop.fast.wasm import F32, F64, I32, I64
 from rosmop.form import nodes
@@ -72,12 +72,22 @@ class MemoryLayout:
         self.strings: set[bytes] = set()
         self.references: list[range] = []
         self.lines: list[OutputLine] = []
+        self.changed = {
+            node.arguments[0].name
+            for function in functions.values()
+            for node in nodes.walk(function.body)
+            if isinstance(node, nodes.Call)
+            and node.function == "a_put"
+            and isinstance(node.arguments[0], nodes.Read)
+        }
+        """The arrays of which an element is assigned."""
         self._used = FIRST
+        self._arena = 0
         self.said = self.take(LINES)
 
     def variable(self, name: str, kind: Type) -> int:
         cells = self.shared[name]
-        if not kept_size(kind):
+        if not is_kept(kind):
             machine_type(kind)
         place = cells.base + 8 * (cells.properties + len(cells.variables))
         return cells.variables.setdefault(name, (place, kind))[0]
@@ -93,20 +103,59 @@ class MemoryLayout:
             return kind.length * self.size(kind.element)
         raise NotCompiledError.of(kind)
 
-    def offset(self, kind: Type, number: int) -> int:
+    def least(self, kind: Type) -> int:
+        return self._values.least(kind)
+
+    def fields(self, kind: Type) -> Sequence[Type]:
         if not isinstance(kind, value_types.RecordType):
             raise NotCompiledError.of(kind)
-        return sum(map(self.size, self._values.fields(kind)[:number]))
+        return self._values.fields(kind)
+
+    def varies(self, kind: Type) -> bool:
+        try:
+            self.size(kind)
+        except NotCompiledError:
+            return True
+        return False
+
+    def row(self, kind: Type) -> int:
+        """Return the bytes of a message of variable size in a table: its address, and the ends of such fields.
+
+        Before the end of a field that is a message itself comes the row of this message.
+        """
+        varying = [field for field in self.fields(kind) if self.varies(field)]
+        inner = [self.row(field) for field in varying if isinstance(field, value_types.RecordType)]
+        return 4 + 4 * len(varying) + sum(inner)
+
+    def place_of_field(self, kind: Type, number: int) -> tuple[int | None, int]:
+        """Return where the address of a field is: the offset in the row of a word, or None, and what to add to it.
+
+        A field that is a message of variable size is its row.
+        """
+        if not self.varies(kind):
+            return None, sum(map(self.size, self.fields(kind)[:number]))
+        base, distance, word = 0, 0, 4
+        for field in self.fields(kind)[:number]:
+            if not self.varies(field):
+                distance += self.size(field)
+                continue
+            base, distance = word + (self.row(field) if isinstance(field, value_types.RecordType) else 0), 0
+            word = base + 4
+        field = self.fields(kind)[number]
+        is_row = isinstance(field, value_types.RecordType) and self.varies(field)
+        return (None, word) if is_row else (base, distance)
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """Return the type of the elements, and their distance in bytes: for strings, in the table."""
+        """Return the type of the elements, and their distance in bytes: in a table, if their size varies."""
         if isinstance(kind, value_types.StringType):
             return value_types.UINT8, 1
         if not isinstance(kind, value_types.VectorType):
             raise NotCompiledError.of(kind)
-        return kind.element, 4 if isinstance(kind.element, value_types.StringType) else self.size(
-            kind.element
-        )
+        if isinstance(kind.element, value_types.StringType):
+            return kind.element, 4
+        if isinstance(kind.element, value_types.RecordType) and self.varies(kind.element):
+            return kind.element, self.row(kind.element)
+        return kind.element, self.size(kind.element)
 
     def copied(self, kind: Type) -> Type:
         """Return the type. Raises `NotCompiledError` if a copy of its values is not free."""
@@ -121,6 +170,14 @@ class MemoryLayout:
         at = self._used
         self._used += -(-size // 8) * 8
         return at
+
+    def arena(self) -> int:
+        self._arena = self._arena or self.take(ARENA)
+        return self._arena
+
+    @property
+    def has_arena(self) -> bool:
+        return self._arena > 0
 
     def reference(self) -> int:
         at = self.take(8)

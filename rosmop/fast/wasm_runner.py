@@ -20,6 +20,7 @@ from rosmop.fast.abi import (
     LEFT,
     LOUD,
     MOST_KEPT,
+    MOST_TEXTS,
     POSITION,
     REST,
     SOONER,
@@ -28,8 +29,10 @@ from rosmop.fast.abi import (
     UNDO,
     Cells,
     CompiledModule,
-    kept_size,
+    is_kept,
+    is_texts,
     most_kept,
+    room_of,
 )
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, failure
@@ -107,7 +110,7 @@ class ModuleState:
         self._strings = [
             (place, cells.texts[address], kind)
             for place, (address, kind) in enumerate(variables.values())
-            if kept_size(kind)
+            if is_kept(kind)
         ]
         codes = "".join(cell_code(kind) for _, kind in variables.values())
         self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
@@ -223,7 +226,17 @@ def packed(prepared: BatchOptions) -> bytes:
 def entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     if len(value) > most_kept(kind):
         return BEYOND << 32
-    if isinstance(kind, value_types.VectorType):
+    if is_texts(kind):
+        at, table = buffer + 4 * MOST_TEXTS, []
+        if sum(4 + len(text) for text in value) > room_of(kind) - 4 * MOST_TEXTS:
+            return BEYOND << 32
+        for text in value:
+            table.append(at)
+            raw = _LENGTH.pack(len(text)) + text
+            memory[at : at + len(raw)] = raw
+            at += len(raw)
+        struct.pack_into(f"<{len(value)}I", memory, buffer, *table)
+    elif isinstance(kind, value_types.VectorType):
         struct.pack_into(f"<{len(value)}{struct_code(kind.element)}", memory, buffer, *value)
     else:
         memory[buffer : buffer + len(value)] = value
@@ -234,13 +247,16 @@ def left(memory: memoryview, word: int, before: Value, kind: Type) -> Value:
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
         return before
+    if is_texts(kind):
+        table = struct.unpack_from(f"<{count}I", memory, at)
+        return [bytes(memory[text + 4 : text + 4 + _LENGTH.unpack_from(memory, text)[0]]) for text in table]
     if isinstance(kind, value_types.VectorType):
         return list(struct.unpack_from(f"<{count}{struct_code(kind.element)}", memory, at))
     return bytes(memory[at : at + count])
 
 
 def cell_code(kind: Type) -> str:
-    if kept_size(kind):
+    if is_kept(kind):
         return "Q"
     if isinstance(kind, value_types.BoolType):
         return "?7x"

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from rosmop.check.sources import compiled_from
 from rosmop.fast import wasm_runner
-from rosmop.fast.abi import AREA
+from rosmop.fast.abi import AREA, MOST_TEXTS
 from rosmop.fast.batch_codegen import MAX_EFFECTS
-from rosmop.fast.codegen_access import MOST_TEXTS
 from rosmop.fast.memory_layout import LINES
 from rosmop.fast.wasm_runner import BEGINNING
 from rosmop.form.findings import SpecificationError

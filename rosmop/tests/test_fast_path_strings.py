@@ -5,7 +5,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosmop.fast import wasm_runner
-from rosmop.fast.abi import MOST_KEPT
+from rosmop.fast.abi import MOST_KEPT, MOST_TEXTS
+from rosmop.tests.acting import message
 from rosmop.tests.both_ways import BothWays, plain, stamped
 from rosmop.tests.examples import examples
 from rosmop.tests.reload import replaced
@@ -133,6 +134,37 @@ def test_strings_survive_wherever_the_module_is_stopped(monkeypatch: pytest.Monk
         both = BothWays(text)
         for time in range(1, 5):
             both.check([stamped(LONG[: 100 * number], number % 4) for number in range(11)], "/stamped", time)
+
+
+def test_arrays_survive_wherever_the_module_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = """s() { std::vector<std::string> a; std::vector<std::string> b; std::vector<double> v; double n = 0;
+        event e(std::vector<std::string> names, std::vector<double> at) /s sensor_msgs/JointState
+        '{name:names, position:at}' { b = a; if (names.size() != 3) { a = names; }
+        if (v.size() != at.size()) { v = at; }
+        for (int i = 0; i < v.size(); i++) { v[i] = (v[i] + at[i]) / 2; n += v[i]; } } }"""
+
+    def told(number: int) -> bytes:
+        names = [f"joint {number} {each}" for each in range(number % 5)]
+        return message("sensor_msgs/JointState", name=names, position=[0.5 * number] * (number // 3))
+
+    for fuel in [*range(3500, 6000, 97), *range(6000, 16000, 997)]:
+        monkeypatch.setattr(wasm_runner, "FUEL", fuel)
+        both = BothWays(text)
+        for time in range(1, 5):
+            both.check([told(time + number) for number in range(11)], "/s", time)
+        assert both.came["together"]
+
+
+def test_what_is_too_long_to_keep_is_left_to_the_engine() -> None:
+    text = """s() { std::vector<std::string> a; int n = 0; event e(std::vector<std::string> names, int k)
+        /s sensor_msgs/JointState '{name:names, header.seq:k}' { if (k == 1) { a = names; } n += a.size(); } }"""
+    both = BothWays(text)
+    few, long = ["x" * 20] * MOST_TEXTS, ["x" * 60] * MOST_TEXTS
+    for names in (few, long, [*few, ""], few):
+        both.check([message("sensor_msgs/JointState", name=names, header__seq=1)] * 2, "/s")
+        before = both.came["together"]
+        both.check([message("sensor_msgs/JointState", name=["y"])] * 2, "/s")
+        assert (both.came["together"] > before) == (names is few)
 
 
 def test_strings_go_to_the_set_that_follows() -> None:
