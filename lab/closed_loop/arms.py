@@ -233,8 +233,9 @@ class JointsWorld(World):
                     velocities=tuple(r.uniform(-v, v) for _ in JOINTS),
                     accelerations=tuple(r.uniform(-a, a) for _ in JOINTS) if "acc" in self.curved else (),
                 )
-                for one in points
+                for one in points[1:]
             ]
+            made = [points[0], *made]  # the way to the first point is straight
             if fits(*extremes(made)):
                 return made
         return points

@@ -26,6 +26,13 @@ role Trajectory(std::string[] names, trajectory_msgs::JointTrajectoryPoint[] poi
     control_msgs/FollowJointTrajectoryActionGoal '{goal.trajectory:{joint_names:names, points:points}}' cancel;
 }
 
+// The stamp is that of the trajectory, which begins then; zero: when it arrives.
+role StampedTrajectory(std::string[] names, trajectory_msgs::JointTrajectoryPoint[] points, ros::Time stamp) {
+    trajectory_msgs/JointTrajectory '{header.stamp:stamp, joint_names:names, points:points}';
+    control_msgs/FollowJointTrajectoryActionGoal
+        '{goal.trajectory:{header.stamp:stamp, joint_names:names, points:points}}' cancel;
+}
+
 // What moves a base or an arm.
 role Command() : Velocity {
     trajectory_msgs/JointTrajectory '{}';
@@ -111,6 +118,10 @@ role Scan(double first, double increment, double least, double most, float[] ran
 
 role Joints(std::string[] names, double[] found) {
     sensor_msgs/JointState '{name:names, position:found}';
+}
+
+role JointMotions(std::string[] names, double[] found, double[] moving) {
+    sensor_msgs/JointState '{name:names, position:found, velocity:moving}';
 }
 
 role Battery(double percentage) {

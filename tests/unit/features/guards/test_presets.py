@@ -33,8 +33,8 @@ from tests.support.features.guards.running_guard import DEFINITIONS
 from tests.support.rows import require_rows
 
 ROOT = Path(__file__).parents[4]
-INTERPRETED = {"joints", "answer"}
-"""Presets with arrays of messages or slices, which the compiled module leaves to the engine."""
+INTERPRETED = {"answer"}
+"""Presets with slices, which the compiled module leaves to the engine."""
 
 
 def compiled(text: str) -> Compiled:

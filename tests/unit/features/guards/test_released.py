@@ -86,7 +86,7 @@ def test_a_value_beyond_its_range_or_without_a_place_is_a_change(preset: Preset)
         assert origin_of(text.replace("\n}\n", f"\n    {other}\n}}\n", 1)) == "changed"
 
 
-@pytest.mark.parametrize(("name", "version"), [("separation", 2), ("zone", 1), ("joints", 2)])
+@pytest.mark.parametrize(("name", "version"), [("separation", 2), ("zone", 1), ("joints", 2), ("joints", 3)])
 def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, version: int) -> None:
     base = released.released(name, version)
     for guard in (made(base), replace(made(base), values={})):

@@ -1,15 +1,20 @@
 import itertools
 import math
+import random
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.polynomial.polynomial import polyder, polyval
 
 from appliance.features.guards.presets import PRESETS, Guard, loaded_values, text_of
 from appliance.features.guards.robot_graph import GOAL
+from lab.closed_loop.arms import Point, curve
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.types.roles import ANY_TYPE
-from tests.unit.features.guards.guarding import NODES, Guarded, legs_of, twist
+from tests.unit.features.guards.guarding import BEGIN, NODES, Guarded, legs_of, seeded, twist
 
 GO = twist(0.5)
 
@@ -225,7 +230,7 @@ def test_a_second_source_that_sends_nan_stops_at_once() -> None:
     assert not runs(guard, 4)
 
 
-def trajectory(names: list[str], *points: tuple[Any, ...]) -> bytes:
+def trajectory(names: list[str], *points: tuple[Any, ...], stamp: float = 0) -> bytes:
     """Return a trajectory of points, each with its time, positions, and perhaps velocities and accelerations."""
     point = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"]
     duration = STORE.types["builtin_interfaces/msg/Duration"]
@@ -240,7 +245,8 @@ def trajectory(names: list[str], *points: tuple[Any, ...]) -> bytes:
         )
         for at, positions, *more in points
     ]
-    return message("trajectory_msgs/JointTrajectory", joint_names=names, points=made)
+    begin = {"sec": int(stamp), "nanosec": round(stamp % 1 * 1e9)}
+    return message("trajectory_msgs/JointTrajectory", header__stamp=begin, joint_names=names, points=made)
 
 
 JOINTS = ["elbow", "wrist"]
@@ -254,9 +260,10 @@ def state(*positions: float, names: list[str] = JOINTS) -> bytes:
     ("points", "passes"),
     [
         ([], True),
-        ([(0, [0, 0])], True),
-        ([(0, [0.1, 0])], True),
-        ([(0, [0.2, 0])], False),
+        ([(0, [0, 0])], False),  # it is over when the controller has it
+        ([(0, [0, 0]), (1, [0, 0])], True),
+        ([(0.001, [0.1, 0])], True),
+        ([(0.001, [0.2, 0])], False),
         ([(-1, [0, 0])], False),
         ([(0, [0, 0]), (0, [0, 0])], False),
         ([(0.4, [1.3, 0])], True),
@@ -311,7 +318,7 @@ def test_the_curve_of_a_controller_keeps_the_limits_of_joints(
     names = ["still", "elbow"]
     for now, side in enumerate((1, -1)):
         guard.tell("state", state(0, side * one[1], names=names), now)
-        points = [(at, *([0.0, side * value] for value in values)) for at, *values in (one, other)]
+        points = [(at + 0.001, *([0.0, side * value] for value in values)) for at, *values in (one, other)]
         assert (guard.tell("command", trajectory(names, *points), now).result == "passed") == passes
 
 
@@ -420,11 +427,11 @@ def test_a_joint_that_was_moved_by_hand_or_wraps_is_taken_where_it_is() -> None:
     guard = Guarded("joints")
     for at, place in ((10, 3.1), (20, -3.1), (30, 0.0), (31, 1.0)):
         guard.tell("state", state(place, 0), at)
-        assert guard.tell("command", trajectory(JOINTS, (0, [place + 0.1, 0])), at + 1).result == "passed"
+        assert guard.tell("command", trajectory(JOINTS, (0.001, [place + 0.1, 0])), at + 1).result == "passed"
 
 
 def test_a_trajectory_needs_the_present_position_of_each_joint() -> None:
-    near = trajectory(JOINTS, (0, [0.1, 0]))
+    near = trajectory(JOINTS, (0.001, [0.1, 0]))
 
     def passes(guard: Guarded, at: int) -> bool:
         return guard.tell("command", near, at).result == "passed"
@@ -446,6 +453,158 @@ def test_a_trajectory_needs_the_present_position_of_each_joint() -> None:
     assert passes(guard, 8)
     guard.tell("state", state(0, names=["gripper"]), 9, "/c")
     assert not passes(guard, 10)
+
+
+RUN = (1.0, [0.6, 0.0], [0.9, 0.0])
+"""A point that the elbow passes at 0.9 rad/s, on its way to the limit of 0.68 rad."""
+
+
+def small_arm(stop_duration: float = 0) -> Guarded:
+    return Guarded("joints", low=-1, high=0.68, vMax=1, aMax=5, jump=0.05, stopDuration=stop_duration)
+
+
+@pytest.mark.parametrize(
+    ("before", "at", "stamp", "points", "why"),
+    [
+        ((), 0.0, -5.0, [(1, [0, 0]), (2, [0, 0])], "of /a that is over: its last point was 3.000 s ago"),
+        ((), 0.0, -1.5, [(1, [0.9, 0]), (2, [0.4, 0])], ""),  # in half a second, at the second point
+        ((), 0.0, -1.9, [(1, [0, 0]), (2, [0.4, 0])], "to point 2 of /a at 0.400 rad in 0.100 s is a jump"),
+        ((), 0.0, 5.0, [(1, [0.5, 0])], ""),  # nothing is in force
+        ((), 0.0, 5.0, [(1, [1.2, 0])], "has elbow at 1.200 rad"),
+        ([RUN], 0.5, 0.3, [(1, [0.5, 0])], "begins in 0.300 s (limit 0.100 s), while elbow moves for 0.5"),
+        ([RUN], 0.5, 0.6, [(1, [0.5, 0])], ""),
+        ([RUN], 0.5, 0.6, [(0.1, [0.4, 0])], "from 0.600 rad to point 1 of /a at 0.400 rad in 0.7"),
+        ([RUN], 0.5, 0.09, [(0.5, [0.6, 0])], ""),
+        # The bridge of a moving joint overshoots the limit; one that stands reaches the same point.
+        ([RUN], 0.98, 0.0, [(1, [0.6, 0], [0, 0])], "of elbow from 0.588 rad to point 1 of /a at 0.600 rad"),
+        ([RUN], 1.02, 0.0, [(1, [0.6, 0], [0, 0])], ""),
+        ([RUN], 0.98, 0.0, [(1, [0.6, 0])], ""),  # straight, without a velocity
+        ([RUN], 0.98, 0.0, [(1, [0.6, 0], [0, 0], [0, 0])], "the way of elbow"),
+        ([(1, [0.6, 0])], 0.98, 0.0, [(1, [0.6, 0], [0, 0])], "the way of elbow"),
+        ([(1, [0.0, 0.6])], 0.98, 0.0, [(1, [0.6, 0], [0, 0])], ""),  # another joint moves
+        ((), 0.0, 0.0, [(1, [0, 0], [0, 0]), (2, [0, 0], [0, math.nan])], "wrist at a value that is not a"),
+    ],
+)  # fmt: skip
+def test_a_trajectory_is_judged_as_its_controller_executes_it(
+    before: list[tuple[Any, ...]], at: float, stamp: float, points: list[tuple[Any, ...]], why: str
+) -> None:
+    guard, now = small_arm(), 1 + round(at * 1000)
+    guard.tell("state", state(0, 0), 1)
+    if before:
+        assert guard.tell("command", trajectory(JOINTS, *before), 1).result == "passed"
+    place = before[0][1] if before else (0, 0)
+    guard.tell("state", state(*(min(at, 1) * one for one in place)), now)
+    begins = BEGIN / 1e9 + now / 1000 + stamp if stamp else 0
+    outcome = guard.tell("command", trajectory(JOINTS, *points, stamp=begins), now)
+    assert (outcome.result == "passed") == (not why), outcome.log
+    assert why in "".join(line.text for line in outcome.log)
+
+
+def test_joints_that_a_trajectory_leaves_out_keep_theirs() -> None:
+    rests = trajectory(["elbow"], (1, [0.6], [0.0]))
+    guard = small_arm()
+    guard.tell("state", state(0, 0), 1)
+    for names, point in ((JOINTS, RUN), (["wrist"], (0.1, [0.0]))):
+        assert guard.tell("command", trajectory(names, point), 2).result == "passed"
+    guard.tell("state", state(0.59, 0), 980)
+    assert guard.tell("command", rests, 980).result == "changed"
+
+
+def test_a_joint_moves_until_its_controller_has_stopped() -> None:
+    rests = trajectory(["elbow"], (1, [0.6], [0.0]))
+    guard = small_arm(0.5)
+    for at, command, passes in (
+        (1, rests, True), (2, trajectory(JOINTS), True), (3, rests, False), (500, rests, False), (600, rests, True)
+    ):  # fmt: skip
+        guard.tell("state", state(0.6, 0), at)
+        assert (guard.tell("command", command, at).result == "passed") == passes, at
+
+
+def test_a_stamp_of_a_simulated_clock_counts_as_now() -> None:
+    for simulated in (True, False):
+        guard = Guarded("joints", simulated=simulated)
+        guard.tell("state", state(0, 0), 1)
+        given = trajectory(JOINTS, (1, [0, 0]), stamp=12.5)
+        assert (guard.tell("command", given, 2).result == "passed") == simulated
+
+
+class Controller:
+    """A joint of joint_trajectory_controller: segments with begin, end and the coefficients of their curves."""
+
+    def __init__(self, place: float) -> None:
+        self.ways: list[tuple[float, float, tuple[float, ...]]] = [(-math.inf, -math.inf, (place,))]
+
+    def sample(self, time: float) -> list[float]:
+        """Return position, velocity and acceleration; the end of a trajectory is held."""
+        begin, end, way = next(one for one in reversed(self.ways) if one[0] <= time)
+        if time > end:
+            return [float(polyval(end - begin, way)) if end > begin else way[0], 0.0, 0.0]
+        return [float(polyval(time - begin, polyder(way, order))) for order in range(3)]
+
+    def take(self, now: float, stamp: float, points: Sequence[tuple[float, Sequence[float]]]) -> None:
+        """Take a trajectory, or a stop. Each point has its time, and its position, velocity and acceleration so far."""
+        begin = stamp or now
+        left = [(begin + at, values) for at, values in points if begin + at > now]
+        if not points:
+            self.ways = [(-math.inf, -math.inf, (self.sample(now)[0],))]
+        if not left:
+            return
+        at = max(begin, now)
+        before, state = at, self.sample(at)
+        self.ways = [one for one in self.ways if one[0] < at]
+        for end, values in left:
+            ends = [Point(when, *zip(some)) for when, some in ((0, state), (end - before, values))]
+            self.ways += [(before, end, curve(ends[0], ends[1], 0))] if end > before else []
+            before, state = end, [*values]
+
+
+def random_points(r: random.Random, places: list[float], v_max: float, most: float) -> list[tuple[Any, ...]]:
+    values, at, points = r.choice((1, 2, 3)), 0.0, []
+    if r.random() < 0.3:
+        points.append((0.0, *(places, [0.0] * len(places), [0.0] * len(places))[:values]))
+    for _ in range(r.choice((1, 1, 2, 4))):
+        seconds = r.choice((0.01, 0.05, 0.3, 1.0))
+        at += seconds
+        places = [max(-most, min(most, one + r.uniform(-1, 1) * v_max * seconds)) for one in places]
+        more = [[r.uniform(-1, 1) * size for _ in places] for size in (0.3 * v_max, 2.0)]
+        points.append((at, *(places, *more)[:values]))
+    return points
+
+
+def test_a_controller_that_is_preempted_keeps_limits_and_velocity() -> None:
+    """Trajectories come at any time, with stamps in the past and the future, and for some of the joints."""
+    v_max, most, jump, passed = 1.0, 1.0, 0.1, Counter[str]()
+    for seed in range(12):
+        r = seeded(seed)
+        guard = Guarded("joints", low=-most, high=most, vMax=v_max, aMax=10, jump=jump)
+        arm = {name: Controller(r.uniform(-0.9, 0.9)) for name in JOINTS}
+        line = []
+        for ms in range(0, 6000, 2):
+            now = ms / 1000
+            states = [joint.sample(now) for joint in arm.values()]
+            line.append([position for position, *_ in states])
+            if ms % 8 == 0:
+                positions, velocities, _ = map(list, zip(*states, strict=True))
+                told = message("sensor_msgs/JointState", name=JOINTS, position=positions, velocity=velocities)
+                guard.tell("state", told, ms)
+            if r.random() < 0.99:
+                continue
+            names = r.sample(JOINTS, r.choice((1, 2, 2)))
+            kind, begin = r.choice((("now", 0.0), ("past", -0.3), ("soon", 0.1), ("later", 1.0)))
+            stamp = now + r.random() * begin if begin else 0.0
+            points = random_points(r, [arm[name].sample(max(stamp, now))[0] for name in names], v_max, most)
+            given = trajectory(names, *points, stamp=BEGIN / 1e9 + stamp if stamp else 0)
+            goes = guard.tell("command", given, ms).result == "passed"
+            passed[kind] += goes
+            for place, name in enumerate(names if goes else JOINTS):
+                way = [(at, [value[place] for value in values]) for at, *values in points] if goes else []
+                arm[name].take(now, stamp, way)
+        places = np.array(line)
+        assert np.abs(places).max() <= most + 1e-3, seed
+        for window in (25, 250):
+            moved = np.abs(places[window:] - places[:-window]).max()
+            assert moved <= 1.1 * v_max * window * 0.002 + 1.2 * jump, (seed, window)
+    assert min(passed[kind] for kind in ("now", "past", "soon", "later")) >= 5, passed
 
 
 def with_id(name: str, before: int, behind: int) -> bytes:
