@@ -1,75 +1,42 @@
-"""Worlds of `joints`: an arm that executes trajectories, and nodes that report the positions of its joints.
+"""Worlds of `joints`: an arm that its controller moves (`controller.py`), and nodes that report where its joints are.
 
-Between two points it drives the curve of joint_trajectory_controller, and to the first one straight.
+Beside the assumptions of `world.py`:
+
+- The clocks of senders, guard and controller agree; where time is simulated, it runs at 0.3 to 1 of the real one.
+- A trajectory reaches the controller within 10 ms, and a report the guard within 20 ms; the controller runs every 10 ms
+  or oftener, and the arm follows it exactly.
+- Trajectories come only through the guard. A goal may also be cancelled beside it, which stops the arm.
+- A joint may gain at most one `jump` on 1.1 `vMax`, over any time. A stop takes the controller's
+  `stop_trajectory_duration`, and adds its way: five eighths of the velocity times the duration.
 """
 
 import math
 import struct
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 from typing import ClassVar
 
-from lab.closed_loop.messages import header
-from lab.closed_loop.world import COMMAND, NEVER, World
+from appliance.features.guards.presets import preset_named
+from lab.closed_loop.controller import Controller, Point, extremes
+from lab.closed_loop.messages import EPOCH, header
+from lab.closed_loop.senders import (
+    HONEST,
+    JOINTS,
+    KINDS,
+    NOT_PROMISED,
+    OVERSHOOT,
+    PARTIAL,
+    SENDERS,
+    Sent,
+    bare,
+    line,
+)
+from lab.closed_loop.world import COMMAND, NEVER, SLACK, World, void
 
-JOINTS: Sequence[str] = ("shoulder", "elbow", "wrist")
-TRAJECTORY = "trajectory_msgs/JointTrajectory"
-_NEAR = 1e-6
-WINDOW = 500
-"""The milliseconds in which a joint gains at most one jump."""
-OVERSHOOT = 1.1
-"""How much of `vMax` a curve between two points may have."""
-
-
-@dataclass(frozen=True)
-class Point:
-    at: float
-    """Seconds from the start."""
-    positions: tuple[float, ...]
-    velocities: tuple[float, ...] = ()
-    accelerations: tuple[float, ...] = ()
-
-
-def curve(one: Point, other: Point, joint: int) -> tuple[float, ...]:
-    """Return the coefficients of the way between two points, the constant first, as joint_trajectory_controller has it.
-
-    It is a quintic with velocities and accelerations in both points, a cubic with velocities, and otherwise straight.
-    """
-    p, q, t = one.positions[joint], other.positions[joint], other.at - one.at
-    if not (one.velocities and other.velocities):
-        return p, (q - p) / t
-    v, w = one.velocities[joint] * t, other.velocities[joint] * t
-    if not (one.accelerations and other.accelerations):
-        return p, v / t, (3 * (q - p) - 2 * v - w) / t**2, (2 * (p - q) + v + w) / t**3
-    a, b = one.accelerations[joint] * t**2, other.accelerations[joint] * t**2
-    return (
-        p,
-        v / t,
-        a / (2 * t**2),
-        (20 * (q - p) - 12 * v - 8 * w - 3 * a + b) / (2 * t**3),
-        (30 * (p - q) + 16 * v + 14 * w + 3 * a - 2 * b) / (2 * t**4),
-        (12 * (q - p) - 6 * v - 6 * w - a + b) / (2 * t**5),
-    )
-
-
-def on(coefficients: Sequence[float], after: float) -> float:
-    """Return the value of a polynomial."""
-    return sum(one * after**power for power, one in enumerate(coefficients))
-
-
-def extremes(points: Sequence[Point], samples: int = 60) -> tuple[float, float]:
-    """Return the greatest distance from zero and the greatest velocity of a joint between points, of samples."""
-    far = fast = 0.0
-    for one, other in pairwise(points):
-        for joint in range(len(one.positions)):
-            way = curve(one, other, joint)
-            velocity = [power * part for power, part in enumerate(way)][1:]
-            times = [(other.at - one.at) * sample / samples for sample in range(samples + 1)]
-            far = max(far, *(abs(on(way, time)) for time in times))
-            fast = max(fast, *(abs(on(velocity, time)) for time in times))
-    return far, fast
+TRAJECTORY, GOAL = "trajectory_msgs/JointTrajectory", "control_msgs/FollowJointTrajectoryActionGoal"
+_NEAR = 1e-5
+_STEP = 0.0025
+"""Seconds between two looks at the arm, at most."""
 
 
 def _texts(names: Sequence[str]) -> bytes:
@@ -81,23 +48,29 @@ def _numbers(values: Sequence[float]) -> bytes:
     return struct.pack(f"<I{len(values)}d", len(values), *values)
 
 
-def trajectory(at: float, names: Sequence[str], points: Sequence[Point]) -> bytes:
-    data = header(at) + _texts(names) + struct.pack("<I", len(points))
-    for one in points:
-        seconds = math.floor(one.at)
-        data += (
-            _numbers(one.positions) + _numbers(one.velocities) + _numbers(one.accelerations) + _numbers(())
-        )
-        data += struct.pack("<ii", seconds, round((one.at - seconds) * 1e9))
-    return data
+def _time(seconds: float) -> tuple[int, int]:
+    return divmod(round(seconds * 1e9), 10**9)
 
 
-def states(at: float, names: Sequence[str], positions: Sequence[float]) -> bytes:
-    return header(at) + _texts(names) + _numbers(positions) + _numbers(()) + _numbers(())
+def trajectory(sent: Sent, began: float, kind: str) -> bytes:
+    """Return the message; the world has begun at this second."""
+    seconds, rest = (0, 0) if sent.stamp is None else _time(began + sent.stamp)
+    data = struct.pack("<4I", 0, seconds, rest, 0) + _texts(sent.names) + struct.pack("<I", len(sent.points))
+    for one in sent.points:
+        for values in (one.positions, one.velocities, one.accelerations, ()):
+            data += _numbers(values)
+        data += struct.pack("<ii", *_time(one.at))
+    return data if kind == TRAJECTORY else bytes(16) + bytes(12) + data + bytes(16)
+
+
+def states(
+    at: float, names: Sequence[str], positions: Sequence[float], velocities: Sequence[float] = ()
+) -> bytes:
+    return header(at) + _texts(names) + _numbers(positions) + _numbers(velocities) + _numbers(())
 
 
 class JointsWorld(World):
-    """Good and wrong trajectories: out of limits, malformed, or from another place."""
+    """An honest sender alone, or a hostile or faulty one beside it: the seed's place in `KINDS` says which."""
 
     preset: ClassVar[str] = "joints"
     span = 8000
@@ -109,39 +82,64 @@ class JointsWorld(World):
 
     def plan(self) -> None:
         r = self.random
-        self.live = not self.alone and r.random() < 0.2
-        self.fastest, self.most = round(r.uniform(0.5, 3), 2), round(r.uniform(1, 3), 2)
-        self.jump, self.silent = round(r.uniform(0.02, 0.2), 2), round(r.uniform(0.1, 0.6), 2)
-        self.growth = 20.0
-        self.curved = r.choice(("", "", "velocities", "velocities and accelerations"))
-        """The values of points beside their positions."""
+        self.sender = KINDS[self.seed % len(KINDS)]
+        self.live = not self.alone and self.sender in HONEST
+        self.tight = not self.live and not self.alone and self.seed // len(KINDS) % 2 == 0
+        """Whether no margin hides a missing term: no delays, a small jump, and nothing else happens."""
+        self.fastest: float = round(r.uniform(0.5, 3), 2)
+        self.most = round(r.uniform(1, 3), 2)
+        self.jump = 0.005 if self.tight else round(r.uniform(0.06 if self.live else 0.02, 0.2), 2)
+        self.silent = round(r.uniform(0.1, 0.6), 2)
+        self.growth: float = 20.0
+        self.stopping = r.choice((0.0, 0.0, 0.2, 0.5))
+        self.controller = Controller(
+            JOINTS, period=r.choice((0.001, 0.001 if self.tight else 0.01)), stopping=self.stopping,
+            partial=self.sender in PARTIAL or r.random() < 0.5,
+        )  # fmt: skip
+        self.delay = 0 if self.tight else r.choice((0, 2, 10))
         self.place = [0.0] * len(JOINTS)
-        self.way: tuple[int, list[float], tuple[Point, ...]] = (0, [0.0] * len(JOINTS), ())
-        """When the trajectory in force began, the position then, and its points."""
+        self.told = [0.0] * len(JOINTS)
+        """Where the joints were, as the nodes have reported."""
+        self.extra = [0.0] * len(JOINTS)
+        """How far each joint has come beyond 1.1 `vMax`, as far as it has not yet waited for it."""
+        self.rest: list[float] | None = [0.0] * len(JOINTS)
+        """How far each joint may still move since a stop."""
+        self.ends = 0.0
+        """When the last trajectory that was sent ends."""
+        self.kept: list[Sent] = []
         self.heard: dict[int, int] = {}
         """When each node that has named joints since the guard began did so last with numbers."""
         self.fault = ""
-        self.sent = self.passing = 0
+        self.curved = r.choice(("", "velocities", "velocities and accelerations"))
+        """The values of points beside their positions."""
         limits = " ".join(f"{name}:{-self.most}..{self.most}" for name in JOINTS) if r.random() < 0.5 else ""
         values = {"vMax": self.fastest, "aMax": self.growth, "jump": self.jump, "silent": self.silent}
         bounds = {"limits": limits} if limits else {"low": -self.most, "high": self.most}
-        self.guarded({**values, **bounds}, {"command": TRAJECTORY})
+        declared = {"stopping": self.stopping, "partial": self.controller.partial}
+        self.kind = r.choice((TRAJECTORY, TRAJECTORY, TRAJECTORY, GOAL))
+        self.began, self.rate = float(EPOCH), 1.0
+        """The second in which the controller's time begins, and the seconds of it in a second."""
+        if "clock" in preset_named("joints").given_topics and r.random() < 0.2:
+            self.began, self.rate = float(r.randrange(1000)), r.uniform(0.3, 1)
+            every, lag = r.choice((1, 10, 20)), 0 if self.tight else r.choice((0, 5, 20))
+            self.every(lambda: every, lambda: self._tell_time(lag))
+        self.guarded({**values, **bounds, **declared})
         halves = r.random() < (0.7 if self.alone else 0.4)
         self.reports = {3: JOINTS[:1], 4: JOINTS[1:]} if halves else {3: JOINTS}
         for node, names in self.reports.items():
-            period = r.uniform(15, 50 if self.live else self.silent * 800)
+            period = 10.0 if self.tight else r.uniform(10, 50 if self.live else self.silent * 800)
+            late = 0.0 if self.tight else min(r.choice((0, 1, 5, 20)), self.silent * 100)
+            velocities = r.random() < 0.5
             self.every(
-                lambda period=period: period * r.uniform(0.7, 1),  # type: ignore[misc]  # bound now
-                lambda node=node, names=names: self._report(node, names),  # type: ignore[misc]  # as above
-                first=r.uniform(0, 200),
+                lambda period=period: period * (1 if self.tight else r.uniform(0.7, 1)),  # type: ignore[misc]  # bound now
+                lambda node=node, names=names, late=late, velocities=velocities: self._read(  # type: ignore[misc]  # as above
+                    node, names, late, velocities=velocities
+                ),
+                first=0 if self.tight else r.uniform(0, 200),
             )
-        self.trail: deque[tuple[int, list[float]]] = deque(maxlen=WINDOW // 10)
-        """When the joints were where, in the last `WINDOW`."""
-        if r.random() < 0.3:
-            self._stream()
-        else:
-            self.every(lambda: r.uniform(300, 1200), self._command, first=600)
-        if not self.live:
+        self.sends = SENDERS[self.sender](self)
+        self.after(600, self._next)
+        if not self.live and not self.tight:
             self.after(r.uniform(1000, 6000), self._fails)
             self.with_second()
             self.interrupt()
@@ -184,8 +182,18 @@ class JointsWorld(World):
         if self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
 
-    def _report(self, node: int, names: Sequence[str]) -> None:
-        places = [self.place[JOINTS.index(name)] for name in names]
+    def _tell_time(self, late: float) -> None:
+        data = struct.pack("<2I", *_time(self.began + self.time))
+        self.after(self.now + late, lambda: void(self.say("clock", data, 5)))
+
+    def _read(self, node: int, names: Sequence[str], late: float, *, velocities: bool) -> None:
+        found = [self.controller.state(JOINTS.index(name), self.time) for name in names]
+        numbers = [one[0] for one in found], [one[1] for one in found] if velocities else []
+        self.after(self.now + late, lambda: self._report(node, names, *numbers))
+
+    def _report(
+        self, node: int, names: Sequence[str], places: list[float], velocities: Sequence[float]
+    ) -> None:
         match self.fault:
             case "dead":
                 return
@@ -204,12 +212,80 @@ class JointsWorld(World):
                 self.heard[node] = NEVER
                 self.say("state", states(self.now, names, places)[:20], node, whole=False)
                 return
+            case "":
+                for name, place in zip(names, places, strict=True):
+                    self.told[JOINTS.index(name)] = place
         self.heard[node] = self.now if self.fault in {"", "half dead"} else NEVER
-        self.say("state", states(self.now, names, places), node)
+        self.say("state", states(self.now, names, places, velocities if names else ()), node)
 
     # Commands
 
-    def _good(self) -> list[Point]:
+    def _next(self) -> None:
+        pause = next(self.sends, None)
+        if pause is not None:
+            self.after(self.now + max(1, 1000 * pause / self.rate), self._next)
+
+    @property
+    def time(self) -> float:
+        return self.now / 1000 * self.rate
+
+    @property
+    def still(self) -> bool:
+        """Whether the arm has stood for 0.1 s, and nothing is queued."""
+        ends = (each.begin + each.seconds for way in self.controller.ways for each in way[-1:])
+        return self.time > max(self.ends, *ends) + 0.1
+
+    def route(
+        self, scale: float, step: float, *, has: int, start: Sequence[float] = (), far: float = 0.9
+    ) -> list[Point]:
+        """Return a plan from where the arm is, as far as the nodes have told, to anywhere."""
+        r = self.random
+        for _try in range(20):
+            goal = [r.uniform(-far, far) * self.most for _ in JOINTS]
+            points = line(
+                start or self.told,
+                goal,
+                scale * self.fastest,
+                r.choice((0.1, 0.5)) * self.growth,
+                step,
+                smooth=r.random() < 0.5,
+            )
+            found = extremes(bare(points, has), 12)
+            if len(points) < 60 and found[0] <= self.most and found[1] <= 1.08 * self.fastest:
+                return bare(points, has)
+        return [Point(1.0, tuple(start or self.told))]
+
+    def send(self, sent: Sent, node: int | None = None, *, honest: bool = False) -> bool:
+        shown = "" if sent.stamp is None else f", stamp {sent.stamp:.3f}"
+        self.trace(f"a trajectory of {len(sent.points)} points{shown}: {sent.bad or self.sender}")
+        data = trajectory(sent, self.began, self.kind)
+        topic = self.guard.topics[COMMAND]
+        passed, messages = self.guard.tell(topic, data, self.now, node or self.commander)
+        for one in messages:
+            self.receive(*one)
+        passes = passed == data
+        self.trace("  it passes" if passes else "  it is stopped")
+        if honest and self.live and self.now > 1000:
+            self.report.honest[self.sender] += 1
+            self.report.honest[f"{self.sender} passed"] += passes
+            if not passes:
+                self.trace("  which is honest")
+        self._judge(sent, passes=passes)
+        if passed is not None:
+            driven = passes and (not sent.bad or self.switched_off)
+            self.receive(self.now, topic, passed, sent if driven else None)
+            if passes and sent.points:
+                begin = self.time if sent.stamp is None else max(self.time, sent.stamp)
+                self.ends = begin + sent.points[-1].at if math.isfinite(sent.points[-1].at) else begin
+        return passes
+
+    def cancel(self) -> None:
+        """Stop the arm beside the guard, as a cancelled goal does."""
+        self.trace("the goal is cancelled")
+        self._stop()
+        self.ends = self.time
+
+    def walk(self) -> list[Point]:
         r, points = self.random, []
         at, place = 0.0, [*self.place]
         for _point in range(r.choice((1, 2, 5))):
@@ -240,174 +316,90 @@ class JointsWorld(World):
                 return made
         return points
 
-    def _stream(self) -> None:
-        """Let a node send points one by one, as MoveIt Servo does: below `vMax`, or with a jump each time."""
-        r = self.random
-        period, after = r.choice((10, 20, 50, 100)), 200 if self.live else r.choice((1, 20, 200))
-        ahead = self.fastest * after / 1000
-        ahead = 0.5 * ahead if self.live else r.choice((0.5 * ahead, ahead, ahead + 0.9 * self.jump))
-        ways = [r.choice((-1, 1)) for _ in JOINTS]
-
-        def point() -> None:
-            for joint, place in enumerate(self.place):
-                if abs(place) > 0.6 * self.most:
-                    ways[joint] = -1 if place > 0 else 1
-            places = (place + way * ahead for place, way in zip(self.place, ways, strict=True))
-            self._send(
-                "",
-                JOINTS,
-                [Point(after / 1000, tuple(max(-self.most, min(self.most, one)) for one in places))],
-            )
-
-        self.every(lambda: period, point, first=600)
-
-    def _command(self) -> None:
-        r = self.random
-        bad = "" if self.live else r.choice(("", "", "", *DAMAGE))
-        names, points = DAMAGE[bad](self, self._good()) if bad else (JOINTS, self._good())
-        if r.random() < 0.05:
-            names, points, bad = JOINTS, [], "empty"
-        self._send(bad, names, points)
-
-    def _send(self, bad: str, names: Sequence[str], points: list[Point]) -> None:
-        self.trace(f"a trajectory of {len(points)} points: {bad or 'good'}")
-        data = trajectory(self.now, names, points)
-        passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, self.commander)
-        for one in sent:
-            self.receive(*one)
-        self._judge(bad, points, passes=passed == data)
-        if passed is not None:
-            driven = passed == data and (not bad or (bad == "curve" and not self.switched_off))
-            self.receive(self.now, self.guard.topics[COMMAND], passed, points if driven else ())
-
-    def _judge(self, bad: str, points: Sequence[Point], *, passes: bool) -> None:
-        honest = not bad and self.live and self.now > 1000
-        self.sent, self.passing = self.sent + honest, self.passing + (honest and passes)
-        if self.switched_off or not passes or not points:
+    def _judge(self, sent: Sent, *, passes: bool) -> None:
+        if self.switched_off or not passes or not sent.points:
             return
         if self.holding or self.guard.holds:
             self.broken("L5", "a trajectory passes a guard that holds")
         if why := self.beside_source():
             self.broken("L4", f"a trajectory passes: {why}")
-        law = {"NaN": "L2", "infinite": "L2", "jump": "L3"}.get(bad, "L1")
-        if bad:
-            self.broken(law, f"a trajectory passes that is wrong: {bad}")
+        law = {"NaN": "L2", "infinite": "L2", "jump": "L3"}.get(sent.bad, "L1")
+        if sent.bad:
+            self.broken(law, f"a trajectory passes that is wrong: {sent.bad}")
         may_answer = self.second is not None and not self.third
         for node in self.heard if may_answer else self.reports:
-            if self.now > self.heard.get(node, NEVER) + self.silent * 1000 and self.now > self.fresh_from:
+            asked = {*self.reports[node]} & {*sent.names}
+            if asked and self.now > max(self.heard.get(node, NEVER) + self.silent * 1000, self.fresh_from):
                 self.broken(
                     "L4" if self.foreign else "L2",
                     f"a trajectory passes, and node {node} does not report where the joints are",
                 )
 
-    def receive(self, at: int, topic: str, data: bytes, points: Sequence[Point] = ()) -> None:
-        """Take a trajectory; one of the guard is empty, and stops the arm where it is."""
-        if topic != self.guard.topics[COMMAND]:
-            return
-        now = max(at, self.now)
-        if points and not self.switched_off:
-            first = points[0]
-            for one, place in zip(first.positions, self.place, strict=False):
-                if not abs(one - place) <= self.jump + self.fastest * first.at + _NEAR:
-                    self.broken("L3", f"a joint jumps from {place:.3f} to {one:.3f} rad in {first.at:.2f} s")
-        self.way = (now, [*self.place], tuple(points))
-        self.force = (now, self.force[1])
+    # Motion
+
+    def receive(self, at: int, topic: str, data: bytes, sent: Sent | None = None) -> None:
+        """Take a trajectory; one of the guard is empty, and stops the arm."""
+        if topic == self.guard.topics[COMMAND]:
+            self.after(max(at, self.now) + self.delay, lambda: self._take(sent))
+
+    def _take(self, sent: Sent | None) -> None:
+        if sent is None or not sent.points:
+            self._stop()
+        elif self.controller.take(self.time, sent.names, sent.stamp, sent.points):
+            self.rest = None
+        else:
+            self.trace("the controller rejects it")
+
+    def _stop(self) -> None:
+        if self.rest is None:
+            most = 0.625 * self.stopping
+            velocities = (abs(self.controller.state(joint, self.time)[1]) for joint in range(len(JOINTS)))
+            # It begins at the last update of the controller, or the state before.
+            self.rest = [most * one + 2 * one * self.controller.period + _NEAR for one in velocities]
+        self.controller.stop(self.time)
+
+    @property
+    def unjudged(self) -> bool:
+        return (
+            self.switched_off
+            or self.now < self.fresh_from + 100 + SLACK + self.delay + 1000 * self.stopping / self.rate
+        )
 
     def move(self, until: int) -> None:
-        began, start, points = self.way
-        passed, before = (until - began) / 1000, Point(0.0, tuple(start))
-        for one in points:
-            if passed <= one.at:
-                if one.at > before.at:
-                    after = passed - before.at
-                    self.place = [on(curve(before, one, joint), after) for joint in range(len(JOINTS))]
-                else:
-                    self.place = [*one.positions]
-                return
-            before = one
-        self.place = [*before.positions]
+        begin, end = self.time, until / 1000 * self.rate
+        if end <= begin:
+            return
+        number = math.ceil((end - begin) / _STEP)
+        times = {end, *(begin + (end - begin) * step / number for step in range(1, number))}
+        for joint, way in enumerate(self.controller.ways):
+            last = way[-1]
+            if last.begin + last.seconds < begin and last.state(end)[0] == self.place[joint]:
+                self.extra[joint] = max(0.0, self.extra[joint] - OVERSHOOT * self.fastest * (end - begin))
+                continue
+            at = begin
+            for time in sorted(times.union(*(one.looks(begin, end) for one in way))):
+                self._watch_joint(joint, self.controller.state(joint, time)[0], time - at)
+                at = time
 
-    def watch(self) -> None:
-        self.trail.append((self.now, [*self.place]))
-        began, before = self.trail[0]
-        most = self.jump + OVERSHOOT * self.fastest * ((self.now - began) / 1000 + 0.02)
-        if not self.switched_off and began > self.fresh_from + 100:
-            for place, one in zip(self.place, before, strict=True):
-                if not abs(place - one) <= most:
-                    self.broken("L3", f"a joint moves from {one:.3f} to {place:.3f} rad since {began} ms")
-        if not self.switched_off and any(not abs(one) <= self.most + _NEAR for one in self.place):
-            self.broken("L1", f"a joint is out of its limits: {self.place}")
+    def _watch_joint(self, joint: int, place: float, passed: float) -> None:
+        before, self.place[joint] = self.place[joint], place
+        if self.unjudged:
+            self.extra[joint] = 0.0
+            return
+        moved = abs(place - before)
+        self.extra[joint] = max(0.0, self.extra[joint] + moved - OVERSHOOT * self.fastest * passed)
+        if not self.extra[joint] <= self.jump + _NEAR:
+            self.broken(
+                "L3", f"{JOINTS[joint]} is {self.extra[joint]:.3f} rad further than a jump and 1.1 vMax"
+            )
+        if self.rest is not None:
+            self.rest[joint] -= moved
+            if not self.rest[joint] >= -_NEAR:
+                self.broken("L3", f"{JOINTS[joint]} moves on after a stop by more than the way of a stop")
+        elif not abs(place) <= self.most + _NEAR and not abs(place) < abs(before):
+            self.broken("L1", f"{JOINTS[joint]} is out of its limits: {place:.3f}")
 
     def ended(self) -> None:
-        if self.live and self.passing < 0.95 * self.sent:
-            self.broken("live", f"of {self.sent} good trajectories {self.passing} pass")
-
-
-Damaged = tuple[Sequence[str], list[Point]]
-
-
-def _first(points: list[Point], **change: object) -> Damaged:
-    return JOINTS, [replace(points[0], **change), *points[1:]]  # type: ignore[arg-type]  # fields of a point
-
-
-def _far(world: JointsWorld, points: list[Point]) -> Damaged:
-    return JOINTS, [
-        *points[:-1],
-        replace(points[-1], positions=(1.01 * world.most, *points[-1].positions[1:])),
-    ]
-
-
-def _jumping(world: JointsWorld, points: list[Point]) -> Damaged:
-    return JOINTS, [Point(0.0, tuple(one + 1.5 * world.jump for one in world.place)), *points]
-
-
-def _fast(world: JointsWorld, points: list[Point]) -> Damaged:
-    last = points[-1]
-    return JOINTS, [
-        *points,
-        Point(last.at + 0.01, tuple(0.5 * one - 0.4 * world.most for one in last.positions)),
-    ]
-
-
-def _bending(world: JointsWorld, points: list[Point]) -> Damaged:
-    """Return points within the limits, and curves between them that are not."""
-    last = points[-1]
-
-    def beyond(far: float, fast: float) -> bool:
-        return far >= 1.01 * world.most or fast >= 1.01 * OVERSHOOT * world.fastest
-
-    found = world.bent(points, beyond)
-    if beyond(*extremes(found)):
-        return JOINTS, found
-    out = tuple(math.copysign(world.fastest, one) for one in last.positions)
-    home = tuple(-one for one in out)
-    long = 8 * world.most / world.fastest + 0.1
-    return JOINTS, [
-        *points[:-1],
-        replace(last, velocities=out, accelerations=()),
-        Point(last.at + long, last.positions, home),
-    ]
-
-
-DAMAGE: Mapping[str, Callable[[JointsWorld, list[Point]], Damaged]] = {
-    "far": _far,
-    "jump": _jumping,
-    "fast": _fast,
-    "curve": _bending,
-    "velocity": lambda world, points: _first(points, velocities=(1.01 * world.fastest, 0.0, 0.0)),
-    "acceleration": lambda world, points: _first(points, accelerations=(0.0, -1.01 * world.growth, 0.0)),
-    "NaN": lambda _world, points: (
-        JOINTS,
-        [*points[:-1], replace(points[-1], positions=(math.nan, 0.0, 0.0))],
-    ),
-    "infinite": lambda _world, points: _first(points, positions=(math.inf, 0.0, 0.0)),
-    "names": lambda _world, points: (JOINTS[:2], points),
-    "unknown": lambda _world, points: ((*JOINTS[:2], "gripper"), points),
-    "twice": lambda _world, points: ((*JOINTS[:2], JOINTS[0]), points),
-    "backwards": lambda _world, points: (JOINTS, [*points, points[-1]]),
-    "minus": lambda _world, points: _first(points, at=-0.5),
-    "short": lambda _world, points: _first(points, positions=points[0].positions[:2]),
-    "long velocities": lambda _world, points: _first(points, velocities=(0.0,) * 4),
-    "no names": lambda _world, points: ((), points),
-}
-"""Wrong trajectories, made of a good one."""
+        sent, passed = self.report.honest[self.sender], self.report.honest[f"{self.sender} passed"]
+        if self.live and self.sender not in NOT_PROMISED and passed < 0.9 * sent:
+            self.broken("live", f"of {sent} honest trajectories {passed} pass")

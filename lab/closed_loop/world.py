@@ -29,6 +29,7 @@ The declared assumptions:
 import heapq
 import math
 import random
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
@@ -69,6 +70,8 @@ class Report:
     act: str = ""
     """The one of `ACTS` that happened, if any."""
     violations: list[Violation] = field(default_factory=list)
+    honest: Counter[str] = field(default_factory=Counter)
+    """Honest trajectories by their sender, and `SENDER passed` for those that passed."""
 
 
 class BrokenLawError(AssertionError):
@@ -119,6 +122,7 @@ class World:
     ) -> None:
         self.seed = seed
         self.random = random.Random(f"{type(self).__name__} {seed}")  # noqa: S311  a seed gives the same world again
+        self.seed = seed
         self.report = Report()
         self.now = 0
         self.kind = TWIST

@@ -99,11 +99,14 @@ class Summary:
     """Worlds that broke a law, by law."""
     broken: list[tuple[int, str]] = field(default_factory=list)
     """The seeds of these worlds, with what happened."""
+    honest: Counter[str] = field(default_factory=Counter)
+    """Honest trajectories by their sender, and `SENDER passed` for those that passed."""
 
     def add(self, seed: int, report: Report) -> None:
         self.worlds += 1
         self.seconds += report.seconds
         self.acts[report.act] += 1
+        self.honest += report.honest
         self.clearance = min(self.clearance, report.clearance)
         for one in report.violations:
             self.violations[one.law] += 1
@@ -117,6 +120,7 @@ class Summary:
         self.acts += other.acts
         self.violations += other.violations
         self.broken += other.broken
+        self.honest += other.honest
 
     def __str__(self) -> str:
         near = f", closest {self.clearance:.3f} m" if self.clearance < float("inf") else ""
