@@ -14,7 +14,7 @@ from appliance.features.guards.evidence import text_digest
 from appliance.features.guards.presets import PRESETS, Preset
 from distribution.checkout import BuildError
 from lab.closed_loop.results import Row, Rows, parsed, present_digests
-from lab.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS
+from lab.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS, at_most
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "lab/closed_loop/results.json"
@@ -451,7 +451,9 @@ def run_line(row: Row) -> str:
     """Return a row of the results in one line, with the worlds of each commit."""
     near = "" if row.closest is None else f", closest {row.closest * 100:.1f} cm"
     broken = sum(row.violations.values())
-    laws = f"{broken} broke a law" if broken else "none broke a law"
+    laws = f"{broken} broke a law" if broken else f"none broke a law ({at_most(row.worlds)})"
+    if sent := row.honest.get("sent", 0):
+        laws += f", {row.honest['passed']:,} of {sent:,} honest commands passed"
     counts = f"commit `{next(iter(row.commits))}`"
     if len(row.commits) > 1:
         counts = ", ".join(f"{worlds:,} of commit `{one}`" for one, worlds in row.commits.items())

@@ -2,6 +2,7 @@
 
 python -m lab.closed_loop --worlds 100000 --seed 1 --jobs 2    run many worlds, as many for each preset
 python -m lab.closed_loop --replay PRESET SEED                 run one world, with everything that happens in it
+python -m lab.closed_loop --continue C.json --worlds 10000     run the seeds that follow those in a file, and add them
 python -m lab.closed_loop --join A.json B.json --json C.json   add runs with seeds that follow, of any commits
 """
 
@@ -11,19 +12,28 @@ import json
 import multiprocessing
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from lab.closed_loop.results import Rows, as_data, corrected, joined, parsed, present_digests, rows_of
+from lab.closed_loop.results import (
+    Rows,
+    as_data,
+    continued,
+    corrected,
+    joined,
+    parsed,
+    present_digests,
+    rows_of,
+)
 from lab.closed_loop.worlds import PAIRS, WORLDS, Summary, replay, run_chunk, run_one
 
 _AT_ONCE = 50
 
 
-def _chunks(presets: list[str], worlds: int, first: int) -> Iterator[tuple[str, int, int]]:
-    each = -(-worlds // len(presets))
+def _chunks(firsts: Mapping[str, int], worlds: int) -> Iterator[tuple[str, int, int]]:
+    each = -(-worlds // len(firsts))
     for begin in range(0, each, _AT_ONCE):
-        for preset in presets:
+        for preset, first in firsts.items():
             yield preset, first + begin, first + min(each, begin + _AT_ONCE)
 
 
@@ -83,6 +93,10 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_argument("--join", nargs="+", type=Path, help="add these runs, instead of running worlds")
     parser.add_argument(
+        "--continue", dest="rows", type=Path, metavar="FILE",
+        help="run the seeds that follow those of this file, from --seed on where a text is new, and add them there",
+    )  # fmt: skip
+    parser.add_argument(
         "--again",
         type=Path,
         help="with --join: the same worlds of some presets, run after a correction of the rig",
@@ -97,18 +111,25 @@ def main(arguments: list[str]) -> int:
         report = run_one(preset, int(seed), trace=_print, alone=chosen.alone)
         return 1 if report.violations else 0
     presets = chosen.preset or [*WORLDS, PAIRS]
+    before, digests = _read(chosen.rows) if chosen.rows else {}, present_digests()
+    firsts = {
+        preset: before[preset].next_seed
+        if preset in before and before[preset].digest == digests[preset]
+        else chosen.seed
+        for preset in presets
+    }
     summaries = {preset: Summary() for preset in presets}
     with multiprocessing.get_context("spawn").Pool(chosen.jobs) as pool:
-        for preset, found in pool.imap_unordered(run_chunk, _chunks(presets, chosen.worlds, chosen.seed)):
+        for preset, found in pool.imap_unordered(run_chunk, _chunks(firsts, chosen.worlds)):
             summaries[preset].join(found)
             for seed, text in found.broken:
                 sys.stdout.write(f"{preset} {seed}: {text}\n    {replay(preset, seed)}\n")
                 sys.stdout.flush()
     for preset, one in summaries.items():
         sys.stdout.write(f"{preset}: {one}\n")
-    if chosen.json:
+    if to := chosen.rows or chosen.json:
         date = datetime.datetime.now(datetime.UTC).date().isoformat()
-        _write(chosen.json, rows_of(summaries, chosen.seed, _commit(), date))
+        _write(to, continued(before, rows_of(summaries, firsts, _commit(), date)))
     return 1 if any(one.broken for one in summaries.values()) else 0
 
 

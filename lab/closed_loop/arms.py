@@ -91,7 +91,7 @@ class JointsWorld(World):
         self.jump = 0.005 if self.tight else round(r.uniform(0.06 if self.live else 0.02, 0.2), 2)
         self.silent = round(r.uniform(0.1, 0.6), 2)
         self.growth: float = 20.0
-        self.stopping = r.choice((0.0, 0.0, 0.2, 0.5))
+        self.stopping = r.choice((0.2, 0.5) if self.sender == "unstopped" else (0.0, 0.0, 0.2, 0.5))
         self.controller = Controller(
             JOINTS, period=r.choice((0.001, 0.001 if self.tight else 0.01)), stopping=self.stopping,
             partial=self.sender in PARTIAL or r.random() < 0.5,
@@ -116,7 +116,7 @@ class JointsWorld(World):
         values = {"vMax": self.fastest, "aMax": self.growth, "jump": self.jump, "silent": self.silent}
         bounds = {"limits": limits} if limits else {"low": -self.most, "high": self.most}
         declared = {"stopping": self.stopping, "partial": self.controller.partial}
-        self.kind = r.choice((TRAJECTORY, TRAJECTORY, TRAJECTORY, GOAL))
+        self.kind = GOAL if r.random() < 0.25 and self.sender != "unstopped" else TRAJECTORY
         self.began, self.rate = float(EPOCH), 1.0
         """The second in which the controller's time begins, and the seconds of it in a second."""
         if "clock" in preset_named("joints").given_topics and r.random() < 0.2:
@@ -265,11 +265,9 @@ class JointsWorld(World):
             self.receive(*one)
         passes = passed == data
         self.trace("  it passes" if passes else "  it is stopped")
-        if honest and self.live and self.now > 1000:
-            self.report.honest[self.sender] += 1
-            self.report.honest[f"{self.sender} passed"] += passes
-            if not passes:
-                self.trace("  which is honest")
+        if honest and self.live and self.sender not in NOT_PROMISED and self.now > 1000:
+            self.report.honest["sent"] += 1
+            self.report.honest["passed"] += passes
         self._judge(sent, passes=passes)
         if passed is not None:
             driven = passes and (not sent.bad or self.switched_off)
@@ -400,6 +398,6 @@ class JointsWorld(World):
             self.broken("L1", f"{JOINTS[joint]} is out of its limits: {place:.3f}")
 
     def ended(self) -> None:
-        sent, passed = self.report.honest[self.sender], self.report.honest[f"{self.sender} passed"]
-        if self.live and self.sender not in NOT_PROMISED and passed < 0.9 * sent:
+        sent, passed = self.report.honest["sent"], self.report.honest["passed"]
+        if passed < 0.9 * sent:
             self.broken("live", f"of {sent} honest trajectories {passed} pass")

@@ -37,6 +37,8 @@ class Row:
 
     Older runs did not count it.
     """
+    honest: Mapping[str, int] = field(default_factory=dict)
+    """Honest commands that were `sent` and that `passed`, where worlds count them."""
 
     @property
     def next_seed(self) -> int:
@@ -48,6 +50,7 @@ class Row:
             "violations": dict(self.violations),
             "commits": dict(self.commits),
             "acts": dict(self.acts),
+            "honest": dict(self.honest),
         }
 
 
@@ -67,12 +70,12 @@ def _of_pairs(digests: Mapping[str, str]) -> str:
     return text_digest(" ".join(f"{name} {digests[name]}" for name in sorted(IN_PAIRS)))
 
 
-def rows_of(summaries: Mapping[str, Summary], first_seed: int, commit: str, date: str) -> Rows:
+def rows_of(summaries: Mapping[str, Summary], firsts: Mapping[str, int], commit: str, date: str) -> Rows:
     digests = present_digests()
     return {
         name: Row(
             digests[name],
-            first_seed,
+            firsts[name],
             one.worlds,
             round(one.seconds),
             round(one.clearance, 4) if one.clearance < float("inf") else None,
@@ -80,6 +83,7 @@ def rows_of(summaries: Mapping[str, Summary], first_seed: int, commit: str, date
             date,
             {commit: one.worlds},
             dict(one.acts),
+            dict(one.honest),
         )
         for name, one in summaries.items()
     }
@@ -137,7 +141,21 @@ def _sum(name: str, one: Row, other: Row) -> Row:
         date=max(one.date, other.date),
         commits=_added(one.commits, other.commits),
         acts=_added(one.acts, other.acts),
+        honest=_added(one.honest, other.honest),
     )
+
+
+def continued(rows: Rows, run: Rows) -> Rows:
+    """Return `rows` with the worlds of a later run; a row of another text is replaced.
+
+    Raises:
+        ValueError: The seeds of a row do not follow those of the row before it.
+    """
+    same = {name for name, row in run.items() if name in rows and rows[name].digest == row.digest}
+    return {
+        **rows,
+        **{name: _sum(name, rows[name], row) if name in same else row for name, row in run.items()},
+    }
 
 
 def _added(one: Mapping[str, int], other: Mapping[str, int]) -> dict[str, int]:

@@ -71,7 +71,7 @@ class Report:
     """The one of `ACTS` that happened, if any."""
     violations: list[Violation] = field(default_factory=list)
     honest: Counter[str] = field(default_factory=Counter)
-    """Honest trajectories by their sender, and `SENDER passed` for those that passed."""
+    """Honest commands that were `sent` and that `passed`, where a world counts them."""
 
 
 class BrokenLawError(AssertionError):

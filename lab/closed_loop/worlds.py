@@ -82,6 +82,11 @@ def replay(preset: str, seed: int, alone: str = "") -> str:
     return f"python -m lab.closed_loop --replay {preset} {seed}{alone and f' --alone {alone}'}"
 
 
+def at_most(worlds: int) -> str:
+    """Return the upper bound of the share that breaks a law if none of so many worlds does, by the rule of three."""
+    return f"at most {300 / worlds:.2g} % with 95 % confidence" if worlds >= 3 else "too few for a bound"
+
+
 @dataclass
 class Summary:
     """The worlds of one preset."""
@@ -100,7 +105,7 @@ class Summary:
     broken: list[tuple[int, str]] = field(default_factory=list)
     """The seeds of these worlds, with what happened."""
     honest: Counter[str] = field(default_factory=Counter)
-    """Honest trajectories by their sender, and `SENDER passed` for those that passed."""
+    """Honest commands that were `sent` and that `passed`, where worlds count them."""
 
     def add(self, seed: int, report: Report) -> None:
         self.worlds += 1
@@ -124,8 +129,16 @@ class Summary:
 
     def __str__(self) -> str:
         near = f", closest {self.clearance:.3f} m" if self.clearance < float("inf") else ""
-        laws = ", ".join(f"{law} {self.violations[law]}" for law in LAWS if self.violations[law]) or "none"
-        return f"{self.worlds} worlds, {self.seconds:.0f} simulated s, {self.cost:.1f} s{near}; violations: {laws}"
+        laws = ", ".join(f"{law} {self.violations[law]}" for law in LAWS if self.violations[law])
+        honest = (
+            f"; {self.honest['passed']} of {self.honest['sent']} honest commands passed"
+            if self.honest
+            else ""
+        )
+        return (
+            f"{self.worlds} worlds, {self.seconds:.0f} simulated s, {self.cost:.1f} s{near}"
+            f"{honest}; violations: {laws or f'none, {at_most(self.worlds)}'}"
+        )
 
 
 def run_many(preset: str, seeds: Iterable[int], change: Change = unchanged, alone: str = "") -> Summary:

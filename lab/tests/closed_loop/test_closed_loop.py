@@ -4,6 +4,7 @@ import pytest
 
 from appliance.features.guards.presets import PRESETS
 from lab.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
+from lab.closed_loop.senders import HONEST, KINDS
 from lab.closed_loop.world import ACTS, COMMAND
 from lab.closed_loop.worlds import (
     EACH_NODE,
@@ -18,8 +19,8 @@ from lab.closed_loop.worlds import (
 from tests.support.examples import ALL, seeds_of_night
 from tests.support.rows import require_rows
 
-AT_GATE = {"separation": 4, "fence": 4, "zone": 3}
-"""Worlds at the gate of presets whose worlds cost 0.1 to 0.2 s; the others cost 5 to 40 ms, and have 6."""
+AT_GATE = {"separation": 4, "fence": 4, "zone": 3, "joints": len(KINDS)}
+"""Worlds at the gate of presets whose worlds cost 0.1 to 0.5 s, one of each sender; the others cost 5 to 40 ms."""
 AT_NIGHT = {"separation": 500, "fence": 500, "zone": 500, PAIRS: 300}
 
 
@@ -125,6 +126,13 @@ def test_a_guard_that_does_nothing_breaks_each_law_of_its_preset(preset: str) ->
         summary.join(run_many(preset, range(first, first + 20), no_guard))
         first += 20
     assert LAWS_OF[preset] <= summary.violations.keys(), str(summary)
+
+
+@pytest.mark.parametrize("sender", [one for one in KINDS if one not in HONEST])
+def test_each_hostile_sender_is_found_without_a_guard_and_without_luck(sender: str) -> None:
+    """In one of its first two worlds without a margin, so that a term that a preset lacks is found, too."""
+    first = KINDS.index(sender)
+    assert run_many("joints", range(first, 4 * len(KINDS), 2 * len(KINDS)), no_guard).broken
 
 
 @pytest.mark.parametrize("preset", sorted(WORLDS.keys() - {"rate"}))

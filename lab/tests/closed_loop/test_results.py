@@ -3,7 +3,16 @@ from typing import Any
 
 import pytest
 
-from lab.closed_loop.results import Row, as_data, corrected, joined, parsed, present_digests, rows_of
+from lab.closed_loop.results import (
+    Row,
+    as_data,
+    continued,
+    corrected,
+    joined,
+    parsed,
+    present_digests,
+    rows_of,
+)
 from lab.closed_loop.worlds import PAIRS, WORLDS, Summary
 from lab.guards_evidence_page import run_line
 
@@ -11,19 +20,22 @@ DIGESTS = {"rate": "r", "joints": "j"}
 
 
 def row(seed: int, commit: str = "c1", digest: str = "r", worlds: int = 300) -> Row:
-    broken, acts = {"L1": 1}, {"": worlds - 1, "hold": 1}
-    return Row(digest, seed, worlds, 9, seed / 1000, broken, "2026-11-28", {commit: worlds}, acts)
+    broken, acts, honest = {"L1": 1}, {"": worlds - 1, "hold": 1}, {"sent": 8, "passed": 7}
+    return Row(digest, seed, worlds, 9, seed / 1000, broken, "2026-11-28", {commit: worlds}, acts, honest)
 
 
 def test_worlds_of_several_commits_are_added_and_counted_by_commit() -> None:
     runs = [{"rate": row(1600, "c2")}, {"rate": row(1000)}, {"rate": row(1300)}]
     rows, left_out = joined(runs, DIGESTS)
-    commits, acts = {"c1": 600, "c2": 300}, {"": 897, "hold": 3}
-    added = Row("r", 1000, 900, 27, 1.0, {"L1": 3}, "2026-11-28", commits, acts)
+    commits, acts, honest = {"c1": 600, "c2": 300}, {"": 897, "hold": 3}, {"sent": 24, "passed": 21}
+    added = Row("r", 1000, 900, 27, 1.0, {"L1": 3}, "2026-11-28", commits, acts, honest)
     assert rows == {"rate": added} and not left_out
     assert parsed(as_data(rows)) == rows
-    line = "900 worlds from seed 1000, 27 s, 3 broke a law, closest 100.0 cm"
-    assert run_line(added) == f"{line} (2026-11-28, 600 of commit `c1`, 300 of commit `c2`)"
+    line = "900 worlds from seed 1000, 27 s, {}, 21 of 24 honest commands passed, closest 100.0 cm"
+    when = " (2026-11-28, 600 of commit `c1`, 300 of commit `c2`)"
+    assert run_line(added) == line.format("3 broke a law") + when
+    bound = "none broke a law (at most 0.33 % with 95 % confidence)"
+    assert run_line(replace(added, violations={})) == line.format(bound) + when
 
 
 @pytest.mark.parametrize("seed", [1299, 1301, 1000])
@@ -65,11 +77,22 @@ def test_pairs_of_another_text_are_left_out() -> None:
 
 
 def test_a_run_gives_a_row_for_each_preset_and_for_pairs() -> None:
-    rows = rows_of({"rate": Summary(5, 2.6), PAIRS: Summary(5, 1.0, 0.12345)}, 3, "c1", "2026-11-28")
+    rows = rows_of(
+        {"rate": Summary(5, 2.6), PAIRS: Summary(5, 1.0, 0.12345)}, {"rate": 3, PAIRS: 3}, "c1", "2026-11-28"
+    )
     assert rows["rate"].digest == present_digests()["rate"] and rows["rate"].commits == {"c1": 5}
     assert rows["rate"].closest is None and rows["rate"].seconds == 3
     assert rows[PAIRS].closest == 0.1235 and rows[PAIRS].next_seed == 8
     assert joined([rows], present_digests()) == (rows, [])
+
+
+def test_a_run_goes_on_where_the_rows_of_its_text_end() -> None:
+    before = {"rate": row(1000), "joints": row(1000, digest="old"), "speed": row(1000)}
+    rows = continued(before, {"rate": row(1300, "c2"), "joints": row(7, digest="j")})
+    assert (rows["rate"].first_seed, rows["rate"].worlds) == (1000, 600)
+    assert rows["joints"] == row(7, digest="j") and rows["speed"] == before["speed"]
+    with pytest.raises(ValueError, match="rate begins with seed"):
+        continued(before, {"rate": row(1301)})
 
 
 def test_a_later_run_replaces_the_rows_of_the_same_worlds() -> None:
