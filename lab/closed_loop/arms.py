@@ -85,10 +85,12 @@ class JointsWorld(World):
         self.sender = KINDS[self.seed % len(KINDS)]
         self.live = not self.alone and self.sender in HONEST
         self.tight = not self.live and not self.alone and self.seed // len(KINDS) % 2 == 0
-        """Whether no margin hides a missing term: no delays, a small jump, and nothing else happens."""
+        """Whether no margin hides a missing term: no delays, a small jump, fresh reports, and nothing else happens."""
         self.fastest: float = round(r.uniform(0.5, 3), 2)
         self.most = round(r.uniform(1, 3), 2)
-        self.jump = 0.005 if self.tight else round(r.uniform(0.06 if self.live else 0.02, 0.2), 2)
+        self.jump = round(r.uniform(0.06 if self.live else 0.02, 0.2), 2)
+        if self.tight:
+            self.jump = 0.1 if self.sender == "stream" else 0.005  # a stream gains by it again and again
         self.silent = round(r.uniform(0.1, 0.6), 2)
         self.growth: float = 20.0
         self.stopping = r.choice((0.2, 0.5) if self.sender == "unstopped" else (0.0, 0.0, 0.2, 0.5))
@@ -258,6 +260,9 @@ class JointsWorld(World):
     def send(self, sent: Sent, node: int | None = None, *, honest: bool = False) -> bool:
         shown = "" if sent.stamp is None else f", stamp {sent.stamp:.3f}"
         self.trace(f"a trajectory of {len(sent.points)} points{shown}: {sent.bad or self.sender}")
+        if self.tight:
+            for reporter, names in self.reports.items():
+                self._report(reporter, names, [self.place[JOINTS.index(name)] for name in names], ())
         data = trajectory(sent, self.began, self.kind)
         topic = self.guard.topics[COMMAND]
         passed, messages = self.guard.tell(topic, data, self.now, node or self.commander)

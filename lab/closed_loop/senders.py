@@ -264,9 +264,9 @@ def wild(w: "JointsWorld") -> None:
 def stream(w: "JointsWorld") -> Sends:
     """Points one by one: below `vMax`, at it, or with a jump each time."""
     r = w.random
-    period, after = r.choice((0.01, 0.02, 0.05, 0.1)), r.choice((0.001, 0.02, 0.2))
-    ahead = w.fastest * after
-    ahead = r.choice((0.5 * ahead, ahead, ahead + 0.9 * w.jump, ahead + 0.9 * w.jump))
+    period, after = r.choice((0.01, 0.02) if w.tight else (0.02, 0.05, 0.1)), r.choice((0.001, 0.02, 0.2))
+    ahead = r.choice((1,) if w.tight else (0.5, 1)) * w.fastest * after
+    ahead += 0.9 * w.jump if w.tight else r.choice((0, 0.9 * w.jump))
     ways = [r.choice((-1, 1)) for _ in JOINTS]
     while True:
         for joint, place in enumerate(w.told):
