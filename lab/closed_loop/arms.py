@@ -392,9 +392,8 @@ class JointsWorld(World):
         moved = abs(place - before)
         self.extra[joint] = max(0.0, self.extra[joint] + moved - OVERSHOOT * self.fastest * passed)
         if not self.extra[joint] <= self.jump + _NEAR:
-            self.broken(
-                "L3", f"{JOINTS[joint]} is {self.extra[joint]:.3f} rad further than a jump and 1.1 vMax"
-            )
+            gained = f"{JOINTS[joint]} has gained {self.extra[joint]:.3f} rad on 1.1 vMax"
+            self.broken("L3", f"{gained}, and a jump is {self.jump}")
         if self.rest is not None:
             self.rest[joint] -= moved
             if not self.rest[joint] >= -_NEAR:
