@@ -111,8 +111,8 @@ def servo(w: "JointsWorld") -> Sends:
                 if abs(place) > 0.6 * w.most:
                     wanted[joint] = -math.copysign(0.4 * w.fastest, place)
                 now[joint] += 0.15 * (wanted[joint] - now[joint])
-            place = tuple(one + v * period for one, v in zip(w.told, now, strict=True))
-            w.send(Sent(bare([Point(period, place, tuple(now))], has)), honest=True)
+            places = tuple(one + v * period for one, v in zip(w.told, now, strict=True))
+            w.send(Sent(bare([Point(period, places, tuple(now))], has)), honest=True)
             yield period
 
 

@@ -6,7 +6,7 @@ from lab.closed_loop.worlds import WORLDS, replay, run_one
 
 SEEDS = {
     "deadman": (0, 3), "separation": (0, 14), "fence": (14,), "sensor": (7,), "estop": (4,), "agree": (2,),
-    "mode": (0, 6), "zone": (0, 17), "joints": (0, 2),
+    "mode": (0, 6), "zone": (0, 17), "joints": (3, 7, 12),
 }  # fmt: skip
 """Worlds that find a guard that does nothing, and one that stops everything; 0 and 1 do so for the other presets."""
 
