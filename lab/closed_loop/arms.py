@@ -92,11 +92,11 @@ class JointsWorld(World):
         if self.tight:
             self.jump = 0.1 if self.sender == "stream" else 0.005  # a stream gains by it again and again
         self.silent = round(r.uniform(0.1, 0.6), 2)
-        self.growth: float = 20.0
+        self.growth: float = r.choice((8.0, 20.0, 50.0))
         self.stopping = r.choice((0.2, 0.5) if self.sender == "unstopped" else (0.0, 0.0, 0.2, 0.5))
         self.controller = Controller(
             JOINTS, period=r.choice((0.001, 0.001 if self.tight else 0.01)), stopping=self.stopping,
-            partial=self.sender in PARTIAL or r.random() < 0.5,
+            partial=self.sender in PARTIAL or (self.sender != "refused" and r.random() < 0.5),
         )  # fmt: skip
         self.delay = 0 if self.tight else r.choice((0, 2, 10))
         self.place = [0.0] * len(JOINTS)

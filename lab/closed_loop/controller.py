@@ -11,6 +11,8 @@ Written from `init_joint_trajectory.h`, `joint_trajectory_msg_utils.h`, `quintic
 - Joints that are left out keep what they do, if `partial`; else such a trajectory is rejected.
 - An empty trajectory and a cancelled goal stop each joint: at once, or in `stopping` seconds.
 - No velocity, acceleration or position is limited. Tolerances abort a goal, and change no motion.
+
+Left out: joints that turn without an end, to whose positions it adds whole turns.
 """
 
 import bisect

@@ -330,11 +330,27 @@ def cancelled(w: "JointsWorld") -> float:
     return ends - w.time + 0.5
 
 
-def damage(w: "JointsWorld") -> None:
+def made(w: "JointsWorld", bad: str) -> Sent:
+    names, points = DAMAGE[bad](w, w.walk())
+    return Sent(points, names=names, bad=bad)
+
+
+def wrong(w: "JointsWorld", bad: str = "") -> None:
+    bad = bad or w.random.choice([*DAMAGE])
+    w.send(Sent((), bad=bad) if bad == "empty" else made(w, bad))
+
+
+def damage(w: "JointsWorld") -> Sends:
+    """Each kind of wrong trajectory, in any order, with good ones between them."""
     r = w.random
-    bad = r.choice(("", *DAMAGE))
-    names, points = DAMAGE[bad](w, w.walk()) if bad else (JOINTS, w.walk())
-    w.send(Sent(*((), None, JOINTS, "empty") if r.random() < 0.05 else (points, None, names, bad)))
+    while True:
+        for bad in r.sample(["empty", "curve", *DAMAGE], 2 + len(DAMAGE)):
+            w.curved = r.choice(("velocities", "velocities and accelerations"))
+            if r.random() < 0.2:
+                w.send(Sent(w.walk()))
+                yield r.uniform(0.1, 0.4)
+            wrong(w, bad)
+            yield r.uniform(0.1, 0.4)
 
 
 def mix(w: "JointsWorld") -> None:
@@ -365,10 +381,10 @@ def _first(points: list[Point], **change: object) -> Damaged:
 
 
 def _far(world: "JointsWorld", points: list[Point]) -> Damaged:
-    return JOINTS, [
-        *points[:-1],
-        replace(points[-1], positions=(1.01 * world.most, *points[-1].positions[1:])),
-    ]
+    """Return a way to a point beyond the limits, slow enough."""
+    last, out = points[-1], tuple(1.01 * world.most for _ in JOINTS[1:])
+    at = last.at + 4 * world.most / world.fastest
+    return JOINTS, [*points, Point(at, (last.positions[0], *out))]
 
 
 def _jumping(world: "JointsWorld", points: list[Point]) -> Damaged:
@@ -434,11 +450,12 @@ NOT_PROMISED = {"blend"}
 """Honest senders whose trajectories `joints` may stop: it knows no velocity for certain while the arm moves."""
 ACTS: Mapping[str, Callable[["JointsWorld"], float | None]] = {
     "past": past, "future": future, "elsewhere": elsewhere, "preempt": preempt, "edge": edge, "wild": wild,
-    "halves": halves, "refused": refused, "replay": replay, "cancelled": cancelled, "damage": damage,
+    "halves": halves, "refused": refused, "replay": replay, "cancelled": cancelled, "wrong": wrong,
 }  # fmt: skip
 SENDERS: Mapping[str, Callable[["JointsWorld"], Sends]] = {
     **HONEST,
     **{name: beside(act) for name, act in {**ACTS, "mix": mix}.items()},
+    "damage": damage,
     "stream": stream,
     "unstopped": unstopped,
 }

@@ -30,6 +30,8 @@ def judge(preset: str, seeds: range, alone: str = "") -> None:
     assert not broken, f"{len(broken)} of {len(seeds)} worlds of {preset} break a law:\n" + "\n".join(
         broken[:5]
     )
+    sent, passed = summary.honest["sent"], summary.honest["passed"]
+    assert passed >= 0.999 * sent, f"of {sent} honest commands {passed} pass"
 
 
 @pytest.mark.timeout(300)
