@@ -67,7 +67,7 @@ def line(
 
 
 def bare(points: Sequence[Point], has: int) -> list[Point]:
-    """Return the points with their positions (0), with velocities (1), or with accelerations, too (2)."""
+    """Return the points with their positions (0), with velocities (1), or also with accelerations (2)."""
     return [
         replace(one, velocities=one.velocities * (has > 0), accelerations=one.accelerations * (has > 1))
         for one in points

@@ -83,7 +83,7 @@ def replay(preset: str, seed: int, alone: str = "") -> str:
 
 
 def at_most(worlds: int) -> str:
-    """Return the upper bound of the share that breaks a law if none of so many worlds does, by the rule of three."""
+    """Return the upper bound of the share that breaks a law if none of these worlds does, by the rule of three."""
     return f"at most {300 / worlds:.2g} % with 95 % confidence" if worlds >= 3 else "too few for a bound"
 
 

@@ -132,7 +132,7 @@ def test_a_guard_that_does_nothing_breaks_each_law_of_its_preset(preset: str) ->
 
 @pytest.mark.parametrize("sender", [one for one in KINDS if one not in HONEST])
 def test_each_hostile_sender_is_found_without_a_guard_and_without_luck(sender: str) -> None:
-    """In one of its first two worlds without a margin, so that a term that a preset lacks is found, too."""
+    """In one of its first two worlds without a margin, so that a term that a preset lacks is also found."""
     first = KINDS.index(sender)
     assert run_many("joints", range(first, 4 * len(KINDS), 2 * len(KINDS)), no_guard).broken
 
