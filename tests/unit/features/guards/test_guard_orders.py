@@ -87,7 +87,8 @@ def orders_of(
     relay: Relay | None = None,
 ) -> GuardOrders:
     present, trail = Graph([], [], []) if graph is None else graph, trail or FakeTrail()
-    fitness = GuardFitness(monitors, relay or Relay(), 1, trail, store or Settings())
+    settings: Any = store or Settings()
+    fitness = GuardFitness(monitors, relay or Relay(), 1, trail, settings)
     return GuardOrders(monitors, lambda: present, Connections(), trail, fitness)
 
 
