@@ -210,35 +210,6 @@ def unreadable(beating: Beating) -> Iterator[float]:
 
 
 @contextlib.contextmanager
-def starved(beating: Beating) -> Iterator[float]:
-    """A relay gets no processor, as on a machine that is busy with more important things."""
-    pid = relays(beating)[0]
-    freezer = Path("/proc", str(pid))
-    before, cores = os.getpriority(os.PRIO_PROCESS, pid), os.sched_getaffinity(pid)
-    core = min(cores)
-    hogs: list[int] = []
-    os.sched_setaffinity(pid, {core})
-    os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
-    began = time.monotonic()
-    for _ in range(3):
-        if (child := os.fork()) == 0:
-            os.sched_setaffinity(0, {core})
-            end = time.monotonic() + OBSERVED + 2
-            while time.monotonic() < end:
-                pass
-            os._exit(0)
-        hogs.append(child)
-    yield began
-    for hog in hogs:
-        os.kill(hog, signal.SIGKILL)
-        os.waitpid(hog, 0)
-    if freezer.exists():
-        os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
-        os.setpriority(os.PRIO_PROCESS, pid, before)
-        os.sched_setaffinity(pid, cores)
-
-
-@contextlib.contextmanager
 def line_lost(beating: Beating) -> Iterator[float]:
     beating.line.pull_out()
     yield time.monotonic()
@@ -266,7 +237,7 @@ def supervisor_killed(beating: Beating) -> Iterator[float]:
 
 FAULTS: tuple[Fault, ...] = (
     first_relay_stopped, other_relay_stopped, first_relay_killed, other_relay_killed, relay_busy, over_budget, disabled,
-    unreadable, starved, line_lost, stopped, supervisor_killed,
+    unreadable, line_lost, stopped, supervisor_killed,
 )  # fmt: skip
 
 
