@@ -111,7 +111,10 @@ class GuardFitness:
         found = [*rows]
         latest, times = max(row[2] for row in found), sum(row[1] for row in found)
         limit = f"{self._limit * 1e3:g} ms"
-        return f"acted up to {latest * 1e3:.0f} ms late (limit {limit}), {counted(times, 'time')} in the last minute"
+        return (
+            f"acted late {counted(times, 'time')} in the last minute (limit {limit}, longest since its relay began"
+            f" {latest * 1e3:.0f} ms)"
+        )
 
     def _record(self, name: str) -> None:
         self._trail.happened(

@@ -481,7 +481,6 @@ class Interceptor:
             self.invalidate_prepared()
         self._prepared.clear()
         self.observations.tick()
-        self.observer.forget_latest()
         self.time_budgets.forget_recovered(self.now())
 
     def close(self) -> None:

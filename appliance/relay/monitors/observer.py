@@ -137,10 +137,6 @@ class Observer:
                     f"{name}: {what} came {longest * 1e3:.0f} ms late (limit {self._bound * 1e3:g} ms)"
                 )
 
-    def forget_latest(self) -> None:
-        for row in self._counters.values():
-            row.latest = 0.0
-
     def take_failed(self) -> str:
         failed, self.failed = self.failed, ""
         return failed
