@@ -18,8 +18,9 @@ import pytest
 
 from appliance.channel import admin
 from appliance.channel.admin import StatusWanted
+from appliance.features.guards.guard_answers import GuardTimes
 from appliance.features.guards.presets import PRESETS, Guard, text_of
-from appliance.features.guards.requests import GuardSet
+from appliance.features.guards.requests import GuardSet, GuardsWanted
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.guards.guarded_robot import GARBAGE, VELOCITY, Stream, scans, stream
@@ -307,3 +308,27 @@ def test_the_heartbeat_goes_on_while_guards_can_act(beating: Beating, act: Calla
     assert all("ms late" in one for one in ended)
     assert ended or max(gaps.values()) < 2 * WITHIN, gaps
     beating.beats()
+
+
+def test_delays_are_counted_over_a_restart_of_a_relay(beating: Beating) -> None:
+    """A relay that was stopped is late, which is an alarm; a new relay process counts on."""
+
+    def times() -> GuardTimes:
+        rows = {one.name: one.times for one in beating.appliance.ask(GuardsWanted()).guards}
+        assert rows["deadman"] is not None
+        return rows["deadman"]
+
+    beating.beats()
+    before = times()
+    for number in (signal.SIGSTOP, signal.SIGCONT):  # the guard is in one of the two
+        for pid in relays(beating):
+            os.kill(pid, number)
+        threading.Event().wait(0.2)
+    eventually(lambda: times().late > before.late, "the delay is counted")
+    assert times().latest >= times().limit
+    assert any(one["kind"] == "guard-late:deadman" for one in beating.appliance.rows("alarm", "list"))
+    late, timed = times().late, times().timed
+    killed = beating.appliance.kill("relay")
+    eventually(lambda: killed not in beating.appliance.pids("relay"), "another relay runs")
+    beating.beats()
+    eventually(lambda: times().timed > timed and times().late >= late, "the counts go on")
