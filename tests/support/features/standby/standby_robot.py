@@ -96,6 +96,9 @@ class StandbyRobot:
             ros.listener("rospy", "/map").wait_for(event="received", data="map 1")
             assert {"/map", "/from_rospy", "/from_roscpp"} <= set(ros.run("rostopic", "list").stdout.split())
             assert "False" in ros.run("rosservice", "call", "/negate_roscpp", "true").stdout
+            mark = self.listeners[0].mark()
+            ros.talker("roscpp", "/from_rospy", name="newcomer")
+            self.listeners[0].wait_for(event="received", publisher="/newcomer", since=mark)
 
     def admitted(self) -> set[str]:
         rules = self.site.robot.run(
