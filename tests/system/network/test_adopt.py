@@ -1,6 +1,7 @@
 """Adopt and release a running robot of unmodified nodes and its stock master, in a namespace, without a restart."""
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -8,14 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from appliance.network.listening_sockets import tcp_sockets
 from examples.landshark.lab import Lab
-from tests.support.adopted_robot import POLICY, Robot, crash, rosrv, until_taken
+from tests.support.adopted_robot import POLICY, URI, Robot, crash, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.requirements import needs
 from tests.support.rosmaster import PlainMaster, call_on
+from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
 
 CYCLES = int(os.environ.get("ROSRV_ADOPT_CYCLES", "20"))
@@ -273,3 +276,47 @@ def test_an_action_server_and_a_recording_go_on_after_each_change(
     go_on()
     rosrv(robot, appliance, "release")
     go_on()
+
+
+@pytest.mark.nightly
+def test_a_master_of_another_user_gets_nothing_at_a_release(robot: Robot, appliance: Appliance) -> None:
+    """The robot's own one has died, and any user may open its port."""
+    own = call_on(robot.host, URI, "getPid", "/test")[2]
+    rosrv(robot, appliance, "adopt")
+    appliance.start()
+    until_taken(robot, appliance)
+    os.kill(own, signal.SIGKILL)
+    command, environment = ["/usr/bin/rosmaster", "--core", "-p", "11311"], {"ROS_LOG_DIR": "/nonexistent"}
+    other = robot.host.popen(command, user=65534, env=environment)
+    try:
+        eventually(
+            lambda: any(one.port == 11311 and one.listens for one in robot.host.run(tcp_sockets)), "no master"
+        )
+        said = rosrv(robot, appliance, "release", check=False)
+        assert "is not the recorded master" in " ".join(said.split())
+        assert call_on(robot.host, URI, "getPid", "/test")[2] == other.pid
+        assert robot.graph() == [[], [], []]
+        robot.hears()
+    finally:
+        other.kill()
+        other.wait(20)
+
+
+@pytest.mark.nightly
+def test_orders_on_a_full_disk_leave_no_subscriber_deaf(robot: Robot, appliance: Appliance) -> None:
+    """They are refused with the reason, and carried out once there is room."""
+    graph, lives = robot.graph(), robot.lives()
+    with small_disk(appliance.state, "160m", "mode=755"):
+        rosrv(robot, appliance, "adopt")
+        appliance.start()
+        for order in ("release", "adopt"):
+            if order == "release":
+                until_taken(robot, appliance)
+            with filled(appliance.state):
+                assert "No space left on device" in rosrv(robot, appliance, order, check=False)
+                robot.hears()
+            rosrv(robot, appliance, order)
+            robot.hears()
+            assert robot.graph() == graph
+        assert robot.lives() == lives
+        appliance.stop()
