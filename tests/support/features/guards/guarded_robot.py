@@ -388,6 +388,14 @@ def another_node(robot: GuardedRobot) -> None:
             load(robot)
 
 
+def kill_sensors(robot: GuardedRobot) -> None:
+    """Let another process take the place of the node that sends on the sources, under its name."""
+    robot.sensors.kill()
+    robot.sensors.stop()
+    robot.ros.processes.remove(robot.sensors)
+    robot.sensors = robot.talker("sensors", "sensors")
+
+
 def kill_relay(robot: GuardedRobot) -> None:
     _kill(robot, "relay")
 
@@ -410,5 +418,5 @@ def restart(robot: GuardedRobot) -> None:
 ACTS = (
     Act(load), Act(reload), Act(resume), Act(disable), Act(shadow), Act(set_value), Act(malformed), Act(silence),
     Act(another_node, within=2.0), Act(kill_relay, within=3.0, cuts=True),
-    Act(kill_control), Act(restart, within=2.0, cuts=True)
+    Act(kill_control), Act(restart, within=2.0, cuts=True), Act(kill_sensors, cuts=True)
 )  # fmt: skip
