@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import msgspec
 import structlog
@@ -14,7 +14,7 @@ from appliance.control.errors import SenselessError, UnavailableError
 from appliance.control.links.supervisor_link import MachineWorkFailedError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport, TakeOverReport
-from appliance.features.adopt.adopt_record import Phase
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus, ReleaseOrder
@@ -55,12 +55,16 @@ class AdoptMemory(msgspec.Struct):
 async def begin(core: Core) -> ControlPart:
     obstacle = _NO_NETNS if core.settings.isolation != "netns" else _PAIRED if core.role.paired else ""
     if obstacle:
-        refused = RefusedAdoption(obstacle)
-        return ControlPart((
-            RequestMethod(AdoptStatus, refused.refuse, order=False),
-            RequestMethod(AdoptOrder, refused.refuse),
-            RequestMethod(ReleaseOrder, refused.refuse),
-        ))  # fmt: skip
+        refused = RefusedAdoption(core, obstacle)
+        return ControlPart(
+            (
+                RequestMethod(AdoptStatus, refused.refuse, order=False),
+                RequestMethod(AdoptOrder, refused.refuse),
+                RequestMethod(ReleaseOrder, refused.refuse),
+            ),
+            {"the look at an earlier adoption": refused.look} if obstacle is _PAIRED else {},
+            refused.status_fields,
+        )
     part = AdoptPart(core)
     core.links.before_end(part.before_end)
     core.links.after_removal(part.after_removal)
@@ -76,13 +80,30 @@ async def begin(core: Core) -> ControlPart:
 
 
 class RefusedAdoption:
-    """Answers where the appliance cannot take a graph over."""
+    """Answers where the appliance cannot take a graph over; a graph that is still wanted is an alarm."""
 
-    def __init__(self, reason: str) -> None:
-        self._reason = reason
+    def __init__(self, core: Core, reason: str) -> None:
+        self._core, self._reason, self._record = core, reason, AdoptRecord()
 
     async def refuse(self, _request: object) -> NoReturn:
         raise SenselessError(self._reason)
+
+    async def look(self) -> None:
+        with suppress(MachineWorkFailedError):  # without the robot's side, nothing was adopted
+            found = await self._core.links.machine_work("adopt", "look", ports=[], names=[])
+            self._record = msgspec.convert(found, MachineFacts, strict=False).record
+
+    def status_fields(self) -> Mapping[str, object]:
+        if not self._record.wanted:
+            return {}
+        obstacle = f"{self._reason}: stop it, and run `rosrv release --dead`"
+        return {"adopt": _state_of(self._record, present=False, obstacle=obstacle)}
+
+
+def _state_of(record: AdoptRecord, **more: Any) -> AdoptState:
+    master = f"{record.program} ({record.unit or f'user {record.user}'})" if record.program else ""
+    given: dict[str, Any] = {"nodes": 0, "not_started": 0, "denied": {}, "missing": {}, **more}
+    return AdoptState(record.phase.value, record.wanted, record.since_utc, master, **given)
 
 
 class AdoptPart:
@@ -222,12 +243,9 @@ class AdoptPart:
         return {"adopt": self._state(self._facts)}
 
     def _state(self, facts: MachineFacts) -> AdoptState:
-        record, unasked = facts.record, self._graph.subscribers.unasked
-        return AdoptState(
-            phase=record.phase.value,
-            wanted=record.wanted,
-            since_utc=record.since_utc,
-            master=f"{record.program} ({record.unit or f'user {record.user}'})" if record.program else "",
+        unasked = self._graph.subscribers.unasked
+        return _state_of(
+            facts.record,
             present=facts.master is not None,
             obstacle=self._obstacle or facts.foreign_master,
             nodes=len(self._graph.taken()),

@@ -139,7 +139,7 @@ class StandbySite:
 
     def _up(self, one: Appliance) -> list[str]:
         return [
-            ROSRV, "up", "--json", "--isolation", "container", "--state", str(one.state), "--policy",
+            ROSRV, "up", "--json", "--isolation", one.isolation, "--state", str(one.state), "--policy",
             str(one.policy_file), *one.options,
         ]  # fmt: skip
 
