@@ -125,6 +125,27 @@ def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
         silence.set()
 
 
+def test_subscribers_that_never_answer_delay_no_list_of_others(calm: Field) -> None:
+    """Each of 300 has a list of publishers to get for each change; the operator's listener hears of it in seconds."""
+    silence = threading.Event()
+    deaf = [f"/deaf_{number}" for number in range(300)]
+    with Impostor(calm.attacker, lambda _connection, _request: silence.wait(30)) as node:
+        for name in deaf:
+            assert calm.rogue("registerSubscriber", name, "/told", "std_msgs/String", node.uri)[0] == 1
+        listener = calm.ros.on(calm.ocu).listener("rospy", "/told")
+        for number in range(3):
+            talker = calm.ros.talker("roscpp", "/told", name=f"late_{number}")
+            began = time.monotonic()
+            listener.wait_for(event="received", publisher=f"/late_{number}")
+            assert time.monotonic() - began < allowed(2 * SLOW)
+            talker.stop()
+        assert node.called.is_set()
+        calm.unharmed(20)
+        silence.set()
+        for name in deaf:
+            calm.rogue("unregisterSubscriber", name, "/told", node.uri)
+
+
 def test_queried_names_do_not_accumulate(calm: Field) -> None:
     face = calm.rogue("lookupNode", "/looker", "/voice")[2]
 
