@@ -16,6 +16,7 @@ from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
+from tests.support.rosmaster import call_on
 from tests.support.waiting import eventually
 
 AGENT = "ws://10.77.0.2:9091"
@@ -149,6 +150,21 @@ def test_a_door_that_is_added_again_has_no_approval(appliance: Appliance, robot:
     eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves again")
     number_in(agent(robot, advertise, answer="status")["msg"])
     assert appliance.recorded("--event", "approval ended")
+
+
+def test_many_calls_of_a_host_leave_the_agent_its_own(appliance: Appliance, robot: Host, lab: Lab) -> None:
+    guest, uri = lab.host("guest", "10.77.0.66/24"), "http://10.77.0.66:1/"
+    appliance.reload(POLICY.replace("[Subscribers]", "/goal/** = 10.77.0.10, ask 10.77.0.66\n[Subscribers]"))
+    said = [
+        call_on(
+            guest, appliance.master_uri, "registerPublisher", "/n", f"/goal/{one}", "std_msgs/String", uri
+        )[1]
+        for one in range(40)
+    ]
+    assert ["held for approval" in one for one in said] == [number < 8 for number in range(40)]
+    advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
+    held = number_in(agent(robot, advertise, answer="status")["msg"])
+    assert "approved by" in appliance.rosrv("approve", held, "--for", "60s").stdout
 
 
 def published(publish: dict[str, Any]) -> bool:
