@@ -13,6 +13,7 @@ from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
+from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
 
 STOP = """
@@ -130,3 +131,33 @@ def test_a_changed_stop_holds_until_it_is_resumed(
         assert monitor(stopped)["held"]
         stopped.rosrv("monitor", "resume", "stop")
         listener.wait_for(event="received", since=mark)
+
+
+def test_a_latched_stop_outlives_a_relay_on_a_full_disk(
+    common_lab: Lab, common_robot: Host, tmp_path: Path
+) -> None:
+    """It is kept in a file whose blocks are reserved at the start."""
+    appliance = Appliance(common_lab.host("full", "10.77.0.8/24"), options=("--api", "off"))
+    try:
+        with small_disk(appliance.state, "200m", "mode=755"):
+            appliance.start()
+            spec = appliance.directory / "stop.rv"
+            spec.write_text(STOP)
+            appliance.rosrv("monitor", "load", str(spec))
+            with RosSession(appliance.master_uri, tmp_path, common_robot) as ros:
+                listener = ros.listener("roscpp", "/chatter")
+                ros.talker("roscpp", "/chatter")
+                listener.wait_for_count(3, event="received")
+                press(appliance, ros)
+                mark = listener.mark()
+                with filled(appliance.state):
+                    killed = appliance.kill("relay")
+                    eventually(lambda: killed not in appliance.pids("relay"), appliance.story)
+                before = eventually(lambda: monitor(appliance), appliance.story)["drops"]
+                eventually(lambda: monitor(appliance)["drops"] >= before + 10, appliance.story)
+                assert not any(one.get("event") == "received" for one in listener.events[mark:])
+                ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: false")
+                listener.wait_for(event="received", since=mark)
+            appliance.stop()
+    finally:
+        appliance.close()
