@@ -202,6 +202,8 @@ class RelayOrders:
         """Lets the monitors of a topic send their safe messages, and returns their names."""
         self.stoppers = relay.taps.stoppers
         """Returns the monitors that have a safe message for a topic; None: its relay does not answer."""
+        self.test = relay.taps.test
+        """Lets a relay test a copy of a guard."""
         self.carried_out = relay.carried_out
 
     def hold(

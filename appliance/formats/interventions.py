@@ -18,6 +18,7 @@ SUBJECTS: Mapping[str, tuple[str, ...]] = {
     "guards and monitors": (
         "specifications loaded", "specifications confirmed", "monitor enabled", "monitor disabled",
         "monitor in shadow mode", "monitor set", "monitor resumed", "monitor not built", "driver checked",
+        "guard tested",
     ),
     "driving rights": ("authority handed over",),
     "approvals": ("approval given", "approval refused", "approval ended"),
@@ -112,6 +113,7 @@ CHANGES: Mapping[str, StateChange] = {
     "monitor resumed": StateChange("holds its topics", "released"),
     "monitor not built": StateChange("loaded", "does nothing"),
     "driver checked": NOTHING_CHANGED,
+    "guard tested": NOTHING_CHANGED,
     "authority handed over": StateChange("{earlier}", "{holder}"),
     "approval given": StateChange("{earlier}", "{now}"),
     "approval refused": StateChange("{earlier}", "{now}"),

@@ -5,7 +5,7 @@ topic or service in its header.
 """
 
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
@@ -21,12 +21,14 @@ from appliance.relay.connections.monitor_calls import OwnAnswer, ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_topic import OwnTopicPublisher
 from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.connections.served_subscribers import TopicSubscriber
 from appliance.relay.connections.service_client import ServiceClient, ServiceTraffic
 from appliance.relay.connections.subscriber import Subscriber
 from appliance.relay.connections.upstream import PublisherConnection
 from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import GrantTable, PeerGrant
 from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.guard_trial import GuardTrials
 from appliance.relay.monitors.heartbeat import Heartbeat
 from appliance.relay.monitors.interceptor import Interceptor, MonitorOrder
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
@@ -94,6 +96,7 @@ class DataPlane:
             topics=lambda: [topic for topic in self.topics.values() if topic.is_judged],
             unwritten=self._unwritten_stop,
         )
+        self._trials = GuardTrials(loop, self.interceptor, self._deliver, self._reporter.send)
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: LoopLink | None) -> None:
@@ -134,6 +137,8 @@ class DataPlane:
             self._topic_taps.order(message, self.topics.values())
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
             self._own_topic(message)
+        elif isinstance(message, messages.GuardTestWanted):
+            self._trials.order(message)
         elif isinstance(message, OwnAnswer):
             self._calls.answered(message)
         elif isinstance(message, messages.OrdersAsked):
@@ -146,6 +151,7 @@ class DataPlane:
 
     def close(self) -> None:
         self.interceptor.close()
+        self._trials.close()
         self.heartbeat.close()
         self.ports.close_all()
         for topic in self.topics.values():
@@ -354,6 +360,14 @@ class DataPlane:
         for relayed in list(self.topics.values()):
             if relayed.topic == commands and relayed.upstream is not publisher:
                 relayed.supersede(stop)
+
+    def _deliver(self, topic: str, data: bytes) -> Sequence[TopicSubscriber]:
+        """Publish a message on the appliance's own connections alone; return the subscribers that get it."""
+        publisher = self._own.get(topic)
+        if publisher is None:
+            return ()
+        publisher.publish(data)
+        return publisher.members()
 
     def _unwritten_stop(self) -> str:
         """Return which subscriber has not taken the last stop of a guard, or an empty text."""

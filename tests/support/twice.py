@@ -45,6 +45,7 @@ TWICE = {
     "fleet take": _ONCE,
     "guard check-driver": "measures again",
     "guard remove": _GONE,
+    "guard test": "tests again",
     "host add": "draws a new kit or one-time token; a second host of one name is refused",
     "host authority rotate": "a rotation makes a new authority each time",
     "host kit": "a new certificate is another certificate",

@@ -171,6 +171,7 @@ ELSEWHERE = {
     "set_guard",
     "upgrade_guard",
     "check_driver",
+    "test_guard",
     "add_door",
 }
 """Operations that need a provider, a guard's topics or a door. The tests of these features call them."""

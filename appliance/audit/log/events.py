@@ -83,6 +83,8 @@ EVENTS: dict[str, str] = {
     " of control, every guard. `detail` has its preset with the version, `origin` (`current`, `older` or `changed`),"
     " the values in force, those `below` the standard, and the `digest` that binds them, as in"
     " `rosrv guard list --json`.",
+    "guard tested": "A copy of a guard got a fault (`rosrv guard test`). `detail` has `monitor`, the guard's `digest`,"
+    " the `stimulus`, the `outcome`, and whom its stop `reached`, with seconds.",
     "guard late": "A guard acted more than `relay.late` later than it was due. It is recorded again when the guard was"
     " in time for a minute.",
     "heartbeat begun": "The heartbeat is on: every guard can act.",
@@ -252,7 +254,7 @@ SEVERITIES: dict[str, Severity] = {
             "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "driver checked", "guard loaded", "heartbeat begun",
-            "monitor resumed",
+            "guard tested", "monitor resumed",
             "monitor set",
             "policy loaded", "rights changed", "stop ended",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",

@@ -612,6 +612,61 @@ class ValuesSeen(Message):
     ages: dict[str, float | None] = msgspec.field(default_factory=dict)
 
 
+class SyntheticMessage(msgspec.Struct, array_like=True):
+    """A message for the copy of a guard, `after` seconds behind the one before; without a `topic`, only time passes."""
+
+    after: float
+    topic: str = ""
+    data: bytes = b""
+    node: str = ""
+
+
+class GuardTestWanted(Message):
+    """A relay gives messages to a copy of a guard, in the copy's own time; the guard in force does not get them.
+
+    From number `fault` on they must make it stop. If they do, and with `deliver`, the relay writes the safe message of
+    the guard once to the subscribers of `command`.
+    """
+
+    number: int
+    monitor: str
+    command: str
+    messages: list[SyntheticMessage]
+    fault: int
+    deliver: bool = False
+
+
+class SubscriberReached(msgspec.Struct, array_like=True):
+    """A subscriber to which a safe message was written.
+
+    `accepted` and `acknowledged` are the seconds from the stimulus until its socket had taken all bytes, and until the
+    TCP of its host had acknowledged them; None: not in time.
+    """
+
+    node: str
+    host: str
+    accepted: float | None
+    acknowledged: float | None
+
+
+class GuardTested(Message):
+    """What the copy did, and whom the safe message reached; `why` is the reason if there was no test.
+
+    `passed`: the last command before the fault passed unchanged. `act` is what the copy did from the fault on:
+    `stopped` (its safe message), `limited` or `dropped` a command, `withheld` the topic, or nothing. `after` is the
+    copy's own time from the fault to that, `seconds` the real time in which it judged.
+    """
+
+    number: int
+    why: str = ""
+    passed: bool = False
+    act: str = ""
+    after: float = 0.0
+    cause: str = ""
+    seconds: float = 0.0
+    reached: list[SubscriberReached] = msgspec.field(default_factory=list)
+
+
 class MessageSeen(Message):
     """A message of a tapped topic; `time` is in nanoseconds since the epoch, `size` in bytes.
 
@@ -637,5 +692,5 @@ RelayLink = (
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
     | MonitorCallWanted | MonitorCallAnswered | RequestHeld | HeldRequestDecided | StopWanted | StopBegun
-    | RankFreed | RankReported | ValuesWanted | ValuesSeen
+    | RankFreed | RankReported | ValuesWanted | ValuesSeen | GuardTestWanted | GuardTested
 )  # fmt: skip

@@ -21,6 +21,7 @@ from appliance.features.guards.guard_answers import DriverCheck
 from appliance.features.guards.guard_facts import facts_of
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import DRIVER_CHECK, GuardError, described, text_of
+from appliance.features.guards.proof_tests import ProofTests, kept_tests
 from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
 from appliance.features.guards.upgrades import planned
 from appliance.specifications.specification_files import SpecificationsRefusedError
@@ -189,7 +190,19 @@ async def begin(core: Core) -> ControlPart:
     fitness = GuardFitness(core.specifications, relay, core.settings.relays, core.trail, core.store)
     if relay.heartbeat:
         core.relay.publish_only("guards", [OwnHeaderStated(relay.heartbeat, *_BOOL, latching=False)])
-    orders = GuardOrders(core.specifications, core.graph.present, core.graph.connections, core.trail, fitness)
+    tests = kept_tests(core.store)
+    orders = GuardOrders(
+        core.specifications, core.graph.present, core.graph.connections, core.trail, fitness, tests=tests
+    )
+    proofs = ProofTests(
+        core.specifications,
+        orders,
+        tests,
+        graph=core.graph,
+        relay=core.relay,
+        trail=core.trail,
+        store=core.store,
+    )
     checks = DriverChecks(core.specifications, core.trail, core.graph.present, core.links.processes)
 
     async def save() -> None:
@@ -197,7 +210,7 @@ async def begin(core: Core) -> ControlPart:
 
     core.links.before_end(save)
     return ControlPart(
-        (*orders.methods(), *checks.methods()),
+        (*orders.methods(), *proofs.methods(), *checks.methods()),
         {
             "the guards": orders.watch,
             "the place of guards": orders.placement.watch,

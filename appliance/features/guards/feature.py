@@ -24,6 +24,7 @@ FEATURE = Feature(
                 "enforce": Verb(f"{_VERBS}:enforce"),
                 "upgrade": Verb(f"{_VERBS}:upgrade"),
                 "remove": Verb(f"{_VERBS}:remove"),
+                "test": Verb("appliance.features.guards.proof_verb:test"),
                 "check-driver": Verb("appliance.features.guards.driver_verb:check_driver"),
             },
             after="monitor",

@@ -78,6 +78,68 @@ class GuardTimes(msgspec.Struct, frozen=True):
     limit: Annotated[float, doc("the limit in seconds, `relay.late`")]
 
 
+class StopReached(msgspec.Struct, frozen=True):
+    """A subscriber of the command to which a proof test wrote the stop.
+
+    The times are seconds from the fault in real time; null: not within a second. Whether the node read the stop, or
+    obeyed, is not seen.
+    """
+
+    node: Annotated[str, doc("the subscriber")]
+    host: Annotated[str, doc("its host")]
+    driver: Annotated[bool, doc("it carries out the command; others only listen")]
+    accepted: Annotated[float | None, doc("until the socket of its connection had accepted all bytes")]
+    acknowledged: Annotated[float | None, doc("until the TCP of its host had acknowledged all bytes")]
+
+
+class ProofTest(msgspec.Struct, frozen=True):
+    """The proof test of a guard: a fault on a copy of it, and the way of its stop to the driver."""
+
+    at: Annotated[Moment, doc("when it was tested, in seconds since the epoch")]
+    digest: Annotated[str, doc("the digest of the guard that was tested")]
+    stimulus: Annotated[str, doc("the fault, for a person")]
+    outcome: Annotated[
+        str,
+        doc(
+            "`stopped`, `limited`, `dropped` or `withheld`: what the copy did at the fault; `passed`: it did nothing;"
+            " `undecided`: the honest motion before the fault did not pass either"
+        ),
+    ]
+    cause: Annotated[str, doc("the cause that the copy printed, or empty")]
+    after: Annotated[float, doc("seconds of the copy's own time from the fault to that, such as `silent`")]
+    seconds: Annotated[float, doc("seconds of real time in which the copy judged the messages of the fault")]
+    reached: Annotated[list[StopReached], doc("the subscribers to which the stop was written")]
+    not_sent: Annotated[str, doc("why no stop was sent to the driver, or empty")]
+    who: Annotated[str, doc("who ordered it")]
+
+    def in_words(self) -> str:
+        """Return the fault and what the copy did, as a sentence."""
+        match self.outcome:
+            case "passed":
+                did = "the copy did not act"
+            case "undecided":
+                did = "not decided: the copy also stopped the honest motion before it"
+            case _:
+                did = f"the copy {self.outcome} {_ACTS_ON[self.outcome]} {self.after:.2f} s later"
+                did += f", after {self.seconds * 1e3:.1f} ms of judging"
+        return f"{self.stimulus}: {did}{f' ({self.cause})' if self.cause else ''}"
+
+    @property
+    def proved(self) -> bool:
+        """Whether the copy acted, and the stop was acknowledged by each driver, unless none was to be sent."""
+        drivers = [one for one in self.reached if one.driver]
+        arrived = bool(drivers) and all(one.acknowledged is not None for one in drivers)
+        return self.outcome in _ACTS_ON and (arrived or bool(self.not_sent))
+
+
+_ACTS_ON = {
+    "stopped": "the motion",
+    "limited": "the command",
+    "dropped": "the command",
+    "withheld": "the topic",
+}
+
+
 class GuardRow(msgspec.Struct, frozen=True):
     """A loaded guard."""
 
@@ -137,6 +199,7 @@ class GuardRow(msgspec.Struct, frozen=True):
     times: Annotated[GuardTimes | None, doc("how late it has acted, or null if it was not in force yet")] = (
         None
     )
+    tested: Annotated[ProofTest | None, doc("its last proof test, or null if there was none")] = None
 
 
 class GuardList(msgspec.Struct, frozen=True):

@@ -21,6 +21,7 @@ from appliance.features.guards.guard_answers import (
     GuardRow,
     LastStop,
     LoadedSuggestion,
+    ProofTest,
     Suggestion,
     Suggestions,
 )
@@ -193,9 +194,12 @@ class GuardOrders:
         connections: ConnectedNodes,
         trail: AuditTrail,
         fitness: GuardFitness,
+        *,
+        tests: Mapping[str, ProofTest],
     ) -> None:
+        """`tests` are the last proof tests, by guard."""
         self._monitors, self._graph, self._trail = monitors, graph, trail
-        self._fitness = fitness
+        self._fitness, self._tests = fitness, tests
         self.placement = Placement(self._guarded_commands, graph, connections, self._note_bypass)
         self._acts: dict[str, int] = {}
         self._acted_at: dict[str, float] = {}
@@ -466,6 +470,10 @@ class GuardOrders:
             if is_former(files.get(file, ""))
         }
 
+    def row(self, name: str) -> GuardRow:
+        """Return a guard. Raises `UnknownThingError`."""
+        return self._row(name, self._guard(name)[0])
+
     def _guarded_commands(self) -> frozenset[str]:
         guards = self._guards().values()
         return frozenset(topics_in(one.text).get("command", "") for one in guards if one.name != "withhold")
@@ -540,4 +548,5 @@ class GuardOrders:
             afresh=monitors.afresh(name) or "absent",
             awaits=row.awaits if (row := monitors.rollout.rows.get(name)) is not None else "",
             times=self._fitness.times.get(name),
+            tested=self._tests.get(name),
         )

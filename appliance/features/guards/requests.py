@@ -11,7 +11,7 @@ from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMo
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.rest_operation import parameter, rest
-from appliance.features.guards.guard_answers import DriverCheck, GuardList, GuardPlan, Suggestions
+from appliance.features.guards.guard_answers import DriverCheck, GuardList, GuardPlan, ProofTest, Suggestions
 
 _NO_GUARD = {404: "There is no such guard."}
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -143,6 +143,17 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
     upgrade: bool = False
 
 
+@rest("operator", "POST", "/v1/guards/{name}/test", name="test_guard", problems=_NO_GUARD, seconds=40.0)
+class GuardTest(WaitingRequest[ProofTest], frozen=True, tag="guard test"):
+    """Give a copy of a guard a fault, and send one stop to its driver, while the robot stands still.
+
+    The guard in force, and its state, stay as they are, and no motion is sent. Rejected while somebody drives, and if
+    the robot is not known to stand still.
+    """
+
+    name: OneMonitor
+
+
 @rest(
     "admin", "POST", "/v1/guards/driver-check", name="check_driver", body=NewDriverCheck, seconds=40.0,
 )  # fmt: skip
@@ -165,6 +176,6 @@ class DriverCheckWanted(WaitingRequest[DriverCheck], frozen=True, tag="driver ch
 
 
 REQUESTS = (
-    GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardUpgrade, GuardTry, DriverCheckBegin,
+    GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardUpgrade, GuardTry, GuardTest, DriverCheckBegin,
     DriverCheckWanted,
 )  # fmt: skip

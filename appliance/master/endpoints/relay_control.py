@@ -422,7 +422,7 @@ class RelayControl:
                 self.ranks.reported(message)
             case messages.OrdersCarriedOut():
                 post.carried_out()
-            case messages.MessageSeen() | messages.StopBegun():
+            case messages.MessageSeen() | messages.StopBegun() | messages.GuardTested():
                 self.taps.seen(message)
             case _ if not self.carried.received(index, message):
                 self.monitors().received(message, index)

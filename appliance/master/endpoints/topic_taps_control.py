@@ -3,12 +3,15 @@
 import asyncio
 from collections.abc import Callable
 
+import msgspec
+
 from appliance.channel import messages
 
 MOST = 8
 """The most taps at once; relays have the same limit."""
 
 _STOP_SECONDS = 5.0
+_TEST_SECONDS = 20.0
 
 
 class TooManyTapsError(Exception):
@@ -16,7 +19,7 @@ class TooManyTapsError(Exception):
 
 
 class TapRequests:
-    """The open taps, and the open requests for the safe messages of monitors.
+    """The open taps, and the open requests for the safe messages and tests of monitors.
 
     `sender(topic)` returns the function that sends a message to the relay that carries the topic.
     """
@@ -25,7 +28,7 @@ class TapRequests:
         self._sender = sender
         self._number = 0
         self._open: dict[int, tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
-        self._stops: dict[int, asyncio.Future[list[str]]] = {}
+        self._asked: dict[int, asyncio.Future[messages.StopBegun | messages.GuardTested]] = {}
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
@@ -56,26 +59,43 @@ class TapRequests:
         """Return the names of monitors with a safe message; None if the relay does not answer."""
         return await self._safe_messages(topic, begin=False)
 
+    async def test(self, wanted: messages.GuardTestWanted) -> messages.GuardTested | None:
+        """Return the outcome of a guard's test; None if the relay does not answer. The message gets its number here."""
+        found = await self._answer(
+            wanted.command, lambda number: msgspec.structs.replace(wanted, number=number), _TEST_SECONDS
+        )
+        return found if isinstance(found, messages.GuardTested) else None
+
     async def _safe_messages(self, topic: str, *, begin: bool) -> list[str] | None:
+        found = await self._answer(
+            topic, lambda number: messages.StopWanted(number, topic, begin), _STOP_SECONDS
+        )
+        return found.monitors if isinstance(found, messages.StopBegun) else None
+
+    async def _answer(
+        self, topic: str, numbered: Callable[[int], messages.Message], seconds: float
+    ) -> messages.StopBegun | messages.GuardTested | None:
         self._number += 1
         number = self._number
-        begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
-        self._stops[number] = begun
+        answer: asyncio.Future[messages.StopBegun | messages.GuardTested] = (
+            asyncio.get_running_loop().create_future()
+        )
+        self._asked[number] = answer
         try:
-            if not self._sender(topic)(messages.StopWanted(number, topic, begin)):
+            if not self._sender(topic)(numbered(number)):
                 return None
-            async with asyncio.timeout(_STOP_SECONDS):
-                return await begun
+            async with asyncio.timeout(seconds):
+                return await answer
         except TimeoutError:
             return None
         finally:
-            del self._stops[number]
+            del self._asked[number]
 
-    def seen(self, message: messages.MessageSeen | messages.StopBegun) -> None:
-        if isinstance(message, messages.StopBegun):
-            begun = self._stops.get(message.number)
-            if begun is not None and not begun.done():
-                begun.set_result(message.monitors)
+    def seen(self, message: messages.MessageSeen | messages.StopBegun | messages.GuardTested) -> None:
+        if not isinstance(message, messages.MessageSeen):
+            answer = self._asked.get(message.number)
+            if answer is not None and not answer.done():
+                answer.set_result(message)
             return
         count, seen, enough = self._open.get(message.number, (0, [], None))
         if len(seen) < count:

@@ -1,8 +1,9 @@
 """The upstream of a topic that the appliance itself publishes: it has a header and no connection."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
+from appliance.relay.connections.served_subscribers import TopicSubscriber
 from appliance.relay.transport.frames import Batch
 from roswire.tcpros import encode_frame
 
@@ -40,6 +41,10 @@ class OwnTopicPublisher(Upstream):
     def publish(self, data: bytes) -> None:
         if self._current is not None:
             self._topic.published(Batch(memoryview(encode_frame(data)), 1, 0, owned=True))
+
+    def members(self) -> Sequence[TopicSubscriber]:
+        """Return the subscribers that get what is published now."""
+        return self._topic.members if self._current is not None else ()
 
     def waiting(self) -> str:
         """Return the name of a subscriber whose socket has not taken all messages, or an empty text."""

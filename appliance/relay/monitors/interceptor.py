@@ -325,6 +325,14 @@ class Interceptor:
             return "ticks of the monitors are overdue"
         return monitors.unfit()
 
+    def copied(self, guard: str) -> tuple[SpecificationsStated, dict[str, dict[str, GivenValue]]] | str:
+        """Return what a copy of a monitor in force is made from, or why there is none."""
+        if self._stated is None or self.blocked or self.monitors is None:
+            return self.blocked or "the relay has no specifications yet"
+        if guard not in self.monitors.acting():
+            return f"{guard} is not in force in its relay"
+        return self._stated, self._given
+
     @property
     def acting(self) -> list[str]:
         """The monitors in force that may stop, change or withhold messages."""

@@ -89,7 +89,7 @@ def orders_of(
     present, trail = Graph([], [], []) if graph is None else graph, trail or FakeTrail()
     settings: Any = store or Settings()
     fitness = GuardFitness(monitors, relay or Relay(), 1, trail, settings)
-    return GuardOrders(monitors, lambda: present, Connections(), trail, fitness)
+    return GuardOrders(monitors, lambda: present, Connections(), trail, fitness, tests={})
 
 
 @pytest.fixture
