@@ -11,6 +11,7 @@ from pathlib import Path
 from appliance.features.guards.evidence import (
     COMMON_CAUSES,
     EVIDENCE,
+    MEANING_OF_SUMS,
     NO_SAFETY_FUNCTION,
     RELAY_MS,
     stopping_time,
@@ -62,9 +63,7 @@ part has no guaranteed bound: of 1,000 stops on a busy machine the slowest took 
 ([measured](../monitors.md#how-fast-a-guard-stops)). Add the base's own reaction and the time in which it brakes from
 its speed, and choose the values so that the sum is safe.
 
-The sum is for a silent source (`standstill`: for `settle`). A thing that a message shows is noticed in that message:
-then the interval of the messages takes the place of the silence, `frozen` (`sensor`) or `samples` (`agree`) times. The
-check of `arm` has `checked` instead of `silent`, and the goal of `answer` its deadline before the sum.
+{sums}
 
 | preset | it notices | silence | timer | relay, at most measured | sum |
 |---|---|---|---|---|---|
@@ -81,7 +80,12 @@ def page() -> str:
             raise BuildError(f"add {', '.join(sorted(missing))} to {where}")
     return "\n".join(
         (
-            _HEAD.format(claim=NO_SAFETY_FUNCTION, relay=RELAY_MS, pairs=_simulated(PAIRS, _results()))
+            _HEAD.format(
+                claim=NO_SAFETY_FUNCTION,
+                sums=MEANING_OF_SUMS,
+                relay=RELAY_MS,
+                pairs=_simulated(PAIRS, _results()),
+            )
             + "".join(_times()),
             *_presets(),
             *_common(),

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from appliance.features.guards.evidence import EVIDENCE
 from appliance.features.guards.presets import PRESETS
-from lab.guards_evidence_page import EVIDENCE, page
+from lab.guards_evidence_page import page
 from tests.support.rows import require_rows
 
 ROOT = Path(__file__).parents[2]
@@ -13,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.complete
 def test_every_preset_has_its_evidence() -> None:
-    require_rows(PRESETS, EVIDENCE, "EVIDENCE of lab/guards_evidence_page.py")
+    require_rows(PRESETS, EVIDENCE, "EVIDENCE of appliance/features/guards/evidence.py")
     for name, row in EVIDENCE.items():
         assert row.clauses and row.notices and row.fails and row.unit, name
         assert not row.silence or PRESETS[name].parameter(row.silence)

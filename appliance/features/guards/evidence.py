@@ -37,6 +37,11 @@ with a performance level**: it runs on a computer and a network without a claime
 guaranteed time. An assessor takes no credit for it in the calculation of a performance level or a safety integrity
 level."""
 
+MEANING_OF_SUMS = """\
+The sum is for a silent source (`standstill`: for `settle`). A thing that a message shows is noticed in that message:
+then the interval of the messages takes the place of the silence, `frozen` (`sensor`) or `samples` (`agree`) times. The
+check of `arm` has `checked` instead of `silent`, and the goal of `answer` its deadline before the sum."""
+
 RELAY_MS = 68
 """The longest of 1,000 measured times from the end of `silent` to a stop at the base, on a busy machine."""
 
