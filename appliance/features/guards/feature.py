@@ -25,6 +25,7 @@ FEATURE = Feature(
                 "upgrade": Verb(f"{_VERBS}:upgrade"),
                 "remove": Verb(f"{_VERBS}:remove"),
                 "test": Verb("appliance.features.guards.proof_verb:test"),
+                "manual": Verb("appliance.features.guards.manual_verb:manual"),
                 "check-driver": Verb("appliance.features.guards.driver_verb:check_driver"),
             },
             after="monitor",

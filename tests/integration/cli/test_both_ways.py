@@ -80,14 +80,15 @@ LOOKING = [
     ("monitor", "confirm"), ("monitor", "enforce", "nobody"), ("monitor", "set", "nobody", "vMax=1"),
     ("alarm", "list"), ("alarm", "acknowledge", "nothing", "--note", "seen"),
     ("alarm", "silence", "nothing", "--for", "1h"),
-    ("guard", "list"), ("guard", "show", "nobody"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
+    ("guard", "list"), ("guard", "show", "nobody"), ("guard", "suggest"), ("guard", "manual"),
+    ("guard", "new", "nothing", "/cmd_vel"),
     ("door", "list"), ("door", "ticket", "nobody"), ("door", "remove", "nobody"), ("drive", "status"),
     ("drive", "assign", "base", "--host", "robot"), ("drive", "free", "base"), ("approval", "refuse", "48213"),
     ("policy", "unused", "--json"), ("policy", "enforce", "Publishers", "--dry-run"), ("who-drove", "--at", "0s"),
     ("drive", "ask", "base", "--host", "robot"), ("approve",),
     ("approve", "48213"), ("sso", "list"), ("sso", "end", "nobody"),
     ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "upgrade", "nobody"),
-    ("guard", "remove", "nobody"),
+    ("guard", "remove", "nobody"), ("guard", "test"), ("guard", "test", "nobody"),
     ("guard", "check-driver", "/nothing", "--by", "/odom", "--yes"),
 ]  # fmt: skip
 
