@@ -104,6 +104,7 @@ class DataPlane:
         self._link = link
         self._reporter.attach(link)
         self._topic_taps.end_all()
+        self._trials.forget()
         self._calls.attach(link is not None)
 
     def copy_to(self, sink: MessageSink) -> None:

@@ -143,6 +143,7 @@ class GuardTrials:
         self._loop, self._interceptor = loop, interceptor
         self._deliver, self._tell = deliver, tell
         self._beside: WorkBeside | None = None
+        self._era = 0
 
     def order(self, wanted: GuardTestWanted) -> None:
         found = self._interceptor.copied(wanted.monitor)
@@ -151,6 +152,7 @@ class GuardTrials:
             self._tell(GuardTested(wanted.number, why))
             return
         stated, given = found
+        era = self._era
 
         def work() -> Trial | str:
             try:
@@ -158,29 +160,40 @@ class GuardTrials:
             except Exception as error:  # noqa: BLE001  a defect of a copy must not end the relay
                 return f"the copy could not be made: {error}"
 
-        self._beside = self._loop.beside(work, lambda trial: self._done(wanted, trial))
+        self._beside = self._loop.beside(work, lambda trial: self._done(wanted, trial, era))
+
+    def forget(self) -> None:
+        """Forget who asked: control has ended, and the next one may give the same number again."""
+        self._era += 1
 
     def close(self) -> None:
         if self._beside is not None:
             self._beside.discard()
             self._beside = None
 
-    def _done(self, wanted: GuardTestWanted, trial: Trial | str) -> None:
+    def _done(self, wanted: GuardTestWanted, trial: Trial | str, era: int) -> None:
         self._beside = None
+        if era != self._era:
+            return
         if isinstance(trial, str):
             self._tell(GuardTested(wanted.number, trial))
             return
         tested, safe = trial.tested, trial.safe
-        if not (wanted.deliver and tested.act and safe is not None):
+        if not (wanted.deliver and tested.passed and tested.act and safe is not None):
             self._tell(tested)
             return
         members = self._deliver(wanted.command, safe_messages.sent(safe, self._interceptor.now()))
         rows = {member: SubscriberReached(member.caller_id, member.host, None, None) for member in members}
         tested = msgspec.structs.replace(tested, reached=[*rows.values()])
-        self._follow(tested, trial.begun, rows, 0)
+        self._follow(tested, trial.begun, rows, era)
 
     def _follow(
-        self, tested: GuardTested, begun: float, left: dict[TopicSubscriber, SubscriberReached], looks: int
+        self,
+        tested: GuardTested,
+        begun: float,
+        left: dict[TopicSubscriber, SubscriberReached],
+        era: int,
+        looks: int = 0,
     ) -> None:
         """Look at the sockets, at once and then every `_LOOK_SECONDS`, and report the result once."""
         for member, row in list(left.items()):
@@ -196,6 +209,6 @@ class GuardTrials:
                 row.acknowledged = seconds
                 del left[member]
         if left and looks < _MOST_LOOKS:
-            self._loop.after(_LOOK_SECONDS, lambda: self._follow(tested, begun, left, looks + 1))
-        else:
+            self._loop.after(_LOOK_SECONDS, lambda: self._follow(tested, begun, left, era, looks + 1))
+        elif era == self._era:
             self._tell(tested)

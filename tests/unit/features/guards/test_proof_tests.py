@@ -170,6 +170,20 @@ def test_a_stop_is_accepted_by_the_socket_and_acknowledged_by_tcp_apart(
         assert (one.accepted is not None, one.acknowledged is not None) == (taken, reads)
 
 
+def test_a_test_of_a_control_that_has_ended_sends_no_stop_and_no_answer() -> None:
+    text = made("sane", {}, {})
+    quiet, sent = QuietMonitors(), list[str]()
+    quiet.load(text)
+    trials = GuardTrials(
+        quiet.loop, quiet.interceptor, lambda topic, _data: sent.append(topic) or (), quiet.reports.send
+    )
+    test, before = stimulus_of(text, "sane"), len(quiet.reports.sent)
+    trials.order(GuardTestWanted(7, "guard", "/cmd_vel", test.messages, test.fault, deliver=True))
+    trials.forget()
+    quiet.loop.finish()
+    assert (sent, len(quiet.reports.sent)) == ([], before)
+
+
 ZERO = {"linear": {"x": 0.0, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": 0.0}}
 MOVES = {**ZERO, "angular": {"x": 0.0, "y": 0.0, "z": 0.4}}
 NAN = {**ZERO, "linear": {"x": math.nan, "y": 0.0, "z": 0.0}}
