@@ -577,6 +577,11 @@ class MonitorSet:
             for one in self._monitors
         )
 
+    def safe_message(self, name: str, topic: str, time_ns: int) -> bytes | None:
+        """Return the safe message of a specification for a topic, as it is sent at a time; None if it has none."""
+        sender = self.monitor(name).safes.get(topic)
+        return None if sender is None else safe_messages.sent(sender.safe, time_ns)
+
     def only_stops(self, event: str) -> bool:
         """Whether the event, named `specification.event`, changes messages only to the safe message."""
         return event in self._stopping

@@ -650,7 +650,7 @@ class SubscriberReached(msgspec.Struct, array_like=True):
 
 
 class GuardTested(Message):
-    """What the copy did, and whom the safe message reached; `why` is the reason if there was no test.
+    """The acts of the copy, and whom the safe message reached; `why` is the reason if there was no test.
 
     `passed`: the last command before the fault passed unchanged. `act` is what the copy did from the fault on:
     `stopped` (its safe message), `limited` or `dropped` a command, `withheld` the topic, or nothing. `after` is the

@@ -1,4 +1,4 @@
-"""What is known of each preset beyond its text, and the digest that binds a guard to its preset, text and values.
+"""The facts about each preset beyond its text, and the digest that binds a guard to its preset, text and values.
 
 The evidence page and the safety manual of a robot are made from the same rows.
 
@@ -136,7 +136,7 @@ EVIDENCE: Mapping[str, Evidence] = {
             "ISO 3691-4:2020, 4.1.14, no automatic restart",
             "IEC 60204-1:2016, 9.2.2, stop category 2 at best, since the drives keep their power; so it is **not an"
             " emergency stop in the sense of ISO 13850:2015, 4.1**, which has category 0 or 1",
-            "ISO 13849-1:2015, 5.2.2, manual reset; two nodes that reset are no two-hand control",
+            "ISO 13849-1:2015, 5.2.2, manual reset; two nodes that reset are not a two-hand control",
         ),
         "a press, in that message; a button that is silent for `silent`",
         "silent",
@@ -278,7 +278,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         "silent",
         (
             "the node of each entry notices its fault",
-            "each entry comes at least every `silent`, also while it is well",
+            "each entry comes at least every `silent`, even while it is well",
         ),
         ("a fault that the robot's nodes do not notice", "a base that ignores a zero velocity"),
         unit=(

@@ -81,8 +81,8 @@ class GuardTimes(msgspec.Struct, frozen=True):
 class StopReached(msgspec.Struct, frozen=True):
     """A subscriber of the command to which a proof test wrote the stop.
 
-    The times are seconds from the fault in real time; null: not within a second. Whether the node read the stop, or
-    obeyed, is not seen.
+    The times are seconds from the fault in real time, or null if it took longer than a second. Whether the node read
+    the stop, or obeyed, is not seen.
     """
 
     node: Annotated[str, doc("the subscriber")]

@@ -1,8 +1,8 @@
 """Make the safety manual of a robot from its guards, and the difference from an earlier one. No I/O.
 
 The content is a function of the guards with their values, of what is not protected, and of the version; its digest is
-printed below it. What changes by itself, such as delays and the last proof tests, follows the signatures and is not
-part of the content.
+printed below it. Delays and the last proof tests change automatically: they follow the signatures, and are not part of
+the content.
 """
 
 import difflib
@@ -144,7 +144,7 @@ def _time_of(row: GuardRow) -> StoppingTime | None:
 
 
 def _relay(row: GuardRow) -> float:
-    """Return the milliseconds of the relay: measured ones count from `relay.late` on, which is no alarm up to that."""
+    """Return the milliseconds of the relay; measured ones count as `relay.late` at least, which raises no alarm."""
     return RELAY_MS if row.times is None else max(row.times.limit, row.times.latest) * 1e3
 
 
@@ -153,7 +153,7 @@ def _times(rows: Sequence[GuardRow]) -> Iterator[str]:
     yield from ("From the cause to the stop at the base, at worst.", "", MEANING_OF_SUMS, "")
     yield (
         "The relay's part is *measured* where this appliance has measured it: the longest delay, or `relay.late`, up to"
-        " which a delay is no alarm. Otherwise it is *declared*: the slowest of 1,000 stops on a busy machine,"
+        " which a delay raises no alarm. Otherwise it is *declared*: the slowest of 1,000 stops on a busy machine,"
         f" {RELAY_MS} ms. Add the sensor's own delay, and the time in which the base stands after the stop."
     )
     yield from ("", "| guard | silence | timer | relay | sum |", "|---|---|---|---|---|")
@@ -206,7 +206,7 @@ def _braking(rows: Sequence[GuardRow]) -> tuple[tuple[float, float] | None, str]
         return (reaction, 1 / (2 * braking)), declared
     if (found := by_preset.get("fence")) is not None:
         ahead = float(found["ahead"])
-        return (ahead, 0.0), f"the base stands in the way of {ahead:g} s, as `fence` declares"
+        return (ahead, 0.0), f"the base stops within the way of {ahead:g} s, as `fence` declares"
     return None, "no value declares how the base brakes"
 
 
@@ -230,7 +230,7 @@ _LINK, _TEXT = re.compile(r"\[([^\]]*)\]\([^)]*\)"), r"\1"
 
 def _state(rows: Sequence[GuardRow]) -> Iterator[str]:
     yield from ("## State when it was made", "")
-    yield f"{_minute(clock.wall())}. This part changes by itself, and is not in the digest."
+    yield f"{_minute(clock.wall())}. This part changes automatically, and is not in the digest."
     yield ""
     for row in rows:
         yield f"- {row.name}: {_proof(row)}"

@@ -2,7 +2,7 @@
 
 1. Nothing is sent before the robot is known to stand: for `WATCH_SECONDS` no motion was commanded, and a zero was, or
    the odometry of the base was zero. Silence alone proves nothing.
-2. What is sent is one stop, on the appliance's own connections. Never a motion.
+2. One stop is sent, on the appliance's own connections, and never a motion.
 3. The last test of each guard is kept over restarts, with the digest of the guard that was tested.
 """
 
@@ -127,7 +127,7 @@ class ProofTests:
         if kind not in VELOCITIES:
             if seen[command]:
                 raise SenselessError(
-                    f"somebody commands {command} ({self._sender(seen[command])}): test it when nobody does"
+                    f"a node, {self._sender(seen[command])}, uses {command}: test it when no node does"
                 )
             return f"no topic says that what {kind} moves stands still"
         for name, messages in seen.items():
@@ -142,7 +142,7 @@ class ProofTests:
             raise SenselessError(
                 f"the robot is not known to stand still: within {WATCH_SECONDS:g} s no zero was commanded on {command},"
                 f" and {f'{odometry[0]} was silent' if odometry else 'no odometry is published'}: let a node command"
-                " zero meanwhile"
+                " zero, and test again"
             )
         return ""
 

@@ -29,7 +29,7 @@ def test(
 
     The guard in force, and its state, stay as they are, and no motion is sent. If the copy acts, one stop is written to
     the connection of the base driver. It is printed when its socket has accepted the bytes, and when the TCP of its
-    host has acknowledged them; not whether the driver obeys. Rejected while somebody drives. Exit status: 0 each copy
+    host has acknowledged them; not whether the driver obeys. Rejected while a node drives. Exit status: 0 each copy
     acted and each stop arrived, 1 not.
 
     Example: rosrv guard test estop

@@ -147,7 +147,7 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
 class GuardTest(WaitingRequest[ProofTest], frozen=True, tag="guard test"):
     """Give a copy of a guard a fault, and send one stop to its driver, while the robot stands still.
 
-    The guard in force, and its state, stay as they are, and no motion is sent. Rejected while somebody drives, and if
+    The guard in force, and its state, stay as they are, and no motion is sent. Rejected while a node drives, and if
     the robot is not known to stand still.
     """
 

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from appliance.base.counted import counted
 from appliance.channel.messages import SyntheticMessage
 from appliance.features.guards.presets import GuardError
 from rosmop.types import given_lists
@@ -234,7 +235,7 @@ def _pose(x: float, y: float) -> Fields:
 
 
 Readings = Iterator[tuple[tuple[str, str], Reading]]
-"""What each node of an honest robot says, by the preset's name of the topic and the node."""
+"""The messages of each node of an honest robot, by the preset's name of the topic and the node."""
 
 
 def _unobserved(_robot: _Robot) -> Readings:
@@ -331,7 +332,7 @@ def _over_limit(robot: _Robot) -> _Fault:
 
 def _burst(robot: _Robot) -> _Fault:
     number = math.ceil(robot.number("burst")) + 2
-    return _Fault(f"{number} commands at once", at_once=number)
+    return _Fault(f"{counted(number, 'command')} at once", at_once=number)
 
 
 _FIRST = f"{_ROBOT}_0"

@@ -14,7 +14,7 @@ import struct
 import termios
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import msgspec
 
@@ -27,14 +27,11 @@ from appliance.channel.messages import (
     SpecificationsStated,
     SubscriberReached,
 )
-from appliance.relay.connections.served_subscribers import TopicSubscriber
 from appliance.relay.loop import EventLoop, WorkBeside
 from rosmop.run.outcomes import NOBODY, MessageSender, Outcome
-from rosmop.runtime import safe_messages
 
 if TYPE_CHECKING:
     from appliance.relay.monitors.interceptor import Interceptor
-    from rosmop.form.nodes import SafeMessage
     from rosmop.run.engine import MonitorSet
 
 _LOOK_SECONDS = 0.002
@@ -42,12 +39,22 @@ _MOST_LOOKS = 500
 _QUEUED = struct.Struct("i")
 
 
+class Subscriber(Protocol):
+    """A subscriber, as a test looks at it; see `TopicSubscriber` of `connections/served_subscribers.py`."""
+
+    caller_id: str
+    host: str
+
+    @property
+    def descriptor(self) -> int: ...
+
+
 class Trial(NamedTuple):
-    """What the copy did; `begun` is the real time of the stimulus, `safe` its safe message on the command's topic."""
+    """The acts of the copy; `begun` is the real time of the stimulus, `safe` its safe message for the command."""
 
     tested: GuardTested
     begun: float
-    safe: SafeMessage | None
+    safe: bytes | None
 
 
 class _Copy:
@@ -120,13 +127,12 @@ def tried(
             passed = not act if message.topic == wanted.command else passed
         elif act:
             break
-    safes = copy.monitors.monitor(wanted.monitor).safes
     return Trial(
         GuardTested(
             wanted.number, "", passed, act, (copy.now - at) / 1e9 if act else 0.0, cause, clock.now() - begun
         ),
         begun,
-        safes[wanted.command].safe if wanted.command in safes else None,
+        copy.monitors.safe_message(wanted.monitor, wanted.command, clock.wall_ns()),
     )
 
 
@@ -137,7 +143,7 @@ class GuardTrials:
         self,
         loop: EventLoop,
         interceptor: Interceptor,
-        deliver: Callable[[str, bytes], Sequence[TopicSubscriber]],
+        deliver: Callable[[str, bytes], Sequence[Subscriber]],
         tell: Callable[[Message], None],
     ) -> None:
         self._loop, self._interceptor = loop, interceptor
@@ -182,7 +188,7 @@ class GuardTrials:
         if not (wanted.deliver and tested.passed and tested.act and safe is not None):
             self._tell(tested)
             return
-        members = self._deliver(wanted.command, safe_messages.sent(safe, self._interceptor.now()))
+        members = self._deliver(wanted.command, safe)
         rows = {member: SubscriberReached(member.caller_id, member.host, None, None) for member in members}
         tested = msgspec.structs.replace(tested, reached=[*rows.values()])
         self._follow(tested, trial.begun, rows, era)
@@ -191,7 +197,7 @@ class GuardTrials:
         self,
         tested: GuardTested,
         begun: float,
-        left: dict[TopicSubscriber, SubscriberReached],
+        left: dict[Subscriber, SubscriberReached],
         era: int,
         looks: int = 0,
     ) -> None:

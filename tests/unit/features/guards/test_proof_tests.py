@@ -114,7 +114,7 @@ def test_the_guard_in_force_gets_no_message_of_a_test_and_nothing_is_published()
 
 
 def test_a_guard_that_no_longer_acts_fails_its_test() -> None:
-    """A press that the text ignores is found; a copy that stops the honest motion, too, decides nothing."""
+    """A press that the text ignores is found; a copy that also stops the honest motion decides nothing."""
     text = made("estop", {}, {})
     declared = "event button(bool pressed) stop std_msgs/Bool '{data:pressed}' {"
     deaf = text.replace(declared, f"{declared} pressed = false;")
@@ -214,7 +214,7 @@ def odometry(twist: dict[str, Any]) -> dict[str, Any]:
 async def test_only_a_robot_that_is_known_to_stand_is_tested(
     said: dict[str, list[Any]], refusal: str, tmp_path: Path
 ) -> None:
-    """What is unknown or cannot be read is no standstill; nothing is asked of the relay then."""
+    """Without evidence, or with a message that cannot be read, the relay gets no order."""
     topics = [
         example(Topic, name="/cmd_vel", type="geometry_msgs/Twist", subscribers=["/base"],
                 publishers=[{"node": "/teleop", "messages_per_second": 1.0}]),
