@@ -87,8 +87,8 @@ class Observer:
         self._stopping: dict[tuple[tuple[str, ...], ObservationPoint], bool] = {}
         """Whether the last change that was compared, by its events and point, was a stop: the module only counts."""
         self._causes: dict[str, tuple[int, str]] = {}
-        self._unjudged: dict[str, tuple[int, str]] = {}
-        """By monitor: when a message that it observes was last over its budget, and in words."""
+        self._unjudged: dict[str, dict[str, tuple[int, str]]] = {}
+        """By monitor and topic that it observes: when a message was last over its budget, and in words."""
         self._owed: list[FastPathCounts] = []
 
     def take(self, monitors: MonitorSet) -> None:
@@ -165,6 +165,8 @@ class Observer:
         self._verdicts(outcome, point, observed)
         self._faults(outcome, point, observed)
         for line in outcome.log:
+            if line.text.startswith(CAUSE):  # also with a command to stand, which a stop does not change
+                self._causes[line.monitor] = outcome.time, line.text.removeprefix(CAUSE)
             self.report_line(
                 line.monitor, line.level, line.text, point=point, time=outcome.time, observed=observed
             )
@@ -216,7 +218,7 @@ class Observer:
         """Return why a monitor stops a topic, and who publishes it if that is no sender of the outcome."""
         cause = self._words(outcome, monitor, topic)
         nodes = [] if outcome.timer is None else self._publishers(topic)[:_PUBLISHERS]
-        found = [{"node": one.caller_id, "host": one.host} for one in nodes]
+        found: list[dict[str, object]] = [{"node": one.caller_id, "host": one.host} for one in nodes]
         if outcome.timer is not None and not nodes and (last := self.senders.last(topic)) is not None:
             found = [{"node": last.caller_id, "host": last.host, "ended": True}]
         return {**({"cause": cause} if cause else {}), **({"publishers": found} if found else {})}
@@ -229,29 +231,34 @@ class Observer:
         own = _own_cause(outcome, monitor)
         if faults:
             return f"a message of {topic} could not be judged: {faults[-1]}"
-        if instance.held:
+        if instance.held or instance.broken:
             why = f": {instance.why_held}" if instance.why_held else ""
-            return f"it holds its topics until an operator resumes it{why}"
-        if instance.broken:
-            return "its start had a fault"
-        if instance.awaits and (not own or own.startswith(_SILENCE)):
-            awaited = (
-                f"{self._sender(node, on)} on {on}"
-                for on, source in instance.sources.items()
-                for node in source.awaited
+            return (
+                f"it holds its topics until an operator resumes it{why}"
+                if instance.held
+                else "its start had a fault"
             )
-            return f"no readable message from {', '.join(awaited)} since the guard began again"
-        if own:
-            time, why = self._unjudged.get(monitor, (0, ""))
-            judged = not own.startswith(_SILENCE) or not time or outcome.time - time > _LINE_NS
-            self._causes[monitor] = outcome.time, own if judged else why
-        elif topic in instance.starting:
+        awaited = {
+            on: f"no readable message from {', '.join(self._sender(node, on) for node in source.awaited)} on {on}"
+            " since the guard began again"
+            for on, source in instance.sources.items()
+            if source.awaited
+        }
+        if not own and awaited:
+            return "; ".join(awaited.values())
+        if not own and topic in instance.starting:
             return f"no command on {topic} since {instance.starting[topic]}"
-        said, cause = self._causes.get(monitor, (0, ""))
-        if not said or outcome.time - said > _LINE_NS:
-            return ""
-        self._causes[monitor] = outcome.time, cause  # the stop goes on
-        return cause
+        said, cause = self._causes.get(monitor, (-_LINE_NS, ""))
+        if own or outcome.time - said <= _LINE_NS:
+            self._causes[monitor] = outcome.time, own or cause  # the stop goes on
+            return self._unread(own or cause, monitor, outcome.time, awaited)
+        return ""
+
+    def _unread(self, cause: str, monitor: str, time: int, awaited: Mapping[str, str]) -> str:
+        """Return a cause, or, if it is a silence of a topic whose messages were not read or judged, that instead."""
+        over = {on: why for on, (at, why) in self._unjudged.get(monitor, {}).items() if time - at <= _LINE_NS}
+        found = [why for on, why in {**over, **awaited}.items() if on in cause.split()]
+        return found[0] if found and cause.startswith(_SILENCE) else cause
 
     def _sender(self, node: str, topic: str) -> str:
         if node == "\0":
@@ -488,9 +495,9 @@ class Observer:
         for fault in outcome.faults:
             where = fault.position
             if fault.over and not self._prefix:
-                who = f"{point.caller_id or 'a monitor'}{f' of {point.host}' if point.host else ''}"
-                text = f"a message of {who} on {point.resource} was not judged: {fault.text}"
-                self._unjudged[fault.monitor] = outcome.time, text
+                who, on = self._sender(point.caller_id, point.resource), point.resource
+                why = f"a message of {who} on {on} was not judged: {fault.text}"
+                self._unjudged.setdefault(fault.monitor, {})[on] = outcome.time, why
             if self._acts(fault.monitor):
                 self.failed = f"{fault.monitor} had a fault: {where}: {fault.text}"
             self._observations.note(

@@ -40,6 +40,7 @@ FALSE = re.compile(r"\w+ = |\b(nan|inf|-inf)\b|, or | is not known")
 
 KINDS = {
     "sensor": "sensor_msgs/LaserScan", "separation": "sensor_msgs/LaserScan", "zone": "sensor_msgs/LaserScan",
+    "diagnostics": "diagnostic_msgs/DiagnosticArray",
     "arm": "sensor_msgs/BatteryState", "enable": "std_msgs/Bool", "mode": "std_msgs/Bool",
 }  # fmt: skip
 """The type of `by`, if it is not odometry."""
@@ -111,14 +112,15 @@ class Robot:
         _file, line, column = position.split(":")
         return self._lines - int(line), column
 
-    def keep(self, seconds: float, every: Callable[[], None]) -> None:
+    def keep(self, seconds: float, *steps: "Step") -> None:
         """Do something every 50 ms."""
         for _ in range(round(seconds * 20)):
-            every()
+            then(*steps)(self)
             self.wait(0.05)
 
 
-Case = tuple[str, Mapping[str, object], Callable[[Robot], Any], str]
+Step = Callable[[Robot], None]
+Case = tuple[str, Mapping[str, object], Step, str]
 
 
 def scan(robot: Robot, r: float = 9.0, node: str = "/lidar", **more: Any) -> None:
@@ -134,13 +136,7 @@ def odometry(
     robot.say(given, node, pose__pose__position__x=x, pose__pose__orientation__w=w, twist__twist__linear__x=v)
 
 
-def moving(robot: Robot, see: Callable[[], None], seconds: float = 0.6) -> None:
-    """Let the robot stand and then move, with what the guard wants to see."""
-    robot.keep(0.3, lambda: (see(), robot.drive(0.0)))  # type: ignore[func-returns-value]
-    robot.keep(seconds, lambda: (see(), robot.drive()))  # type: ignore[func-returns-value]
-
-
-def then(*steps: Callable[[Robot], Any]) -> Callable[[Robot], None]:
+def then(*steps: Step) -> Step:
     def run(robot: Robot) -> None:
         for step in steps:
             step(robot)
@@ -148,42 +144,67 @@ def then(*steps: Callable[[Robot], Any]) -> Callable[[Robot], None]:
     return run
 
 
-def driven(see: Callable[[Robot], None]) -> Callable[[Robot], None]:
-    return lambda robot: moving(robot, lambda: see(robot))
+def drive(v: float = 0.2, node: str = "/teleop", **more: object) -> Step:
+    return lambda robot: robot.drive(v, node, **more)
 
 
-def silent(seconds: float = 0.7) -> Callable[[Robot], None]:
+def keep(seconds: float, *steps: Step) -> Step:
+    return lambda robot: robot.keep(seconds, *steps)
+
+
+def driven(*see: Step) -> Step:
+    """Let the robot stand and then move, with what the guard wants to see."""
+    return then(keep(0.3, *see, drive(0)), keep(0.6, *see, drive()))
+
+
+def silent(seconds: float = 0.7) -> Step:
     """Let the evidence be silent while the robot is commanded to move."""
-    return lambda robot: robot.keep(seconds, robot.drive)
+    return keep(seconds, drive())
 
 
-def waits(seconds: float) -> Callable[[Robot], None]:
+def waits(seconds: float) -> Step:
     return lambda robot: robot.wait(seconds)
 
 
-def sees(see: Callable[[Robot], None], seconds: float = 0.4) -> Callable[[Robot], None]:
-    return lambda robot: robot.keep(seconds, lambda: (see(robot), robot.drive()))  # type: ignore[func-returns-value]
+def sees(see: Step, seconds: float = 0.4) -> Step:
+    return keep(seconds, see, drive())
 
 
-def wall(r: float) -> Callable[[Robot], None]:
-    return lambda robot: scan(robot, ranges=[r] * 360)
+def scans(r: float = 9.0, node: str = "/lidar", **more: Any) -> Step:
+    return lambda robot: scan(robot, r, node, **more)
 
 
-def at(x: float, v: float = 0.0, w: float = 1.0) -> Callable[[Robot], None]:
+def wall(r: float) -> Step:
+    return scans(ranges=[r] * 360)
+
+
+def at(x: float, v: float = 0.0, w: float = 1.0) -> Step:
     return lambda robot: odometry(robot, x, v, w=w)
 
 
-def both(v: float = 0.0, other: float = 0.0) -> Callable[[Robot], None]:
-    return lambda robot: (odometry(robot, v=other, given="other", node="/other"), odometry(robot, v=v))  # type: ignore[func-returns-value, return-value]
+def other(v: float = 0.0, node: str = "/other", given: str = "by") -> Step:
+    return lambda robot: odometry(robot, v=v, given=given, node=node)
 
 
-def bool_of(data: bool, given: str = "by", node: str = "/lidar") -> Callable[[Robot], None]:
-    return lambda robot: robot.say(given, node, data=data)
+def both(v: float = 0.0, theirs: float = 0.0) -> Step:
+    return then(other(theirs, given="other"), at(0, v))
 
 
-def battery(
-    left: float = 0.8, *, fix: int = 0, lat: float = 48.0, check: bool = True
-) -> Callable[[Robot], None]:
+def say(given: str, node: str = "/lidar", **fields: object) -> Step:
+    return lambda robot: robot.say(given, node, **fields)
+
+
+def bool_of(data: bool, given: str = "by", node: str = "/lidar") -> Step:
+    return say(given, node, data=data)
+
+
+def statuses(*levels: int, name: str = "motor", node: str = "/lidar") -> Step:
+    """Send an entry with each level; their names differ if there are several."""
+    rows = [{"name": f"{name}{number or ''}", "level": level} for number, level in enumerate(levels)]
+    return say("by", node, status=rows)
+
+
+def battery(left: float = 0.8, *, fix: int = 0, lat: float = 48.0, check: bool = True) -> Step:
     def see(robot: Robot) -> None:
         robot.say("by", "/lidar", percentage=left)
         robot.say("fix", "/other", status__status=fix, latitude=lat, longitude=11.0)
@@ -192,7 +213,7 @@ def battery(
     return see
 
 
-def nine(given: str, node: str = "/lidar", **fields: object) -> Callable[[Robot], None]:
+def nine(given: str, **fields: object) -> Step:
     def see(robot: Robot) -> None:
         for number in range(9):
             HOSTS.setdefault(f"/n{number}", "10.0.1.1")
@@ -201,18 +222,13 @@ def nine(given: str, node: str = "/lidar", **fields: object) -> Callable[[Robot]
     return see
 
 
-def manual(robot: Robot) -> None:
-    robot.say("by", "/lidar", data=True)
-
-
 def pressed(robot: Robot) -> None:
     robot.say("stop", "/lidar", data=True)
     robot.wait(0.01)
 
 
 def held(robot: Robot) -> None:
-    robot.say("by", "/lidar", data=False)
-    moving(robot, lambda: robot.say("by", "/lidar", data=True))
+    then(bool_of(False), driven(bool_of(True)))(robot)
 
 
 def crossed(robot: Robot) -> None:
@@ -229,25 +245,25 @@ INTRUDER = f"{OTHER} also publishes on {{}}, last 0.00 s ago (limit 1 s)"
 NOT_FINITE = f"{TELEOP} commands a velocity that is not a finite number"
 ZERO_FIRST = f"{TELEOP} must command zero before its motion passes"
 STAND_FIRST = "the base stands, and a command to stand must come before a motion"
-SCAN, ODOM = "/scan", "/odom"
+SCAN, ODOM, DIAGNOSTICS = "/scan", "/odom", "/diagnostics"
 CASES: list[Case] = [
     (
         "sane",
         {},
-        lambda one: one.drive(math.nan),
+        drive(math.nan),
         f"the linear velocity that {TELEOP} commands is not a finite number",
     ),
     (
         "sane",
         {},
-        lambda one: one.drive(0, angular__z=math.inf),
+        drive(0, angular__z=math.inf),
         f"the angular velocity that {TELEOP} commands is not a finite number",
     ),
-    ("speed", {}, lambda one: one.drive(math.nan), NOT_FINITE),
+    ("speed", {}, drive(math.nan), NOT_FINITE),
     (
         "speed",
         {"vMax": 0},
-        lambda one: one.drive(0.5),
+        drive(0.5),
         f"{TELEOP} commands 0.50 m/s and 0.00 rad/s, which may not grow from"
         " zero within 0.100 s (limits 0 m/s and 1 rad/s)",
     ),
@@ -257,13 +273,13 @@ CASES: list[Case] = [
     (
         "sensor",
         {},
-        then(driven(scan), lambda one: scan(one, node="/other"), sees(scan, 0.05)),
+        then(driven(scan), scans(node="/other"), sees(scan, 0.05)),
         INTRUDER.format(SCAN),
     ),
     (
         "sensor",
         {"frozen": 3},
-        sees(lambda one: scan(one, ranges=[1.0] * 360), 2),
+        sees(scans(ranges=[1.0] * 360), 2),
         f"{LIDAR} repeated its values on /scan 23 times (limit 3)",
     ),
     (
@@ -293,7 +309,7 @@ CASES: list[Case] = [
     (
         "overspeed",
         {},
-        then(driven(at(0)), lambda one: odometry(one, node="/other"), waits(0.1)),
+        then(driven(at(0)), other(), waits(0.1)),
         INTRUDER.format(ODOM).replace("0.00", "0.02"),
     ),
     ("standstill", {}, silent(), NONE_YET.format(ODOM)),
@@ -302,16 +318,14 @@ CASES: list[Case] = [
     (
         "standstill",
         {},
-        then(driven(at(0)), lambda one: one.keep(1.2, lambda: (one.drive(0), at(0, 0.3)(one)))),  # type: ignore[func-returns-value]
+        then(driven(at(0)), keep(1.2, drive(0), at(0, 0.3))),
         "the base moves with 0.30 m/s and 0.00 rad/s (limit 0.05 m/s and rad/s) although no motion is commanded for"
         f" 1.02 s (limit 1 s), as {LIDAR} measures it on /odom",
     ),
     (
         "standstill",
         {},
-        then(
-            driven(at(0)), lambda one: one.drive(0), lambda one: one.keep(1.2, lambda: at(0)(one)), at(0, 0.3)
-        ),
+        then(driven(at(0)), drive(0), keep(1.2, at(0)), at(0, 0.3)),
         "the base moves with 0.30 m/s and 0.00 rad/s (limit 0.05 m/s and rad/s) although no motion is commanded for"
         f" 1.20 s (limit 1 s), as {LIDAR} measures it on /odom",
     ),
@@ -355,7 +369,7 @@ CASES: list[Case] = [
     (
         "agree",
         {},
-        then(driven(both()), lambda one: odometry(one, node="/other"), waits(0.1)),
+        then(driven(both()), other(), waits(0.1)),
         INTRUDER.format(ODOM).replace("0.00", "0.02"),
     ),
     ("arm", {}, silent(), NONE_YET.format("/battery_state")),
@@ -395,57 +409,63 @@ CASES: list[Case] = [
     (
         "arm",
         {"needCheck": True, "silent": 0.5},
-        sees(lambda one: one.say("by", "/lidar", percentage=0.9)),
+        sees(say("by", percentage=0.9)),
         NONE_YET.format("/preflight"),
     ),
     (
         "deadman",
         {},
-        lambda one: one.drive(),
+        drive(),
         f"{TELEOP} commands for 0.00 s without a pause (a motion passes after 0.2 s)",
     ),
     (
         "deadman",
         {},
-        lambda one: (one.drive(), one.wait(0.4)),
+        then(drive(), waits(0.4)),
         f"{TELEOP} commands for 0.00 s without a pause (a motion passes after 0.2 s)",
     ),
     (
         "deadman",
         {},
-        then(driven(lambda _: None), waits(0.38)),
+        then(driven(), waits(0.38)),
         f"{TELEOP} commanded a motion on /cmd_vel, and nothing for 0.31 s since (limit 0.3 s)",
     ),
     (
         "deadman",
         {},
-        then(driven(lambda _: None), waits(2.1)),
+        then(driven(), waits(2.1)),
         f"{TELEOP} commanded a motion on /cmd_vel, and nothing for 0.31 s since (limit 0.3 s)",
     ),
     (
         "deadman",
         {},
         then(
-            lambda one: one.keep(0.6, lambda: (one.drive(), one.drive(0.1, "/nav"))),
-            ONCE,  # type: ignore[func-returns-value]
-            lambda one: one.drive(0.1, "/third"),
+            keep(0.6, drive(), drive(0.1, "/nav")),
+            ONCE,
+            drive(0.1, "/third"),
         ),
         f"/third of 10.0.0.9 commands a motion, and so do {TELEOP} and /nav of 10.0.0.8 (limit 2 nodes)",
     ),
     ("estop", {}, silent(0.2), NONE_YET.format("/emergency_stop")),
     ("estop", {"silent": 0}, silent(0.2), "no button has sent a message on /emergency_stop"),
+    (
+        "estop",
+        {"publishers": 2},
+        sees(bool_of(False, "stop")),
+        "1 of 2 buttons have sent a message on /emergency_stop",
+    ),
     ("estop", {}, pressed, f"{LIDAR} is pressed on /emergency_stop"),
     ("estop", {}, then(pressed, silent(0.2)), f"{LIDAR} is pressed on /emergency_stop"),
     (
         "estop",
         {},
-        then(pressed, lambda one: one.keep(1.5, lambda: bool_of(False, "stop")(one))),
+        then(pressed, keep(1.5, bool_of(False, "stop"))),
         "all buttons on /emergency_stop are released, and a reset by a node on /emergency_stop_reset is awaited",
     ),
     (
         "estop",
         {"twoHands": True},
-        then(pressed, lambda one: one.keep(1.5, lambda: bool_of(False, "stop")(one))),
+        then(pressed, keep(1.5, bool_of(False, "stop"))),
         "all buttons on /emergency_stop are released, and a reset by two nodes on /emergency_stop_reset is awaited",
     ),
     ("estop", {}, sees(bool_of(False, "stop")), ZERO_FIRST),
@@ -457,6 +477,7 @@ CASES: list[Case] = [
     ),
     ("estop", {}, then(nine("stop", data=False), ONCE), "nine nodes publish on /emergency_stop (limit 8)"),
     ("enable", {}, silent(0.2), NONE_YET.format("/enable")),
+    ("enable", {"publishers": 2}, held, "1 of 2 enabling devices have sent a message on /enable"),
     ("enable", {}, sees(bool_of(True)), f"{LIDAR} must be let go on /enable once before it counts as held"),
     ("enable", {}, then(held, bool_of(False)), f"{LIDAR} is let go on /enable"),
     ("enable", {}, then(held, waits(0.4)), SILENT.format("/enable", "0.31", "0.3")),
@@ -471,13 +492,13 @@ CASES: list[Case] = [
     (
         "mode",
         {"vMax": 0, "wMax": 0},
-        sees(manual),
+        sees(bool_of(True)),
         f"{LIDAR} says manual mode on /manual (limits 0 m/s and 0 rad/s)",
     ),
     (
         "mode",
         {"vMax": 0.1},
-        then(driven(bool_of(False)), manual),
+        then(driven(bool_of(False)), bool_of(True)),
         f"{LIDAR} says manual mode on /manual (limits 0.1 m/s and 0.5 rad/s)",
     ),
     (
@@ -493,12 +514,51 @@ CASES: list[Case] = [
         f"{TELEOP} commands 0.20 m/s and 0.00 rad/s, and has not been slow in"
         " automatic mode (limits 0 m/s and 0 rad/s)",
     ),
-    ("mode", {"vMax": 0.1}, lambda one: one.drive(math.nan), NOT_FINITE),
+    (
+        "mode",
+        {"vMax": 0, "wMax": 0, "publishers": 2},
+        sees(bool_of(False)),
+        "1 of 2 nodes say the mode on /manual, so it is manual (limits 0 m/s and 0 rad/s)",
+    ),
+    ("mode", {"vMax": 0.1}, drive(math.nan), NOT_FINITE),
     (
         "mode",
         {"vMax": 0.1},
         then(driven(bool_of(False)), nine("by", data=False)),
         "nine nodes publish on /manual (limit 8), so the mode is manual (limits 0.1 m/s and 0.5 rad/s)",
+    ),
+    ("diagnostics", {}, silent(0.2), NONE_YET.format(DIAGNOSTICS)),
+    ("diagnostics", {}, sees(statuses()), "no entry on /diagnostics has come whose name begins with ''"),
+    (
+        "diagnostics",
+        {"named": "laser, hardware_id:7*"},
+        sees(statuses(0, name="laser")),
+        "no entry on /diagnostics has come whose hardware_id begins with '7'",
+    ),
+    ("diagnostics", {}, sees(statuses(0)), ZERO_FIRST),
+    (
+        "diagnostics",
+        {},
+        then(driven(statuses(0)), statuses(2)),
+        f"motor from {LIDAR} on /diagnostics is at level 2 (limit 1)",
+    ),
+    (
+        "diagnostics",
+        {"warnings": True},
+        sees(statuses(0, 1)),
+        f"motor1 from {LIDAR} on /diagnostics is at level 1 (limit 0)",
+    ),
+    (
+        "diagnostics",
+        {"silent": 0.5},
+        then(driven(statuses(0)), waits(0.6)),
+        f"no message with motor from {LIDAR} on /diagnostics for 0.51 s (limit 0.5 s)",
+    ),
+    (
+        "diagnostics",
+        {},
+        sees(statuses(*[0] * 65)),
+        "more than 64 entries on /diagnostics have these names; set forget to another number",
     ),
     ("fence", {}, silent(0.2), NONE_YET.format(ODOM)),
     ("fence", {}, then(driven(at(0)), waits(0.6)), SILENT.format(ODOM, "0.51", "0.5")),
@@ -525,11 +585,11 @@ CASES: list[Case] = [
         "the base is 0.25 m from the fence, at 1.75 and 0.00 m, and could come nearer than"
         " 0.2 m with 0.20 m/s before the next position",
     ),
-    ("fence", {}, sees(lambda one: (at(0)(one), one.drive(math.inf))), NOT_FINITE),  # type: ignore[func-returns-value, arg-type, return-value]
+    ("fence", {}, sees(then(at(0), drive(math.inf))), NOT_FINITE),
     (
         "fence",
         {},
-        then(driven(at(0)), lambda one: odometry(one, node="/other"), waits(0.1)),
+        then(driven(at(0)), other(), waits(0.1)),
         INTRUDER.format(ODOM).replace("0.00", "0.02"),
     ),
     ("separation", {}, silent(0.2), NONE_YET.format(SCAN)),
@@ -551,9 +611,8 @@ CASES: list[Case] = [
     (
         "separation",
         {"sector": 1},
-        sees(lambda one: (scan(one), one.drive(-0.2))),
-        "the way of 0.20 m/s is outside the sector of the"  # type: ignore[func-returns-value, arg-type, return-value]
-        f" scanner, {LIDAR} on /scan (limit 0 m/s)",
+        sees(then(scan, drive(-0.2))),
+        f"the way of 0.20 m/s is outside the sector of the scanner, {LIDAR} on /scan (limit 0 m/s)",
     ),
     (
         "separation",
@@ -562,11 +621,11 @@ CASES: list[Case] = [
         "0.45 m are known to be free in the way, and a motion needs more than"
         f" 0.77 m, by the scan from {LIDAR} on /scan",
     ),
-    ("separation", {}, lambda one: one.drive(math.nan), NOT_FINITE),
+    ("separation", {}, drive(math.nan), NOT_FINITE),
     (
         "separation",
         {},
-        then(driven(scan), lambda one: scan(one, node="/other"), waits(0.1)),
+        then(driven(scan), scans(node="/other"), waits(0.1)),
         INTRUDER.format(SCAN).replace("0.00", "0.02"),
     ),
     ("zone", {}, silent(0.2), NONE_YET.format(SCAN)),
@@ -587,13 +646,13 @@ CASES: list[Case] = [
     (
         "zone",
         {},
-        sees(lambda one: scan(one, angle_increment=0.0)),
+        sees(scans(angle_increment=0.0)),
         f"{LIDAR} sends scans on /scan whose angles or ranges are not valid",
     ),
     (
         "zone",
         {},
-        sees(lambda one: scan(one, angle_min=0.0, ranges=[9.0] * 9)),
+        sees(scans(angle_min=0.0, ranges=[9.0] * 9)),
         f"the rays from {LIDAR} on /scan do not cover the zone",
     ),
     (
@@ -602,7 +661,7 @@ CASES: list[Case] = [
         then(crossed, wall(0.6), waits(0.1)),
         f"83 rays from {LIDAR} on /scan end in the zone or before it, and 0 are not valid (limit 3)",
     ),
-    ("zone", {}, lambda one: one.drive(math.nan), NOT_FINITE),
+    ("zone", {}, drive(math.nan), NOT_FINITE),
 ]
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from lab.closed_loop.messages import steering
+from lab.closed_loop.messages import ACKERMANN, steering
 from rosmop.tests.acting import message
 from rosmop.tests.examples import examples, sample
 from tests.unit.features.guards.guarding import (
@@ -13,7 +13,7 @@ from tests.unit.features.guards.guarding import (
     seeded,
     twist,
 )
-from tests.unit.features.guards.limit_oracles import ACKERMANN, struct_of
+from tests.unit.features.guards.limit_oracles import struct_of
 
 STILL = twist()
 

@@ -299,7 +299,9 @@ def test_a_stop_is_marked_and_has_its_cause(kind: str, *, together: bool) -> Non
     assert all(event.safe for event in counts)
     assert 1 + sum(event.count for event in counts) == (30 if kind == "change" else 3)
     assert first.detail["cause"] == (
-        "too fast: 5.0" if kind == "change" else "it holds its topics until an operator resumes it: its state is lost"
+        "too fast: 5.0"
+        if kind == "change"
+        else "it holds its topics until an operator resumes it: its state is lost"
     )
     told.monitored.close()
 
