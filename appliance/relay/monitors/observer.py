@@ -241,18 +241,17 @@ class Observer:
         awaited = {
             on: f"no readable message from {', '.join(self._sender(node, on) for node in source.awaited)} on {on}"
             " since the guard began again"
-            for on, source in instance.sources.items()
+            for on, source in sorted(instance.sources.items(), key=lambda each: not each[1].unreadable)
             if source.awaited
         }
-        if not own and awaited:
-            return "; ".join(awaited.values())
-        if not own and topic in instance.starting:
-            return f"no command on {topic} since {instance.starting[topic]}"
         said, cause = self._causes.get(monitor, (-_LINE_NS, ""))
-        if own or outcome.time - said <= _LINE_NS:
+        waits = instance.blocks or topic in instance.starting
+        if own or (not waits and outcome.time - said <= _LINE_NS):
             self._causes[monitor] = outcome.time, own or cause  # the stop goes on
             return self._unread(own or cause, monitor, outcome.time, awaited)
-        return ""
+        if awaited:
+            return next(iter(awaited.values()))
+        return f"no command on {topic} since {instance.starting[topic]}" if topic in instance.starting else ""
 
     def _unread(self, cause: str, monitor: str, time: int, awaited: Mapping[str, str]) -> str:
         """Return a cause, or, if it is a silence of a topic whose messages were not read or judged, that instead."""

@@ -25,7 +25,7 @@ WANTED = {
     "deadman": "/left of {host} commanded a motion on /a/cmd_vel, and nothing for 0.3\\d s since \\(limit 0.3 s\\)",
     "never": "no message on /never since the guard began",
     "sensor": "no message from /sensors of {host} on /scan for 0.5\\d s \\(limit 0.5 s\\)",
-    "separation": "0.46 m are known to be free in the way, and a motion needs more than [01].\\d\\d m, by the scan"
+    "separation": "0.45 m are known to be free in the way, and a motion needs more than [01].\\d\\d m, by the scan"
     " from /near of {host} on /near_scan",
 }
 

@@ -15,7 +15,8 @@ from appliance.channel.messages import MonitorEvent, MonitorsReported
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.relay.monitors.observation_points import ObservationPoint, ObservedMessage
 from rosmop.form import nodes
-from rosmop.run.outcomes import MessageSender
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Fault, MessageSender, Outcome
 from rosmop.tests.acting import message
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.relay.monitors.quiet import QuietMonitors
@@ -65,10 +66,11 @@ class Robot:
     def say(self, given: str, node: str, **fields: object) -> None:
         by = KINDS.get(self.preset, "nav_msgs/Odometry")
         kind = by if given == "by" else OTHERS.get(given, "std_msgs/Bool")
-        data = message("geometry_msgs/Twist" if given == "command" else kind, **fields)
+        self.send(given, node, message("geometry_msgs/Twist" if given == "command" else kind, **fields))
+
+    def send(self, given: str, node: str, data: bytes) -> None:
         point = ObservationPoint("key", self.topics[given], HOSTS[node], node)
-        interceptor, monitors = self.interceptor, self.interceptor.monitors
-        assert monitors is not None
+        interceptor, monitors = self.interceptor, monitors_of(self)
         sender = MessageSender(interceptor.senders.number(point))
         outcome = monitors.process(point.resource, bytearray(data), interceptor.now(), sender)
         interceptor.observer.report(outcome, point)
@@ -82,9 +84,7 @@ class Robot:
         """Let time pass; a relay reports each second."""
         for _ in range(round(seconds * 100)):
             self._time.advance(0.01)
-            monitors = self.interceptor.monitors
-            assert monitors is not None
-            for outcome in monitors.advance(self.interceptor.now()):
+            for outcome in monitors_of(self).advance(self.interceptor.now()):
                 self.interceptor.observer.report(outcome, ObservationPoint("", ""))
         self.collect()
 
@@ -245,6 +245,7 @@ INTRUDER = f"{OTHER} also publishes on {{}}, last 0.00 s ago (limit 1 s)"
 NOT_FINITE = f"{TELEOP} commands a velocity that is not a finite number"
 ZERO_FIRST = f"{TELEOP} must command zero before its motion passes"
 STAND_FIRST = "the base stands, and a command to stand must come before a motion"
+NOT_VALID = f"0 of 360 values from {LIDAR} on /scan are valid (at least one and 10 % must be)"
 SCAN, ODOM, DIAGNOSTICS = "/scan", "/odom", "/diagnostics"
 CASES: list[Case] = [
     (
@@ -286,7 +287,7 @@ CASES: list[Case] = [
         "sensor",
         {},
         sees(wall(99.0)),
-        f"0 of 360 values from {LIDAR} on /scan are valid (at least one and 10 % must be)",
+        NOT_VALID,
     ),
     ("overspeed", {}, silent(), NONE_YET.format(ODOM)),
     ("overspeed", {}, sees(at(0)), STAND_FIRST),
@@ -674,8 +675,7 @@ def time() -> Iterator[VirtualClock]:
 
 def stops_of(robot: Robot) -> set[tuple[int, str]]:
     """Return the places of `STOP` in the guard's text."""
-    monitors = robot.interceptor.monitors
-    assert monitors is not None
+    monitors = monitors_of(robot)
     found = (
         node.site
         for function in monitors.compiled.functions.values()
@@ -704,3 +704,101 @@ def test_each_stop_has_a_true_sentence_as_its_cause(preset: str, time: VirtualCl
         ]
     assert not wrong, "\n".join(wrong)
     assert missing == set()
+
+
+def monitors_of(robot: Robot) -> MonitorSet:
+    monitors = robot.interceptor.monitors
+    assert monitors is not None
+    return monitors
+
+
+def garbage(given: str = "by", node: str = "/lidar") -> Step:
+    """Send bytes that are no message."""
+    return lambda robot: robot.send(given, node, b"\xff" * 7)
+
+
+def over_budget(robot: Robot) -> None:
+    """Report a scan that was not judged."""
+    outcome = Outcome(bytearray(), robot.interceptor.now())
+    position = monitors_of(robot).monitor("guard").code.position
+    outcome.faults = (Fault("guard", position, "it took too long", {}, over=True),)
+    point = ObservationPoint("key", SCAN, HOSTS["/lidar"], "/lidar")
+    robot.interceptor.observer.report(outcome, point)
+
+
+def held_by_relay(robot: Robot) -> None:
+    monitors_of(robot).hold(monitors_of(robot).monitor("guard"), "its file is lost")
+    robot.wait(0.2)
+
+
+def begun(robot: Robot) -> None:
+    for enabled in (False, True):
+        monitors_of(robot).switch({"guard": enabled}, robot.interceptor.now())
+    robot.wait(0.2)
+
+
+def stopped_by_operator(robot: Robot) -> None:
+    monitors_of(robot).stop("/cmd_vel")
+    robot.wait(0.2)
+
+
+UNREAD = "no readable message from {} on {} since the guard began again"
+OF_RELAY: list[Case] = [
+    ("sensor", {}, begun, "no command on /cmd_vel since the guard began"),
+    ("sensor", {}, stopped_by_operator, "no command on /cmd_vel since an operator stopped it"),
+    (
+        "sensor",
+        {},
+        then(driven(scan), held_by_relay),
+        "it holds its topics until an operator resumes it: its file is lost",
+    ),
+    ("sensor", {}, then(driven(scan), garbage(), silent(0.2)), UNREAD.format(LIDAR, SCAN)),
+    (
+        "mode",
+        {},
+        then(bool_of(False), garbage(), waits(0.2)),
+        UNREAD.format(LIDAR, "/manual"),
+    ),
+    (
+        "enable",
+        {},
+        then(bool_of(False), bool_of(False, node="/other"), garbage(), waits(0.2)),
+        UNREAD.format(f"{LIDAR}, {OTHER}", "/enable"),
+    ),
+    (
+        "arm",
+        {"needFix": True},
+        then(driven(battery()), garbage("fix", "/other"), waits(0.2)),
+        UNREAD.format(OTHER, "/fix"),
+    ),
+    (
+        "arm",
+        {"needFix": True},
+        then(driven(battery()), garbage("fix", "/other"), sees(say("by", percentage=0.8))),
+        UNREAD.format(OTHER, "/fix"),
+    ),
+    (
+        "arm",
+        {},
+        then(driven(battery()), garbage("fix", "/other"), sees(say("by", percentage=0.1))),
+        f"{LIDAR} reports a charge of 0.1 on /battery_state (limits 0.2 and 1)",
+    ),
+    (
+        "sensor",
+        {},
+        then(driven(scan), keep(0.6, over_budget)),
+        f"a message of {LIDAR} on /scan was not judged: it took too long",
+    ),
+    ("sensor", {}, then(driven(scan), over_budget, sees(wall(99.0))), NOT_VALID),
+    ("sensor", {}, then(driven(scan), over_budget, waits(3), drive()), SILENT.format(SCAN, "3.05", "0.5")),
+]
+
+
+@pytest.mark.parametrize(("preset", "values", "script", "wanted"), OF_RELAY)
+def test_the_relay_says_why_a_guard_cannot_judge(
+    preset: str, values: Mapping[str, object], script: Step, wanted: str, time: VirtualClock
+) -> None:
+    """A silence of a topic is not said of messages that came; each other sentence of the guard stays."""
+    robot = Robot(preset, time, **values)
+    script(robot)
+    assert robot.cause() == wanted
