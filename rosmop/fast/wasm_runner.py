@@ -101,6 +101,8 @@ class ModuleState:
         self._running = running
         self._throttles = throttles
         self._senders, self._turn = senders, interpreter.turn
+        self._named: tuple[bytes, bytes] | None = None
+        """The names that the module has of the sender."""
         variables = dict(sorted(cells.variables.items(), key=lambda item: item[1][0]))
         self._names = [*variables]
         self._addresses = {name: address for name, (address, _kind) in variables.items()}
@@ -133,8 +135,11 @@ class ModuleState:
         self.prepared = prepared
         self.machine.refuel(FUEL)
         self._memory[self._source : self._source + _PREPARED.size] = packed(prepared)
+        if not self._senders or (names := self._turn.names(prepared.source)) == self._named:
+            return
+        self._named = names
         for address in self._senders:
-            names, room = self._turn.names(prepared.source), address + _SPANS.size
+            room = address + _SPANS.size
             words = [
                 entered(self._memory, name, room + place * MOST_KEPT, value_types.STRING)
                 for place, name in enumerate(names)

@@ -447,7 +447,7 @@ CASES: list[Case] = [
         ),
         f"/third of 10.0.0.9 commands a motion, and so do {TELEOP} and /nav of 10.0.0.8 (limit 2 nodes)",
     ),
-    ("estop", {}, silent(0.2), NONE_YET.format("/emergency_stop")),
+    ("estop", {}, silent(0.2), "no button has sent a message on /emergency_stop"),
     ("estop", {"silent": 0}, silent(0.2), "no button has sent a message on /emergency_stop"),
     (
         "estop",
@@ -477,7 +477,7 @@ CASES: list[Case] = [
         SILENT.format("/emergency_stop", "1.05", "1"),
     ),
     ("estop", {}, then(nine("stop", data=False), ONCE), "nine nodes publish on /emergency_stop (limit 8)"),
-    ("enable", {}, silent(0.2), NONE_YET.format("/enable")),
+    ("enable", {}, silent(0.2), "no enabling device has sent a message on /enable"),
     ("enable", {"publishers": 2}, held, "1 of 2 enabling devices have sent a message on /enable"),
     ("enable", {}, sees(bool_of(True)), f"{LIDAR} must be let go on /enable once before it counts as held"),
     ("enable", {}, then(held, bool_of(False)), f"{LIDAR} is let go on /enable"),
@@ -488,7 +488,7 @@ CASES: list[Case] = [
         "mode",
         {"vMax": 0, "wMax": 0},
         silent(0.2),
-        NONE_YET.format("/manual") + ", so the mode is manual (limits 0 m/s and 0 rad/s)",
+        "no node says the mode on /manual, so it is manual (limits 0 m/s and 0 rad/s)",
     ),
     (
         "mode",
