@@ -149,6 +149,7 @@ class Running:
 
     def __init__(self, preset: Preset, text: str) -> None:
         self._topics = preset.given_topics
+        self._prepared: dict[tuple[FastLane, int], BatchOptions] = {}
         self._monitors: MonitorSet = on_its_module(part_of(text))
         self._monitors.name_senders(lambda source: (f"10.0.0.{source}", f"/node{source}"))
         self._monitors.start(0)
@@ -168,9 +169,13 @@ class Running:
             outcome = self._monitors.process(topic, buffer, now, MessageSender(source))
         return time.thread_time_ns() - began, outcome
 
-    @staticmethod
-    def _options(lane: FastLane, source: int) -> BatchOptions:
-        return lane.prepare(loud=False, told=[True] * len(lane.events), source=source)
+    def _options(self, lane: FastLane, source: int) -> BatchOptions:
+        """Return the options that a relay keeps for each publisher."""
+        found = self._prepared.get((lane, source))
+        if found is None:
+            found = lane.prepare(loud=False, told=[True] * len(lane.events), source=source)
+            self._prepared[lane, source] = found
+        return found
 
 
 def measured(row: Row, guards: list[Running]) -> tuple[list[float], str]:

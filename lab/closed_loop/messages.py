@@ -106,7 +106,7 @@ def boolean(on: bool) -> bytes:
 
 @functools.cache
 def diagnostics(level: int) -> bytes:
-    """Return an entry; nodes that say it are told apart."""
+    """Return an entry, the same for each node."""
     return message("diagnostic_msgs/DiagnosticArray", status=[{"name": "motor", "level": level}])
 
 

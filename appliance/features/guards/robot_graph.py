@@ -1,7 +1,7 @@
 """Read from the graph which topics command a base or an arm, and which sources belong to the same robot.
 
-1. Direction decides before names: a driver subscribes to a command, and does not pass it on to another command. What a
-   driver subscribes to is a command, and a velocity that a driver reports is none.
+1. Direction decides before names: a driver subscribes to a command, and does not pass it on to another command. A
+   velocity that a driver subscribes to is a command, and one that it reports is not.
 2. A source below the namespace of another robot never belongs to this one. A source below no robot's namespace
    belongs to the only robot, or to the one whose nodes use it.
 3. An undecided source belongs to no robot; callers report it.
@@ -378,7 +378,7 @@ class RobotGraph:
     def _moves_an_arm(self, command: TopicFacts) -> bool:
         if _NOT_A_BASE.search(command.name):
             return True
-        if command.name.endswith("/cmd_vel"):  # of a base with legs, too
+        if command.name.endswith("/cmd_vel"):  # also of a base with legs
             return False
         drivers = self.drivers(command)
         measured = any(self.publishes(node, POSES) for node in drivers)

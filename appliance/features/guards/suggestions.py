@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from appliance.base.counted import counted
 from appliance.features.guards import robot_graph as types
 from appliance.features.guards.presets import PRESETS
 from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, SIDE, RobotGraph, TopicFacts
@@ -363,7 +364,7 @@ class _Writer:
         if len(button.publishers) > 1:
             self._say(
                 f"{button.name} comes from {', '.join(button.publishers[:_MOST_NAMED])}: {preset} waits for"
-                f" {len(button.publishers)} nodes; if not each is a button, set publishers"
+                f" {counted(len(button.publishers), 'node')}; if not each is a button, set publishers"
             )
         if not button.rate and not button.subscribers:
             self._say(
@@ -653,7 +654,7 @@ def _slug(topic: str) -> str:
 
 
 def _publishers(topic: TopicFacts) -> dict[str, str]:
-    """Return how many nodes have to be heard, if a guard can know so many."""
+    """Return the number of nodes that have to be heard, if a guard can know all of them."""
     return {"publishers": f"{len(topic.publishers)}"} if len(topic.publishers) <= _MOST_PUBLISHERS else {}
 
 

@@ -215,7 +215,7 @@ class Observer:
         return bool(self._monitors and not self._prefix and self._monitors.only_stops(event))
 
     def _cause(self, outcome: Outcome, monitor: str, topic: str) -> Mapping[str, object]:
-        """Return why a monitor stops a topic, and who publishes it if that is no sender of the outcome."""
+        """Return why a monitor stops a topic, and its publishers, if a timer led to it."""
         cause = self._words(outcome, monitor, topic)
         nodes = [] if outcome.timer is None else self._publishers(topic)[:_PUBLISHERS]
         found: list[dict[str, object]] = [{"node": one.caller_id, "host": one.host} for one in nodes]

@@ -1,4 +1,4 @@
-"""The cause of a stop is the same true sentence in each place that tells it, also when the node has ended."""
+"""The cause of a stop is the same true sentence in each place that tells it, and names a node that has ended."""
 
 import json
 import math

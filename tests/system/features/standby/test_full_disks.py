@@ -121,7 +121,7 @@ def test_a_full_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> Non
 def test_two_nearly_full_disks(site: StandbySite, robot: StandbyRobot) -> None:
     """The lease does not go to and fro: while neither can serve, and after it has gone both ways.
 
-    What is left may be written before the next look at the disk: then it is full, and called so.
+    The rest may be written before the next look at the disk: then it is full, and called so.
     """
 
     def reports(name: str, pattern: str) -> None:

@@ -37,7 +37,7 @@ HOSTS = {
 }
 TELEOP, LIDAR, OTHER = (f"{node} of {HOSTS[node]}" for node in ("/teleop", "/lidar", "/other"))
 FALSE = re.compile(r"\w+ = |\b(nan|inf|-inf)\b|, or | is not known")
-"""What no sentence has: a dump of variables, numbers that are none, a list of suspects."""
+"""No sentence has these: a dump of variables, numbers that are none, a list of suspects."""
 
 KINDS = {
     "sensor": "sensor_msgs/LaserScan", "separation": "sensor_msgs/LaserScan", "zone": "sensor_msgs/LaserScan",
@@ -713,7 +713,7 @@ def monitors_of(robot: Robot) -> MonitorSet:
 
 
 def garbage(given: str = "by", node: str = "/lidar") -> Step:
-    """Send bytes that are no message."""
+    """Send bytes that are not a message."""
     return lambda robot: robot.send(given, node, b"\xff" * 7)
 
 

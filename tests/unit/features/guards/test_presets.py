@@ -121,7 +121,7 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
     assert {one.topic for one in code.events if one.topic} == {"/base/cmd", "/pose"}
 
 
-def test_a_name_of_an_entry_is_no_topic() -> None:
+def test_a_name_of_an_entry_is_not_a_topic() -> None:
     text = text_of(Guard("guard", PRESETS["diagnostics"], values={"named": " /Robot/*,Battery: (A) "}))
     assert topics_in(text) == {"command": "/cmd_vel", "by": "/diagnostics"}
     assert values_in(text)["named"] == "/Robot/*,Battery: (A)"
