@@ -199,7 +199,7 @@ class EnableWorld(SwitchWorld):
 
 
 class DiagnosticsWorld(EnableWorld):
-    """Parts of a base that are well, at ERROR or silent: each is like a device that does not have to be let go first."""
+    """Parts of a base that are well, at ERROR or silent: each is a device that need not be let go first."""
 
     preset: ClassVar[str] = "diagnostics"
 

@@ -270,7 +270,7 @@ class GuardOrders:
         switches = self._monitors.switches
         return GuardsState(
             len(guards),
-            [ActingGuard(name, since) for name, since in self._acting_since.items()],
+            [ActingGuard(name, since, self._cause(name)) for name, since in self._acting_since.items()],
             place.elsewhere,
             place.bypassed,
             place.unanswered,
@@ -488,6 +488,11 @@ class GuardOrders:
         """Return how often the guard acted, or would have acted in shadow mode."""
         before = "shadow " if self._monitors.switches.in_shadow(name) else ""
         return sum(self._monitors.records.counts[f"{before}{kind}", name] for kind in _ACTS)
+
+    def _cause(self, name: str) -> str:
+        """Return why a guard stops the robot now, or an empty text."""
+        stops = self._monitors.records.stops
+        return stops.last[name].present if stops.goes_on(name) else ""
 
     def _last_stop(self, name: str) -> LastStop | None:
         stops = self._monitors.records.stops

@@ -20,6 +20,7 @@ class ActingGuard(msgspec.Struct, frozen=True):
 
     name: Annotated[str, doc("the guard")]
     since: Annotated[Moment, doc("it has done so since then, without a pause of 2 seconds")]
+    cause: Annotated[str, doc("why it stops the robot now, or empty while it only limits it")] = ""
 
 
 class BypassedGuard(msgspec.Struct, frozen=True):
@@ -126,7 +127,10 @@ def _line(state: GuardsState) -> tuple[str, Pieces]:
     """Return the guards; a stop is red in its first seconds only: later it holds a robot that stands."""
     now = clock.wall()
     acting = [
-        (f"; {_since(guard)}", "bold red" if 0 <= now - guard.since < _BEGINS_SECONDS else "")
+        (
+            f"; {_since(guard)}{guard.cause and f': {guard.cause}'}",
+            "bold red" if 0 <= now - guard.since < _BEGINS_SECONDS else "",
+        )
         for guard in state.acting
     ]
     return "guards", [(f"{state.loaded} loaded", ""), *acting]

@@ -78,6 +78,11 @@ def test_a_stop_has_its_cause_in_each_place(
         publishers = begun["deadman"]["detail"]["publishers"]
         assert [(one["node"], one["host"]) for one in publishers] == [("/left", common_robot.address)]
         listed = own_appliance.rosrv("guard", "list").stdout
+        acting = {one["name"]: one["cause"] for one in own_appliance.status()["guards"]["acting"]}
+        assert re.fullmatch(WANTED["never"], acting["never"])
+        assert re.fullmatch(
+            WANTED["separation"].format(host=re.escape(common_robot.address)), acting["separation"]
+        )
         for name, one in guards(own_appliance).items():
             wanted = (
                 WANTED[name]

@@ -135,7 +135,7 @@ async def test_the_status_names_the_guards_that_act_and_since_when(
     for _second in range(3):  # the pauses are shorter than two seconds
         act(monitors)
         orders.look()
-        assert orders.state() == GuardsState(1, [ActingGuard("fence", began)])
+        assert orders.state() == GuardsState(1, [ActingGuard("fence", began, "at the edge")])
         let_time_pass(1.5)
     let_time_pass(2.0)
     orders.look()
