@@ -33,9 +33,9 @@ def test_the_example_of_a_property_loads() -> None:
 def test_the_code_of_the_functions_in_rv_is_on_the_page() -> None:
     code = re.sub(r" +// .*", "", FUNCTIONS).strip().split("\n")
     text = "\n".join(code)
-    named = set(re.findall(r"^\w+ (\w+)\(", text, re.MULTILINE))
+    named = set(re.findall(r"^[\w:]+ (\w+)\(", text, re.MULTILINE))
     assert named == set(functions()) - FREE - {"isfinite_all"}
-    functions_of = re.split(r"^(?=\w+ \w+\()", text, flags=re.MULTILINE)
+    functions_of = re.split(r"^(?=[\w:]+ \w+\()", text, flags=re.MULTILINE)
     assert [one for one in functions_of if one not in TEXT] == []
 
 
