@@ -27,8 +27,8 @@ from distribution import released_presets
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import sample
 
-VALUES = {"corners": "0,0 4,0 0,3.5", "joints": "a:-1..1 b:0..2.5", "time": "7s", "hosts": "10.0.0.7/32 10.8.0.0/16",
-          "bool": "true"}  # fmt: skip
+VALUES = {"corners": "0,0 4,0 0,3.5", "joints": "a:-1..1 b:0..2.5", "entries": "Battery, Laser: *", "time": "7s",
+          "hosts": "10.0.0.7/32 10.8.0.0/16", "bool": "true"}  # fmt: skip
 RELEASED = [tuple(path.stem.rsplit("-", 1)) for path in sorted(FOLDER.glob("*.rv"))]  # names and versions
 
 
