@@ -468,22 +468,3 @@ def test_entries_have_a_name_a_beginning_or_a_hardware_id(named: str, missing: A
     assert moves(guard, SLOW, 50)
     guard.tell("by", diagnostics(missing, (met[0], 2, *met[2:]), ("unnamed", 0)), 60, "/b")
     assert not moves(guard, SLOW, 70)
-
-
-def test_the_cause_of_a_stop_has_the_entry_its_node_and_the_limit() -> None:
-    guard = Guarded("diagnostics", silent=1, named="motor, laser: *")
-
-    def cause(at: int) -> str:
-        [line] = guard.tell("command", SLOW, at).log
-        return line.text
-
-    assert cause(0) == "stopped: no entry of the diagnostics has come whose name is 'motor'"
-    guard.tell("by", diagnostics(WELL), 500, "/b")
-    assert cause(2000) == "stopped: no entry of the diagnostics has come whose name begins with 'laser: '"
-    guard.tell("by", diagnostics(("laser: status", 2)), 2500, "/c")
-    assert cause(4000) == "stopped: motor from /b has not come for 3.5 s (limit 1.0 s)"
-    guard.tell("by", diagnostics(WELL), 4100, "/b")
-    assert cause(5500) == "stopped: motor from /b has not come for 1.4 s (limit 1.0 s)"
-    guard.tell("by", diagnostics(WELL), 5600, "/b")
-    guard.tell("by", diagnostics(("laser: status", 2)), 5600, "/c")
-    assert cause(6500) == "stopped: laser: status from /c is at level 2 (limit 1)"
