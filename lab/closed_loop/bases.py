@@ -4,6 +4,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+from lab.closed_loop.geometry import Point
 from lab.closed_loop.messages import Legs
 
 DIFFERENTIAL, OMNIDIRECTIONAL, STEERED = "differential", "omnidirectional", "steered"
@@ -11,10 +12,11 @@ DIFFERENTIAL, OMNIDIRECTIONAL, STEERED = "differential", "omnidirectional", "ste
 
 @dataclass
 class Base:
-    """A round base with its sensor in the middle.
+    """A base of any outline, with its sensor anywhere on it; by default round, with the sensor in the middle.
 
     Metres, seconds and radians, but times of commands in ms. The base slows along its motion at `braking`, and gathers
-    a velocity in any other direction at `gathering`. It turns at once. A number that is not finite is its full speed.
+    a velocity in any other direction at `gathering`. Its turn, or its steering angle, changes at `turn_gathering`, by
+    default at once. A number that is not finite is its full speed.
     """
 
     kind: str
@@ -30,6 +32,14 @@ class Base:
     vx: float = 0.0
     vy: float = 0.0
     turning: float = 0.0
+    turn_gathering: float = math.inf
+    """rad/s2; for a steered base rad/s."""
+    steered: float = 0.0
+    """The steering angle of a steered base, in radians."""
+    sensor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the sensor is, and its direction, in the frame of the base."""
+    outline: tuple[Point, ...] = ()
+    """Corners in the frame of the base; none: it is round."""
     now: int = 0
     orders: "deque[tuple[int, Legs]]" = field(default_factory=deque)
     wanted: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -56,7 +66,7 @@ class Base:
         return self.vx * cos - self.vy * sin, self.vx * sin + self.vy * cos
 
     def wanted_by(self, legs: Legs) -> tuple[float, float, float]:
-        """Return the velocities x, y and turning that the base takes up for a command."""
+        """Return the velocities x, y and turning, or the steering angle, that the base takes up for a command."""
         x, y, turning = (legs[place] for place in (0, 1, 5))
         x, y = (one if math.isfinite(one) else math.copysign(self.top, one) for one in (x, y))
         x, y = (max(-1e6, min(1e6, one)) for one in (x, y))
@@ -66,12 +76,32 @@ class Base:
         x, y = x / scale, y / scale
         if self.kind == STEERED:
             angle = max(-0.6, min(0.6, turning)) if math.isfinite(turning) else 0.6
-            return x, y, x * math.tan(angle) / self.wheelbase
+            return x, y, angle
         turning = turning if math.isfinite(turning) else self.turn_top
         return x, y, max(-self.turn_top, min(self.turn_top, turning))
 
+    def _turned(self, now: float, wanted: float, seconds: float) -> float:
+        most = self.turn_gathering * seconds
+        return now + max(-most, min(most, wanted - now))
+
+    def placed(self, x: float, y: float) -> Point:
+        """Return a place in the frame of the base in that of the world."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        return self.x + x * cos - y * sin, self.y + x * sin + y * cos
+
+    @property
+    def seen_from(self) -> tuple[float, float, float]:
+        """Return where the sensor is, and its direction, in the frame of the world."""
+        x, y, turned = self.sensor
+        return (*self.placed(x, y), self.heading + turned)
+
     def _step(self, seconds: float) -> None:
-        x, y, self.turning = self.wanted
+        x, y, turn = self.wanted
+        if self.kind == STEERED:
+            self.steered = self._turned(self.steered, turn, seconds)
+            self.turning = self.vx * math.tan(self.steered) / self.wheelbase
+        else:
+            self.turning = self._turned(self.turning, turn, seconds)
         before = self.velocity
         dx, dy = x - self.vx, y - self.vy
         # A base that stands sets out in the direction that it is commanded.

@@ -31,7 +31,8 @@ class DeadmanWorld(World):
         r = self.random
         self.kind = r.choice(VELOCITIES)
         self.silent = round(r.uniform(0.1, 1), 2)
-        self.guarded({"silent": self.silent})
+        self.resume = r.choice((0.2, 0.2, 0.45))
+        self.guarded({"silent": self.silent, "resume": self.resume})
         self.live = r.random() < 0.15
         self.sent = self.got = 0
         self.drivers = {node: Driver(node) for node in range(1, 2 if self.live else r.choice((2, 3)))}
@@ -83,6 +84,8 @@ class DeadmanWorld(World):
         late = (self.now - self.made) / 1000
         if got is not None and self.moves(got):
             driver.got_at = self.now
+            if self.now < driver.broke_at + self.resume * 1000 - SLACK:
+                self.broken("L6", f"a motion passes {self.now - driver.broke_at} ms after a silence")
             if late > self.silent + SLACK / 1000 and driver.broke_at >= self.now - 10:
                 self.broken("L6", f"a motion passes that comes {late:.2f} s late, after a silence")
             self.got += self.now > 1500

@@ -43,7 +43,11 @@ class EstopWorld(World):
         """Nodes whose next command must stand still."""
         self.live = r.random() < 0.15
         self.publishers = self.seed % (2 if self.live else 3)
-        self.guarded({"twoHands": self.hands, "silent": self.silent, "publishers": self.publishers})
+        self.together, self.zero_first = r.choice((0.3, 0.5, 2.0)), r.random() < 0.8
+        self.guarded({
+            "twoHands": self.hands, "silent": self.silent, "publishers": self.publishers, "together": self.together,
+            "zeroFirst": self.zero_first, "forget": r.choice((0, 7)),
+        })  # fmt: skip
         for node in (1, 2) if r.random() < 0.5 else (1,):
             self._drives(node)
         buttons = (3,) if self.live else r.choice(((3,), (3, 4), (3, 4)))
@@ -55,6 +59,8 @@ class EstopWorld(World):
         for node in (5, 6) if self.hands or r.random() < 0.5 else (5,):
             self._resets(node)
         self.interrupt(0.4)
+        if r.random() < 0.15:
+            self.after(r.uniform(1500, 6000), self._forget)
 
     def _drives(self, node: int) -> None:
         r = self.random
@@ -69,6 +75,14 @@ class EstopWorld(World):
             )
 
         self.every(lambda: period * r.uniform(0.8, 1.2), send, first=r.uniform(0, 100))
+
+    def _forget(self) -> None:
+        self.trace("the guard is told to forget all nodes")
+        self.guard.give("forget", 3)
+        if not self.switched_off:
+            self.stops.clear()
+            self.resets.clear()
+            self._latch()
 
     def _press(self, node: int, on: bool) -> None:
         if not self.switched_off:
@@ -120,7 +134,7 @@ class EstopWorld(World):
             button.on, button.heard = on, self.now
         if edge and self.needs_reset and not self._pressed() and not self.switched_off:
             self.edges[node] = self.now
-            hands = [one for one, at in self.edges.items() if self.now - at <= 2000]
+            hands = [one for one, at in self.edges.items() if self.now - at <= self.together * 1000 + 1]
             if len(hands) >= (2 if self.hands else 1):
                 self.needs_reset, self.reset_at = False, self.now
                 self.waiting = {1, 2}
@@ -200,7 +214,7 @@ class EstopWorld(World):
             self.broken(
                 self.latched_by, f"a motion passes without a reset after the stop at {self.latched_at} ms"
             )
-        if node in self.waiting:
+        if node in self.waiting and self.zero_first:
             self.broken(
                 "L6",
                 f"node {node} has not stood still since the reset at {self.reset_at} ms, or a resume",

@@ -184,9 +184,10 @@ class ArmWorld(EvidenceWorld):
             self.alone == "fix" or r.random() < 0.5,
             self.alone == "check" or r.random() < 0.5,
         )
+        self.hundred = r.random() < 0.3
         self.commands(r.choice((30, 100, 250)))
         self.guarded({
-            "charge": self.charge, "needFix": self.needs_fix, "needCheck": self.needs_check, "silent": self.silent,
+            "charge": self.charge, "hundred": self.hundred, "needFix": self.needs_fix, "needCheck": self.needs_check, "silent": self.silent,
             "checked": self.checked,
         })  # fmt: skip
         self.battery = self.fix = self.check = (NEVER, False)
@@ -227,7 +228,7 @@ class ArmWorld(EvidenceWorld):
 
     def good(self, topic: str) -> bytes:
         if topic == "by":
-            return battery(0.9)
+            return battery(90 if self.hundred else 0.9)
         return boolean(True) if topic == "check" else position(FIX, self.now, 1.0, 1.0, 0)
 
     def stops_for(self, topic: str) -> float:
@@ -237,11 +238,13 @@ class ArmWorld(EvidenceWorld):
         return {"fix": self.needs_fix, "check": self.needs_check}.get(topic, True)
 
     def _battery(self) -> None:
-        bad = {"low": self.charge - 0.02, "percent": 15.0, "NaN": math.nan, "minus": -1.0}.get(self.fault)
+        wrong = 0.9 if self.hundred else 15.0  # of 1, where the guard takes it for one of 100, or the other way
+        bad = {"low": self.charge - 0.02, "NaN": math.nan, "minus": -1.0}.get(self.fault)
+        charge = (0.9 if bad is None else bad) * (100 if self.hundred else 1)
         if self.fault == "no battery":
             return
-        data = battery(0.9 if bad is None else bad)
-        self.battery = (self.now, bad is None and self.fault != "cut")
+        data = battery(wrong if self.fault == "percent" else charge)
+        self.battery = (self.now, bad is None and self.fault not in {"cut", "percent"})
         self.say("by", data[:20] if self.fault == "cut" else data, whole=self.fault != "cut")
 
     def _fix(self) -> None:
@@ -280,11 +283,12 @@ class AgreeWorld(EvidenceWorld):
 
     def plan(self) -> None:
         r = self.random
-        self.tolerance, self.samples = 0.1, r.choice((1, 3, 5))
+        self.tolerance, self.turning = r.choice((0.05, 0.1, 0.4)), r.choice((0.1, 0.2, 0.8))
+        self.samples = r.choice((1, 3, 5))
         self.silent = round(r.uniform(0.2, 1), 2)
         self.commands(r.choice((30, 100, 250)))
         self.guarded(
-            {"tolerance": self.tolerance, "samples": self.samples, "silent": self.silent},
+            {"tolerance": self.tolerance, "turning": self.turning, "samples": self.samples, "silent": self.silent},
             {"by": ODOMETRY, "other": ODOMETRY},
         )
         self.fault, self.faulty_since = "", NEVER
@@ -328,11 +332,11 @@ class AgreeWorld(EvidenceWorld):
             if given == "other":
                 match self.fault:
                     case "x":
-                        velocity[0] = 0.5
+                        velocity[0] = 0.97 - self.tolerance
                     case "y":
-                        velocity[1] = 0.7
+                        velocity[1] += self.tolerance + 0.01
                     case "turn":
-                        velocity[5] = 2.0
+                        velocity[5] += self.turning + 0.01
                     case "opposite turn":
                         velocity[5] = -0.5
                     case "NaN":

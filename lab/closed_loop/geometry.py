@@ -18,6 +18,18 @@ def nearest_on(segment: Segment, x: float, y: float) -> Point:
     return ax + part * dx, ay + part * dy
 
 
+def apart(one: Segment, other: Segment) -> float:
+    """Return the distance between two segments."""
+    ax, ay, bx, by = one
+    cx, cy, dx, dy = other
+    sides = [(px - ax) * (by - ay) - (py - ay) * (bx - ax) for px, py in ((cx, cy), (dx, dy))]
+    others = [(px - cx) * (dy - cy) - (py - cy) * (dx - cx) for px, py in ((ax, ay), (bx, by))]
+    if sides[0] * sides[1] < 0 and others[0] * others[1] < 0:
+        return 0.0
+    ends = [((ax, ay), other), ((bx, by), other), ((cx, cy), one), ((dx, dy), one)]
+    return min(math.dist(end, nearest_on(segment, *end)) for end, segment in ends)
+
+
 def edges(corners: Sequence[Point]) -> list[Segment]:
     return [(*one, *other) for one, other in zip(corners, [*corners[1:], corners[0]], strict=True)]
 

@@ -96,6 +96,11 @@ class RunningGuard:
     def holds(self) -> bool:
         return self._monitors.monitor("guard").held
 
+    def give(self, name: str, value: Value) -> None:
+        """Set a value of the running guard."""
+        self._given["guard"][name] = value
+        self._monitors.give(self._given)
+
     def hold(self) -> None:
         self._monitors.hold(self._monitors.monitor("guard"), "the rig asks for it")
 

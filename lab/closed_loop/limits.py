@@ -3,15 +3,7 @@
 import math
 from typing import ClassVar
 
-from lab.closed_loop.messages import (
-    ACKERMANN_STAMPED,
-    STILL,
-    VELOCITIES,
-    Legs,
-    header,
-    steering,
-    straight,
-)
+from lab.closed_loop.messages import STILL, VELOCITIES, Legs, fields_of, steered, straight
 from lab.closed_loop.world import NEVER, World
 
 
@@ -26,10 +18,14 @@ class SpeedWorld(World):
         self.kind = r.choice(VELOCITIES)
         self.most, self.turn = round(r.uniform(0.1, 3), 2), round(r.uniform(0.1, 3), 2)
         self.growth, self.turn_growth = round(r.uniform(0.2, 20), 2), round(r.uniform(0.2, 20), 2)
-        self.guarded(
-            {"vMax": self.most, "wMax": self.turn, "aMax": self.growth, "alphaMax": self.turn_growth}
-        )
+        self.angle, self.rate, self.jerk = (round(r.uniform(0.1, most), 2) for most in (1.5, 3, 30))
+        self.guarded({
+            "vMax": self.most, "wMax": self.turn, "aMax": self.growth, "alphaMax": self.turn_growth,
+            "steerMax": self.angle, "steerSpeed": self.rate, "jerkMax": self.jerk,
+        })  # fmt: skip
         self.before: tuple[int, float, float] = (NEVER, 0.0, 0.0)
+        self.steering: tuple[int, Legs] = self.force
+        """The motion in force before the command that passes now."""
         self.live = r.random() < 0.2
         self.interrupt(0 if self.live else 0.3)
         period = r.choice((10, 20, 50, 100, 300))
@@ -40,7 +36,11 @@ class SpeedWorld(World):
             if not self.live and r.random() < 0.2:
                 size = r.choice((0.0, 0.1, 1.0, 9.0, 1e300, math.inf, math.nan))
                 legs = tuple(size * r.choice((0, 1, -1, 0.5, r.random())) for _axis in range(6))  # type: ignore[assignment]  # six
-            self.drive(legs)
+            if self.live or not self.kind.startswith("ackermann"):
+                self.drive(legs)
+                return
+            more = [r.choice((0.0, 0.5, -9.0, 99.0, 1e30, math.inf, math.nan)) for _field in range(3)]
+            self.publish(steered(self.kind, self.now, [legs[5], legs[0], *more]))
 
         self.every(
             lambda: period * r.uniform(0.9, 1.1) if self.live or r.random() > 0.02 else r.uniform(900, 1500),
@@ -51,8 +51,8 @@ class SpeedWorld(World):
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if got is None:
             return
-        steered = self.kind.startswith("ackermann")
-        speed, turn = math.hypot(*got[:3]), 0.0 if steered else math.hypot(*got[3:])
+        steers = self.kind.startswith("ackermann")
+        speed, turn = math.hypot(*got[:3]), 0.0 if steers else math.hypot(*got[3:])
         if not (math.isfinite(speed) and math.isfinite(got[5]) and math.isfinite(turn)):
             self.broken("L2", "a velocity that is not a number passes a limit of velocities")
         if speed > self.most * (1 + 1e-6) or turn > self.turn * (1 + 1e-6):
@@ -72,6 +72,26 @@ class SpeedWorld(World):
                 f"{before:.3f} m/s grow to {speed:.3f}, {turned:.3f} rad/s to {turn:.3f} in {seconds:.2f} s",
             )
         self.before = (self.now, speed, turn)
+        if steers and self.bytes is not None:
+            self._steered(*fields_of(self.bytes))
+
+    def publish(self, data: bytes, node: int | None = None) -> "Legs | None":
+        self.steering = self.force
+        return super().publish(data, node)
+
+    def _steered(self, angle: float, rate: float, speed: float, acceleration: float, jerk: float) -> None:  # noqa: PLR0917  the fields, in their order
+        at, before = self.steering
+        most = self.rate * max(0.1, (self.now - at) / 1000) * (1 + 1e-6) + 1e-6
+        if not (abs(angle) <= self.angle * (1 + 1e-6) and abs(angle - before[5]) <= most):
+            self.broken("L1", f"the steering angle of {before[5]:.3f} rad becomes {angle:.3f}")
+        brakes = abs(speed) < abs(before[0]) and speed * before[0] >= 0
+        for name, value, limit in (
+            ("steering rate", rate, self.rate),
+            ("acceleration", acceleration, math.inf if brakes else self.growth),
+            ("jerk", jerk, math.inf if brakes else self.jerk),
+        ):
+            if not abs(value) <= limit * (1 + 1e-6):
+                self.broken("L1", f"a {name} of {value:.3f} passes; {limit} is permitted")
 
     def received(self, at: int, legs: Legs) -> None:
         super().received(at, legs)
@@ -112,8 +132,7 @@ class SaneWorld(World):
         if self.kind.startswith("ackermann"):
             parts = [bad if place == wrong else r.uniform(-1, 1) for place in range(5)]
             self.whole = wrong >= 5
-            data = steering(*parts)
-            self.publish(header(self.now) + data if self.kind == ACKERMANN_STAMPED else data)
+            self.publish(steered(self.kind, self.now, parts))
             return
         self.whole = wrong >= 6
         self.drive(tuple(bad if place == wrong else r.uniform(-1, 1) for place in range(6)))  # type: ignore[arg-type]  # six

@@ -32,7 +32,7 @@ class MeasuredWorld(World):
     """A base that at times drives without a command, and its odometry, which may fail."""
 
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut")}
-    still = 0.05
+    still: float
     silent: float
     waits = True
     """Whether a node must command zero, while the base is measured as standing, before a motion passes."""
@@ -42,6 +42,8 @@ class MeasuredWorld(World):
         kind = r.choice((DIFFERENTIAL, OMNIDIRECTIONAL, STEERED))
         self.kind = r.choice(KINDS[kind])
         self.base = Base(kind, r.randrange(10, 150), r.uniform(1, 4), r.uniform(1, 8), top)
+        self.base.turn_gathering = r.choice((math.inf, 3.0))
+        self.still = r.choice((0.03, 0.05, 0.1))
         self.push: tuple[float, float] = (0.0, 0.0)
         """Velocities, linear and angular, that no command asks for."""
         self.live = not self.alone and r.random() < 0.2
@@ -79,7 +81,7 @@ class MeasuredWorld(World):
 
     def _pushes(self) -> None:
         r = self.random
-        self.push = r.choice(((1.0, 0.0), (0.3, 0.0), (0.0, 2.5), (-1.5, 0.5)))
+        self.push = r.choice(((1.0, 0.0), (0.3, 0.0), (0.0, 2.5), (-1.5, 0.5), (1.2 * self.still, 0.0)))
         self.trace(f"the base moves without a command: {self.push}")
         self.after(self.now + r.uniform(300, 2500), self._ends_push)
 
@@ -176,8 +178,11 @@ class OverspeedWorld(MeasuredWorld):
 
     def plan(self) -> None:
         self.begun(1.0)
-        self.most, self.turn = 0.6, 1.2
-        self.guarded({"vMax": self.most, "wMax": self.turn, "silent": self.silent}, {"by": ODOMETRY})
+        self.most, self.turn = round(self.random.uniform(0.45, 1), 2), round(self.random.uniform(0.5, 2), 2)
+        self.guarded(
+            {"vMax": self.most, "wMax": self.turn, "still": self.still, "silent": self.silent},
+            {"by": ODOMETRY},
+        )
         self.happens()
 
     def _fast(self) -> bool:
@@ -223,7 +228,9 @@ class StandstillWorld(MeasuredWorld):
     def plan(self) -> None:
         self.begun(0.5)
         self.settle = round(self.random.uniform(0.7, 1.5), 2)
-        self.guarded({"settle": self.settle, "silent": self.silent}, {"by": ODOMETRY})
+        self.guarded(
+            {"settle": self.settle, "still": self.still, "silent": self.silent}, {"by": ODOMETRY}
+        )
         self.stopped_at = 0
         """The time of the command to stand; `NEVER` while the base is commanded to move."""
         self.stop_at = 0

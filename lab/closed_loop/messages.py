@@ -21,12 +21,13 @@ ACKERMANN, ACKERMANN_STAMPED = "ackermann_msgs/AckermannDrive", "ackermann_msgs/
 SCAN, ODOMETRY, FIX = "sensor_msgs/LaserScan", "nav_msgs/Odometry", "sensor_msgs/NavSatFix"
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"
 RANGE, IMU = "sensor_msgs/Range", "sensor_msgs/Imu"
+BOOL, JOY = "std_msgs/Bool", "sensor_msgs/Joy"
 
 _SIX, _FIVE = struct.Struct("<6d"), struct.Struct("<5f")
 _LARGEST = 3.4e38
 _NO_COVARIANCE = bytes(8 * 36)
-EAST, NORTH = 6_378_137.0, 6_335_439.3
-"""Radii of WGS 84 at latitude 0, in metres."""
+WGS_84 = 6_378_137.0, 0.00669437999014
+"""The greatest radius, in metres, and the square of the eccentricity."""
 
 
 def header(at: float, frame: bytes = b"f") -> bytes:
@@ -38,6 +39,16 @@ def header(at: float, frame: bytes = b"f") -> bytes:
 def steering(angle: float, speed: float, acceleration: float = 0, jerk: float = 0, rate: float = 0) -> bytes:
     numbers = (angle, rate, speed, acceleration, jerk)
     return _FIVE.pack(*(math.copysign(math.inf, one) if abs(one) > _LARGEST else one for one in numbers))
+
+
+def steered(kind: str, at: float, fields: Sequence[float]) -> bytes:
+    """Return a command of an Ackermann type: steering angle, speed, acceleration, jerk, and rate of the angle."""
+    return (header(at) if kind == ACKERMANN_STAMPED else b"") + steering(*fields)
+
+
+def fields_of(data: bytes) -> tuple[float, ...]:
+    """Return the steering angle, its rate, the speed, acceleration and jerk of a command of an Ackermann type."""
+    return _FIVE.unpack(data[-_FIVE.size :])
 
 
 def command(kind: str, legs: Legs, at: float) -> bytes:
@@ -85,9 +96,15 @@ def odometry(at: float, pose: Sequence[float], velocity: Sequence[float] = STILL
 
 
 def position(  # noqa: PLR0917  the fields of the message, in their order
-    kind: str, at: float, x: float, y: float, turned: float, quaternion: Sequence[float] = ()
+    kind: str,
+    at: float,
+    x: float,
+    y: float,
+    turned: float,
+    quaternion: Sequence[float] = (),
+    origin: tuple[float, float] = (0.0, 0.0),
 ) -> bytes:
-    """Return a position in metres, with a heading in rad or a quaternion; a fix is about latitude and longitude 0."""
+    """Return a position in metres, with a heading in rad or a quaternion; a fix is about a latitude and longitude."""
     pose = (*_pose(x, y, turned)[:3], *(quaternion or _pose(x, y, turned)[3:]))
     if kind == ODOMETRY:
         return odometry(at, pose)
@@ -95,8 +112,11 @@ def position(  # noqa: PLR0917  the fields of the message, in their order
         return header(at) + struct.pack("<7d", *pose)
     if kind == POSE_WITH_COVARIANCE:
         return header(at) + struct.pack("<7d", *pose) + _NO_COVARIANCE
-    east, north = math.degrees(x / EAST), math.degrees(y / NORTH)
-    return header(at) + struct.pack("<bH3d9dB", 0, 1, north, east, 0.0, *[0.0] * 9, 0)
+    latitude, (radius, square) = math.radians(origin[0]), WGS_84
+    part = 1 - square * math.sin(latitude) ** 2
+    north = origin[0] + math.degrees(y * part**1.5 / (radius * (1 - square)))
+    east = origin[1] + math.degrees(x * math.sqrt(part) / (radius * math.cos(latitude)))
+    return header(at) + struct.pack("<bH3d9dB", 0, 1, north, (east + 180) % 360 - 180, 0.0, *[0.0] * 9, 0)
 
 
 @functools.cache
@@ -105,9 +125,14 @@ def boolean(on: bool) -> bytes:
 
 
 @functools.cache
-def diagnostics(level: int) -> bytes:
-    """Return an entry, the same for each node."""
-    return message("diagnostic_msgs/DiagnosticArray", status=[{"name": "motor", "level": level}])
+def diagnostics(level: int, beside: int = 0) -> bytes:
+    """Return an entry, beside an entry of another name; nodes that say it are told apart."""
+    entries = [{"name": "fan", "level": beside}, {"name": "motor", "level": level}]
+    return message("diagnostic_msgs/DiagnosticArray", status=entries)
+
+
+def joy(buttons: Sequence[bool]) -> bytes:
+    return header(0) + struct.pack("<II", 0, len(buttons)) + struct.pack(f"<{len(buttons)}i", *buttons)
 
 
 def battery(charge: float) -> bytes:

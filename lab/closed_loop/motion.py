@@ -58,6 +58,8 @@ class DrivenWorld(World):
         self.kind = r.choice(KINDS[kind])
         self.base = Base(kind, lag, braking * r.choice((1, 1, 1.3)), braking * r.choice((1, 2, 10)), top)
         self.base.heading = r.uniform(-math.pi, math.pi)
+        self.base.wheelbase = r.choice((0.25, 0.4, 1.0))
+        self.base.turn_gathering = r.choice((math.inf, 2.0, 0.7) if kind == STEERED else (math.inf, 6.0, 2.0))
 
     def driven(self, towards: "tuple[Point, ...]", *, turns: bool = True, forward: bool = False) -> None:
         """Let a node drive towards places, or anywhere, at 1 to 50 Hz, with pauses of up to 2 s."""
@@ -195,6 +197,10 @@ SCAN_FAULTS = (
 )  # fmt: skip
 
 
+BLANK_FAULTS = {"NaN", "zero", "one infinite", "bag"}
+"""Faults of a scanner whose blank readings mean that nothing is there."""
+
+
 class SeparationWorld(DrivenWorld):
     """Walls and persons around a base with a scanner: ISO 13855 and ISO/TS 15066, speed and separation."""
 
@@ -212,6 +218,8 @@ class SeparationWorld(DrivenWorld):
             self._plan_honest()
             return
         self.sector = r.choice((WHOLE, WHOLE, WHOLE, HALF))
+        self.unseen = r.choice((0.0, 0.2)) if self.sector == HALF else 0.0
+        self.blank = r.choice((0.0, math.nan)) if r.random() < 0.2 else None
         self.speed = r.choice((0.0, 1.6, 1.6))
         braking, reaction = round(r.uniform(0.4, 3), 2), round(r.uniform(0.1, 0.5), 2)
         margin, self.silent = round(r.uniform(0.3, 0.6), 2), round(r.uniform(0.15, 0.8), 2)
@@ -222,21 +230,53 @@ class SeparationWorld(DrivenWorld):
         )  # fmt: skip
         self.reaction, self.braking, self.margin = reaction, braking, margin
         self.radius = margin - r.uniform(0.06, 0.15)
+        mounted = round(r.uniform(-math.pi, math.pi) if self.sector == WHOLE else r.uniform(-0.4, 0.4), 2)
+        self.shaped(mounted)
         self._surroundings()
         self.guarded({
             "sector": self.sector, "reaction": reaction, "braking": braking, "person": self.speed, "margin": margin,
             "silent": self.silent, "width": round(self.radius + r.uniform(0.06, 0.2), 2),
-            "wheelbase": self.base.wheelbase,
+            "wheelbase": self.base.wheelbase, "mounted": mounted, "unseen": self.unseen,
+            "blankIsFree": self.blank is not None,
         }, {"by": SCAN})  # fmt: skip
         self.scanner(r.uniform(25, self.silent * 850), r.uniform(0, reaction * 1000 - lag))
         self.driven(
             tuple((person.x, person.y) for person in self.persons) + tuple((w[0], w[1]) for w in self.walls),
-            turns=self.sector == WHOLE, forward=self.sector == HALF,
+            turns=self.sector == WHOLE,
         )  # fmt: skip
         if r.random() < 0.5:
             self.after(r.uniform(300, 6000), self._fail)
         self.with_second()
         self.interrupt()
+
+    def shaped(self, mounted: float) -> None:
+        """Give the base an outline in some worlds, and the sensor a place and a direction on it.
+
+        `radius` is the distance of the farthest corner from the sensor.
+        """
+        r = self.random
+        self.base.sensor = (0.0, 0.0, mounted)
+        if r.random() < 0.5:
+            return
+        angle = r.uniform(0.4, 1.2)
+        length, width = self.radius * math.cos(angle), self.radius * math.sin(angle)
+        low, high = -length * r.choice((1.0, r.uniform(0.2, 1))), length
+        right, left = -width * r.choice((1.0, r.uniform(0.2, 1))), width
+        x, y = r.uniform(low, high) * 0.8, r.uniform(right, left) * 0.8
+        self.base.sensor = (-x, -y, mounted)
+        corners = ((low, right), (high, right), (high, left), (low, left))
+        self.base.outline = tuple((px - x, py - y) for px, py in corners)
+
+    def left(self, segment: Segment, radius: float = 0.0) -> float:
+        """Return the metres between the base and a wall, or a disc; at most, if it is far from the base."""
+        x, y, _turned = self.base.seen_from
+        away = math.dist((x, y), geometry.nearest_on(segment, x, y)) - self.radius - radius
+        if away > 0.02 or not self.base.outline:
+            return away
+        corners = [self.base.placed(*corner) for corner in self.base.outline]
+        if geometry.is_inside(corners, *segment[:2]):
+            return -radius
+        return min(geometry.apart(edge, segment) for edge in geometry.edges(corners)) - radius
 
     def good(self, topic: str) -> bytes:
         return scan(self.now, -math.pi, math.pi / 50, self.near, self.far, np.full(101, self.far * 0.9))
@@ -265,6 +305,7 @@ class SeparationWorld(DrivenWorld):
         """Plan a corridor of 1.5 m, or 3 m straight in a room, with the preset's values but the person's."""
         r = self.random
         self.sector, self.silent, self.radius, self.speed = WHOLE, 0.5, 0.2, r.choice((0.0, 1.6))
+        self.unseen, self.blank = 0.0, None
         self.built((DIFFERENTIAL,), 100, 1.0, 1.0)
         self.base.heading = 0.0
         corridor = r.random() < 0.5
@@ -298,9 +339,8 @@ class SeparationWorld(DrivenWorld):
             if self.fault == "dead":
                 return
             discs = [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
-            found = geometry.ranges(
-                self.base.x, self.base.y, self.angles + self.base.heading, self.walls, discs
-            )
+            x, y, turned = self.base.seen_from
+            found = geometry.ranges(x, y, self.angles + turned, self.walls, discs)
             found[found > self.far] = np.inf
             found[found < self.near] = self.near
             data, valid = self.scan(found)
@@ -320,7 +360,8 @@ class SeparationWorld(DrivenWorld):
         self.measured(valid=valid)
 
     def _fail(self) -> None:
-        self.fault = self.random.choice(SCAN_FAULTS)
+        faults = SCAN_FAULTS if self.blank is None else set(SCAN_FAULTS) - BLANK_FAULTS
+        self.fault = self.random.choice(sorted(faults))
         self.trace(f"the scanner fails: {self.fault}")
         if (self.returns or self.fault != "dead") and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(500, 3000), self._repair)
@@ -331,6 +372,8 @@ class SeparationWorld(DrivenWorld):
 
     def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
         """Return a scan with the present fault, and whether it is valid; None: parts of it are."""
+        if self.blank is not None:
+            found[found > self.far] = self.blank
         start, step = float(self.angles[0]), float(self.angles[1] - self.angles[0])
         low, high, valid = self.near, self.far, not self.fault
         match self.fault:
@@ -369,10 +412,14 @@ class SeparationWorld(DrivenWorld):
             if until > one.leaves and away > 0:
                 one.x -= (self.base.x - one.x) / away * one.speed * seconds
                 one.y -= (self.base.y - one.y) / away * one.speed * seconds
-            elif until > one.begins and away > self.radius + PERSON_RADIUS:
-                way = min(one.speed * seconds, away - self.radius - PERSON_RADIUS)
+            elif until > one.begins and (left := self.left((one.x, one.y, one.x, one.y), PERSON_RADIUS)) > 0:
+                way = min(one.speed * seconds, left)
                 one.x += (self.base.x - one.x) / away * way
                 one.y += (self.base.y - one.y) / away * way
+
+    def evidence(self, silent: float) -> None:
+        if not self.force[1][0] < 0 < self.unseen:
+            super().evidence(silent)
 
     def watch(self) -> None:
         self.harm()
@@ -383,20 +430,23 @@ class SeparationWorld(DrivenWorld):
         for person in self.persons:
             self._follow(person)
         self.escaped = self.escaped and not self._caught()
-        places = [(*geometry.nearest_on(wall, self.base.x, self.base.y), 0.0) for wall in self.walls]
-        places += [
-            (one.x, one.y, PERSON_RADIUS) for one in self.persons if self.each_counts or not one.stepped_in
+        things = [(wall, 0.0) for wall in self.walls]
+        things += [
+            ((one.x, one.y, one.x, one.y), PERSON_RADIUS)
+            for one in self.persons
+            if self.each_counts or not one.stepped_in
         ]
         vx, vy = self.base.velocity
-        for x, y, radius in places:
+        if self.escaped or self.base.vx < 0 < self.unseen:
+            return
+        for thing, radius in things:
+            x, y = geometry.nearest_on(thing, self.base.x, self.base.y)
             dx, dy = x - self.base.x, y - self.base.y
             away = math.hypot(dx, dy)
             towards = (vx * dx + vy * dy) / away if away > 0 else math.hypot(vx, vy)
             if towards <= 0.01:
                 continue
-            left = away - self.radius - radius
-            if self.escaped:
-                continue
+            left = self.left(thing, radius)
             self.report.clearance = min(self.report.clearance, left)
             if left <= 1e-9:
                 what = "a person" if radius else "a wall"
@@ -424,6 +474,10 @@ class SeparationWorld(DrivenWorld):
             )
             away = math.dist((person.x, person.y), (self.base.x, self.base.y)) - PERSON_RADIUS
             person.stepped_in = away < needed + self.margin
+
+    def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
+        if self.sector == HALF and got is not None and got[0] < -self.unseen * (1 + 1e-6):
+            self.broken("L2", f"{got[0]:.3f} m/s pass out of the sector; {self.unseen} is permitted")
 
     def _looked(self) -> int:
         """Return when the scanner looked last before the motion passed that the base executes."""
@@ -489,8 +543,13 @@ class FenceWorld(DrivenWorld):
         self._place()
         self.least = min(0.0, self._depth())
         corners = " ".join(f"{x},{y}" for x, y in self.field)
-        values: dict[str, Value] = {"margin": self.margin, "ahead": ahead, "silent": self.silent, "polygon": corners,
-                                    "worldFrame": self.world_frame}  # fmt: skip
+        self.inward = r.choice((0.1, 0.3))
+        self.origin = r.choice(((0.0, 0.0), (52.5, 13.4), (-77.85, -179.99998)))
+        values: dict[str, Value] = {
+            "margin": self.margin, "ahead": ahead, "silent": self.silent, "polygon": corners, "inward": self.inward,
+            "worldFrame": self.world_frame, "wheelbase": self.base.wheelbase, "lat0": self.origin[0],
+            "lon0": self.origin[1],
+        }  # fmt: skip
         self.guarded(values, {"by": self.by})
         self._positions(r.uniform(20, self.silent * (200 if self.live else 900)), delay)
         if self.live:
@@ -506,7 +565,7 @@ class FenceWorld(DrivenWorld):
         self.interrupt()
 
     def good(self, topic: str) -> bytes:
-        return position(self.by, self.now, -1.0, 0.0, 0.0)
+        return position(self.by, self.now, -1.0, 0.0, 0.0, origin=self.origin)
 
     def _place(self) -> None:
         r = self.random
@@ -542,7 +601,7 @@ class FenceWorld(DrivenWorld):
                     known = r.choice(
                         ((1e200, 1e200, 1e200, 1e200), (0.0, 0.0, math.nan, 1.0), (0.0, 0.0, 0.0, math.inf))
                     )
-            data = position(self.by, self.now, x, y, self.base.heading, known)
+            data = position(self.by, self.now, x, y, self.base.heading, known, self.origin)
             data = data[:20] if self.fault == "cut" else data
             valid = (
                 None if self.fault.endswith("heading") else not self.fault
@@ -567,9 +626,10 @@ class FenceWorld(DrivenWorld):
         self.trace("the position is right again")
         self.fault = ""
 
-    def drive(self, legs: Legs, node: int | None = None, made: int | None = None) -> "Legs | None":
-        """Publish a command. One in the frame of the world is turned into that of the base only behind the guard."""
-        return super().drive(legs, node, made)
+    def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
+        far = self.planned_act != "switch" and self._depth() < -self.noise - 0.1
+        if far and got is not None and math.hypot(*got[:3]) > self.inward * (1 + 1e-6):
+            self.broken("L3", f"{math.hypot(*got[:3]):.3f} m/s pass outside; {self.inward} is permitted")
 
     def received(self, at: int, legs: Legs) -> None:
         if self.world_frame:

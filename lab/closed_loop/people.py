@@ -4,8 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from lab.closed_loop.messages import STILL, VELOCITIES, Legs, boolean, diagnostics, straight
+from lab.closed_loop.messages import BOOL, JOY, STILL, VELOCITIES, Legs, boolean, diagnostics, joy, straight
 from lab.closed_loop.world import NEVER, SLACK, World
+from tests.support.features.guards.running_guard import Value
 
 TICK = 20
 """Milliseconds between two looks of these guards."""
@@ -29,14 +30,33 @@ class SwitchWorld(World):
     live: bool
 
     def begun(self) -> None:
+        self.forgot = NEVER
         self.switches: dict[int, Switch] = {}
         self.ready: set[int] = set()
         """Nodes that have stood, or were slow, since the last stop."""
         self.passing = self.sent = 0
         self.publishers = self.seed % (2 if self.live else 3)
 
-    def unheard(self) -> bool:
-        return len(self.switches) < max(self.publishers, 1)
+    def unheard(self, slack: int) -> bool:
+        return len(self.switches) < max(self.publishers, 1) and self.now >= self.forgot + slack
+
+    def common(self) -> "dict[str, Value]":
+        """Return values that several of these guards have, of which one may change."""
+        r = self.random
+        self.zero_first = self.live or r.random() < 0.8
+        if not self.live and r.random() < 0.15:
+            self.after(r.uniform(1500, 6000), self._forget)
+        return {
+            "silent": self.silent, "publishers": self.publishers, "zeroFirst": self.zero_first,
+            "forget": r.choice((0, 7)),
+        }  # fmt: skip
+
+    def _forget(self) -> None:
+        self.trace("the guard is told to forget all nodes")
+        self.guard.give("forget", 3)
+        self.forgot = self.now
+        self.switches.clear()
+        self.ready.clear()
 
     def drives(self, nodes: tuple[int, ...], speeds: tuple[float, ...]) -> None:
         r = self.random
@@ -99,12 +119,20 @@ class EnableWorld(SwitchWorld):
         self.live = r.random() < 0.15
         self.silent = round(r.uniform(0.1, 0.5), 2)
         self.begun()
-        self.guarded({"silent": self.silent, "publishers": self.publishers})
+        self.values()
         self.drives((1,) if self.live or r.random() < 0.5 else (1, 2), (0.5,))
         for node in (3,) if self.live or r.random() < 0.6 else (3, 4):
             self._device(node)
         if not self.live:
             self.interrupt(0.4)
+
+    def values(self) -> None:
+        self.joy = self.random.random() < 0.3
+        self.button = self.random.choice((0, 5))
+        self.guarded({**self.common(), "button": self.button}, {"by": JOY if self.joy else BOOL})
+
+    def word(self, on: bool) -> bytes:
+        return joy([on == (number == self.button) for number in range(8)]) if self.joy else super().word(on)
 
     def stands(self) -> bool:
         return self.live and self.now < 1500
@@ -147,7 +175,7 @@ class EnableWorld(SwitchWorld):
     def _why_not(self, slack: int = 0) -> tuple[str, str] | None:
         """Return the law and the reason that nothing may move."""
         law = "L4" if len(self.switches) > 1 else "L2"
-        if self.unheard():
+        if self.unheard(slack):
             return law, "a device has not said a word"
         if quiet := self.quiet(slack):
             return law, f"the device of node {quiet[0]} is silent"
@@ -167,7 +195,7 @@ class EnableWorld(SwitchWorld):
         if got is not None and self.moves(got):
             if late := self._why_not(SLACK):
                 self.broken(late[0], f"a motion passes, and {late[1]}")
-            if node not in self.ready and not why:
+            if node not in self.ready and not why and self.zero_first:
                 self.broken("L6", f"a motion of node {node} passes that has not stood since the last stop")
         if self.live and self.now > 2000:
             self.sent, self.passing = self.sent + 1, self.passing + (got == wanted)
@@ -203,8 +231,15 @@ class DiagnosticsWorld(EnableWorld):
 
     preset: ClassVar[str] = "diagnostics"
 
+    def values(self) -> None:
+        self.publishers = 1
+        self.named, self.warnings = self.random.choice(("*", "motor", "mot*")), self.random.random() < 0.3
+        self.guarded({**self.common(), "named": self.named, "warnings": self.warnings})
+
     def word(self, on: bool) -> bytes:
-        return diagnostics(0 if on else self.random.choice((2, 3, 4, -1)))
+        bad, well = (1, 2, 3, 4, -1), (0, 0, 1)
+        level = self.random.choice((well[: 2 if self.warnings else 3]) if on else bad[0 if self.warnings else 1 :])
+        return diagnostics(level, 0 if self.named == "*" else self.random.choice((0, 2)))
 
     def heard(self, switch: Switch) -> None:
         switch.was_off = True
@@ -223,9 +258,7 @@ class ModeWorld(SwitchWorld):
         self.silent = 1.0 if self.live else r.choice((0.0, 0.3, 1.0))
         self.most, self.turn = round(r.uniform(0.1, 0.5), 2), round(r.uniform(0.2, 1), 2)
         self.begun()
-        self.guarded({
-            "vMax": self.most, "wMax": self.turn, "silent": self.silent, "publishers": self.publishers,
-        })  # fmt: skip
+        self.guarded({**self.common(), "vMax": self.most, "wMax": self.turn})
         self.drives(
             (1,) if self.live or r.random() < 0.5 else (1, 2),
             (1.5,) if self.live else (self.most * 0.9, 0.7, 1.5, 9.0, 1e300, math.inf, math.nan),
@@ -275,7 +308,7 @@ class ModeWorld(SwitchWorld):
 
     def _why_not(self, slack: int = 0) -> tuple[str, str] | None:
         law = "L4" if len(self.switches) > 1 else "L2"
-        if self.unheard():
+        if self.unheard(slack):
             return law, "a node has not said the mode"
         if quiet := self.quiet(slack):
             return law, f"node {quiet[0]}, which says the mode, is silent"

@@ -131,6 +131,8 @@ class World:
         self.switched_off = False
         self.holding = False
         """Whether the guard has been made to hold, and is not yet resumed."""
+        self.bytes: bytes | None = None
+        """What became of the last command behind the guard."""
         self.fresh_from = 0
         """A motion is only allowed if its command came after this time."""
         self.made = 0
@@ -268,6 +270,7 @@ class World:
         legs = legs_of(self.kind, data)
         passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, node)
         got = None if passed is None else legs_of(self.kind, passed)
+        self.bytes = passed
         for one in sent:
             self.receive(*one)
         if got is not None:

@@ -41,10 +41,16 @@ class ZoneWorld(SeparationWorld):
         self.built(
             (DIFFERENTIAL,) if self.live else (DIFFERENTIAL, OMNIDIRECTIONAL, STEERED), lag, braking, top
         )
+        self.unseen, self.blank = 0.0, r.choice((0.0, math.nan)) if not self.live and r.random() < 0.2 else None
+        self.turn, self.restarts = r.choice((0.0, 0.0, 0.3)), r.random() < 0.2
         self.radius, delay = r.uniform(0.15, 0.3), r.uniform(0, 100)
+        self.shaped(0.0)
+        self.own = 0.1 if not self.live and r.random() < 0.2 else 0.0
+        swing = self.base.turn_top * math.hypot(*self.base.sensor[:2])
         seconds = self.silent + (delay + lag + self.tick) / 1000 + 0.02
-        self.half = self.radius + 0.08 + (top + self.speed) * seconds + (self.speed + top / 2) * top / braking
-        """Half a side of the zone."""
+        self.half = self.radius + 0.08 + (top + swing + self.speed) * seconds
+        self.half += (self.speed + swing + top / 2) * top / braking
+        """The least distance of the edge of the zone from the scanner."""
         self.muted_from, self.muted_until = -NEVER, NEVER
         self.occupied_at, self.occupied = NEVER, False
         self.occupied_since: int | None = None
@@ -53,9 +59,9 @@ class ZoneWorld(SeparationWorld):
         """Whether the scan that is made now surely has something in the zone."""
         self.ready: set[int] = set()
         self.around = r.random() < 0.5
-        """Whether the zone is the square, which protects the base."""
+        """Whether the zone is around the scanner, and protects the base."""
         self.corners = (
-            FRONT if self.live and not self.around else self._square() if self.around else self._any()
+            FRONT if self.live and not self.around else self._surrounding() if self.around else self._any()
         )
         if self.live:
             self.half, self.honest, self.span = 1.0, (0.3, 1.2), 6000
@@ -66,7 +72,8 @@ class ZoneWorld(SeparationWorld):
         mutes = self.alone == "mute" or (not self.live and r.random() < 0.2)
         values: dict[str, Value] = {
             "slow": self.slow, "points": self.points, "silent": self.silent, "clear": self.clear,
-            "muteFor": MUTED if mutes else 0.0, "polygon": " ".join(f"{x},{y}" for x, y in self.corners),
+            "muteFor": MUTED if mutes else 0.0, "turn": self.turn, "restarts": self.restarts, "own": self.own,
+            "blankIsFree": self.blank is not None, "polygon": " ".join(f"{x},{y}" for x, y in self.corners),
         }  # fmt: skip
         self.guarded(values, {"by": SCAN})
         self.scanner(r.uniform(25, self.silent * 850), delay)
@@ -84,9 +91,17 @@ class ZoneWorld(SeparationWorld):
         self.with_second()
         self.interrupt(0.25)
 
-    def _square(self) -> Sequence[Point]:
-        far = self.half = 1.0 if self.live else round(self.half, 2)
-        return ((far, -far), (far, far), (-far, far), (-far, -far))
+    def _surrounding(self) -> Sequence[Point]:
+        """Return the corners of a polygon, in either turn, whose edges touch a circle around the scanner."""
+        r = self.random
+        sides, near = r.randrange(4, 9), 1.0 if self.live else self.half
+        step = 2 * math.pi / sides
+        angles = [(side + r.uniform(-0.1, 0.1)) * step for side in range(sides)]
+        corners = []
+        for one, other in zip(angles, [*angles[1:], angles[0] + 2 * math.pi], strict=True):
+            away, angle = near / math.cos((other - one) / 2) + 0.001, (one + other) / 2
+            corners.append((round(away * math.cos(angle), 3), round(away * math.sin(angle), 3)))
+        return corners[:: r.choice((1, -1))]
 
     def _any(self) -> Sequence[Point]:
         """Return corners in turn around a point, so that no edges cross: before, around or beside the scanner."""
@@ -121,7 +136,8 @@ class ZoneWorld(SeparationWorld):
 
     def scanner(self, period: float, delay: float) -> None:
         super().scanner(period, delay)
-        self.far, self.angles = max(self.far, 1.5 * self.half), np.linspace(-math.pi, math.pi, 360)
+        reach = max(math.hypot(*corner) for corner in self.corners)
+        self.far, self.angles = max(self.far, 1.1 * reach), np.linspace(-math.pi, math.pi, 360)
 
     def _mute(self) -> None:
         self.trace("the zone is to be muted")
@@ -158,11 +174,14 @@ class ZoneWorld(SeparationWorld):
 
     def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
         """Note whether a thing is in the zone, also one behind another."""
+        hidden = np.arange(len(found)) % 180 < (2 if self.own else 0)  # rays that end at a part of the base
+        found[hidden] = 0.8 * self.own
         inside = np.zeros(found.shape, bool)
+        x0, y0, turned = self.base.seen_from
         discs = [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
         for walls, persons in [([wall], []) for wall in self.walls] + [([], [disc]) for disc in discs]:
-            away = geometry.ranges(self.base.x, self.base.y, self.angles + self.base.heading, walls, persons)
-            seen = (away < self.far) & (away > self.near)
+            away = geometry.ranges(x0, y0, self.angles + turned, walls, persons)
+            seen = (away < self.far) & (away > max(self.near, self.own)) & ~hidden
             x, y = (
                 np.where(seen, away, 0) * np.cos(self.angles),
                 np.where(seen, away, 0) * np.sin(self.angles),
@@ -183,7 +202,8 @@ class ZoneWorld(SeparationWorld):
         super().arrive(data[:-1], valid, whole=whole)
 
     def _fast(self, legs: Legs) -> bool:
-        return not math.hypot(*legs[:3]) <= self.slow * (1 + 1e-6)
+        turn = 0.0 if self.kind.startswith("ackermann") else math.hypot(*legs[3:])
+        return not (math.hypot(*legs[:3]) <= self.slow * (1 + 1e-6) and turn <= self.turn * (1 + 1e-6))
 
     def _law(self) -> str:
         return "L6" if self.muted_until > NEVER else self.law("L3")
@@ -210,7 +230,7 @@ class ZoneWorld(SeparationWorld):
             self.broken(
                 self._law(), f"a motion passes, though something was in the zone at {self.occupied_at} ms"
             )
-        if node not in self.ready and not self.slow:
+        if node not in self.ready and not self.slow and not self.restarts:
             self.broken("L6", "a motion passes of a node that has not stood since the last stop")
 
     def begins_again(self) -> None:
