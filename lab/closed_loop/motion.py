@@ -1,8 +1,9 @@
 """Worlds with a base that moves: among obstacles and persons (`separation`), and inside a fence (`fence`)."""
 
 import copy
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -47,15 +48,21 @@ class DrivenWorld(World):
     """When the last valid measurement arrived, or -1."""
     blind_from: int | None = None
     """When the first measurement without any evidence arrived that no valid one has followed."""
+    legs: Legs
     escaped = False
     """Whether the base drove without the guard, so that no stop prevents the harm, and has not stood since."""
     each_counts = False
     """Whether persons also count who stepped in from beside, so near that no moving base can stop."""
 
-    def built(self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float) -> None:
+    def built(
+        self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float, *, tight: bool = False
+    ) -> None:
         r = self.random
         kind = r.choice(kinds)
         self.kind = r.choice(KINDS[kind])
+        if tight:
+            self.base = Base(kind, lag, braking, 10 * braking, top)
+            return
         self.base = Base(kind, lag, braking * r.choice((1, 1, 1.3)), braking * r.choice((1, 2, 10)), top)
         self.base.heading = r.uniform(-math.pi, math.pi)
         self.base.wheelbase = r.choice((0.25, 0.4, 1.0))
@@ -65,7 +72,7 @@ class DrivenWorld(World):
         """Let a node drive towards places, or anywhere, at 1 to 50 Hz, with pauses of up to 2 s."""
         r = self.random
         period = r.choice((20, 50, 100, 200, 500, 1000))
-        self.legs: Legs = (0.0,) * 6
+        self.legs = STILL
         self.until = 0.0
 
         def choose() -> None:
@@ -207,12 +214,16 @@ class SeparationWorld(DrivenWorld):
     preset: ClassVar[str] = "separation"
     returns = False
     """Whether a scanner that was silent may send again."""
+    tight: ClassVar[tuple[str, ...]] = ("person", "slowing", "turn", "edge")
 
     def plan(self) -> None:
         r = self.random
         self.walls: list[Segment] = []
         self.persons: list[Person] = []
         self.fault = ""
+        if self.case and not self.alone:
+            self._plan_tight()
+            return
         self.live = not self.alone and r.random() < 0.12
         if self.live:
             self._plan_honest()
@@ -321,7 +332,54 @@ class SeparationWorld(DrivenWorld):
             lambda: 100, lambda: void(self.drive((self.honest[0], 0.0, 0.0, 0.0, 0.0, 0.0))), first=300
         )
 
-    def scanner(self, period: float, delay: float) -> None:
+    def _plan_tight(self) -> None:
+        """Plan a base that is as slow as it declares, with an outline 1 cm within `margin`, that drives straight on.
+
+        It drives at a person who walks at it, and the scanner dies as late as it may; or at one with scans that come
+        after one interval and one and a half, where no tick may stop it; or along an arc at a pillar; or past an edge.
+        """
+        r = self.random
+        self.live, self.unseen, self.blank, self.sector = False, 0.0, None, WHOLE
+        self.speed = 1.6 if self.case in {"person", "slowing"} else 0.0
+        self.reaction, self.braking = round(r.uniform(0.2, 0.4), 2), round(r.uniform(0.6, 1.2), 2)
+        self.margin, self.silent, top = round(r.uniform(0.3, 0.5), 2), 0.9, r.uniform(0.8, 1.1)
+        self.radius, delay = self.margin - 0.01, r.uniform(20, 80)
+        self.built((DIFFERENTIAL,), int(self.reaction * 1000 - delay), self.braking, top, tight=True)
+        turning = r.choice((-1, 1)) * r.uniform(0.7, 0.9) if self.case == "turn" else 0.0
+        match self.case:
+            case "person" | "slowing":
+                self.persons = [Person(14.0, 0.0, 1.6, 0)]
+            case "turn":
+                angle, arc = r.uniform(1.8, 2.4), top / turning
+                x, y = abs(arc) * math.sin(angle), arc * (1 - math.cos(angle))
+                self.walls = [(x, y, x + 0.05, y)]
+            case _:
+                self.walls = [(5.0, self.radius - 0.03, 5.0, 5.0)]
+        self.guarded({
+            "reaction": self.reaction, "braking": self.braking, "person": self.speed, "margin": self.margin,
+            "silent": self.silent, "width": round(self.radius + 0.01, 2),
+        }, {"by": SCAN})  # fmt: skip
+        intervals = itertools.cycle((100.0, 100.0, 145.0, 60.0, 104.0) if self.case == "slowing" else (100.0,))
+        self.scanner(0.0, delay, lambda: next(intervals))
+        self.far = 30.0
+        self.legs = (top, 0.0, 0.0, 0.0, 0.0, turning)
+        again = 400 if self.case == "turn" else 60_000
+        self.every(lambda: again, lambda: void(self.drive(self.legs)), first=1000)
+
+    def _left_for_age(self) -> float:
+        """Return the metres that are left for the age of a scan that is made now."""
+        speed = math.hypot(*self.base.velocity)
+        delay = self.reaction + 0.02
+        stops = speed * delay + speed**2 / (2 * self.braking) + self.speed * (delay + speed / self.braking)
+        return self.left((*[self.persons[0].x, self.persons[0].y] * 2,), PERSON_RADIUS) - stops - 0.01  # type: ignore[arg-type]
+
+    def receive(self, at: int, topic: str, data: bytes) -> None:
+        if self.case == "slowing" and travels(self.force[1]):
+            self.broken("live", "a base that is slowed is stopped between two scans")
+        super().receive(at, topic, data)
+
+    def scanner(self, period: float, delay: float, exact: "Callable[[], float] | None" = None) -> None:
+        """Let a scanner look after `period` ms at most, or after `exact` ones with the whole of its delay."""
         r = self.random
         self.motions: list[int] = []
         """When the base got each motion."""
@@ -344,16 +402,20 @@ class SeparationWorld(DrivenWorld):
             found[found > self.far] = np.inf
             found[found < self.near] = self.near
             data, valid = self.scan(found)
-            arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
+            arrived = max(arrived, self.now + (delay if exact else r.uniform(delay * 0.3, delay)))
             whole = self.fault != "cut"
             made = self.now
+            if self.case == "person" and self._left_for_age() < 0.7 * self.silent * (self.base.vx + self.speed):
+                self.fault = "dead"
             self.after(arrived, lambda: self._arrive(made, data, valid, whole=whole))
 
-        self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
+        self.every(exact or (lambda: period * r.uniform(0.7, 1.0)), look, first=r.uniform(0, 200))
 
     def _arrive(self, made: int, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         self.looks.append((self.now, made))
         self.arrive(data, valid, whole=whole)
+        if self.case == "slowing" and self.now > 1000:
+            self.drive(self.legs)
 
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         self.say("by", data, 5, whole=whole)
@@ -513,6 +575,7 @@ FIELDS: tuple[tuple[Point, ...], ...] = (
     ((-2, -2), (3, -2), (0, 3)),
     ((-3, -3), (3, -3), (3, 0), (0.5, 0), (0.5, 3), (-3, 3)),
     ((-3, -2), (0, -1), (3, -2), (2, 2), (0, 1), (-2, 2)),
+    ((-8, -8), (8, -8), (8, 8), (-8, 8)),
 )
 POSITION_FAULTS = ("dead", "NaN", "no heading", "infinite heading", "cut", "gap")
 
@@ -522,12 +585,16 @@ class FenceWorld(DrivenWorld):
 
     preset: ClassVar[str] = "fence"
     tick = 50
+    tight: ClassVar[tuple[str, ...]] = ("straight", "late", "slowing")
 
     def plan(self) -> None:
         r = self.random
         self.fault, self.live = "", not self.alone and r.random() < 0.1
         self.field = FIELDS[0] if self.live else r.choice(FIELDS)
         self.margin, ahead, self.silent = 0.2, 0.5, 0.5
+        if self.case and not self.alone:
+            self._plan_tight()
+            return
         if not self.live:
             self.margin, ahead = round(r.uniform(0.1, 0.4), 2), round(r.uniform(0.3, 1), 2)
             self.silent = round(r.uniform(0.1, 1), 2)
@@ -564,6 +631,33 @@ class FenceWorld(DrivenWorld):
         self.with_second()
         self.interrupt()
 
+    def _plan_tight(self) -> None:
+        """Plan a base that needs all of `ahead` to stop, and drives straight over the edge.
+
+        The positions end as late as they may; or they come after one interval and one and a half, where no tick may
+        stop the base.
+        """
+        r = self.random
+        self.live, self.by, self.world_frame, self.noise, self.outside = False, ODOMETRY, False, 0.0, False
+        self.field, self.least, self.origin, self.inward = FIELDS[-1], 0.0, (0.0, 0.0), 0.3
+        self.margin, self.silent, self.ahead = 0.01, 0.9, round(r.uniform(0.5, 0.9), 2)
+        delay, lag, braking = r.uniform(20, 60), r.randrange(50, 150), r.uniform(1.5, 3)
+        top = (self.ahead - (delay + lag) / 1000) * 2 * braking
+        self.built((DIFFERENTIAL,), lag, braking, min(top, 2.0), tight=True)
+        self.base.braking = self.base.full_braking = self.base.top / 2 / (self.ahead - (delay + lag) / 1000)
+        corners = " ".join(f"{x},{y}" for x, y in self.field)
+        self.guarded({"margin": self.margin, "ahead": self.ahead, "silent": self.silent, "polygon": corners}, {"by": ODOMETRY})
+        pattern = {"straight": (20.0,), "late": (100.0,)}.get(self.case, (100.0, 100.0, 145.0, 60.0, 104.0))
+        intervals = itertools.cycle(pattern)
+        self._positions(0.0, delay, lambda: next(intervals))
+        self.legs = (self.base.top, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.after(500, lambda: void(self.drive(self.legs)))
+
+    def receive(self, at: int, topic: str, data: bytes) -> None:
+        if self.case == "slowing" and travels(self.force[1]):
+            self.broken("live", "a base that is slowed is stopped between two positions")
+        super().receive(at, topic, data)
+
     def good(self, topic: str) -> bytes:
         return position(self.by, self.now, -1.0, 0.0, 0.0, origin=self.origin)
 
@@ -580,7 +674,7 @@ class FenceWorld(DrivenWorld):
     def _depth(self) -> float:
         return geometry.depth(self.field, self.base.x, self.base.y)
 
-    def _positions(self, period: float, delay: float) -> None:
+    def _positions(self, period: float, delay: float, exact: "Callable[[], float] | None" = None) -> None:
         r = self.random
         arrived = 0.0
 
@@ -606,15 +700,21 @@ class FenceWorld(DrivenWorld):
             valid = (
                 None if self.fault.endswith("heading") else not self.fault
             )  # far from the edge it needs none
-            arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
+            arrived = max(arrived, self.now + (delay if exact else r.uniform(delay * 0.3, delay)))
             whole = self.fault != "cut"
+            if self.case in {"straight", "late"}:
+                rest = self.silent + 0.04 if self.case == "straight" else 0.27
+                ends = self._depth() - self.margin < self.base.vx * (rest + self.ahead)
+                self.fault = "dead" if ends else ""
             self.after(arrived, lambda: self.arrive(data, valid, whole=whole))
 
-        self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
+        self.every(exact or (lambda: period * r.uniform(0.7, 1.0)), look, first=r.uniform(0, 200))
 
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         self.say("by", data, 5, whole=whole)
         self.measured(valid=valid)
+        if self.case == "slowing" and self.now > 500:
+            self.drive(self.legs)
 
     def _fail(self) -> None:
         self.fault = self.random.choice(POSITION_FAULTS)

@@ -1,7 +1,7 @@
 """Worlds of `zone`: a base with a square zone around it, which covers its way until it stands, or with any polygon."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -25,6 +25,7 @@ class ZoneWorld(SeparationWorld):
 
     preset: ClassVar[str] = "zone"
     returns = True
+    tight: ClassVar[tuple[str, ...]] = ()
     not_yet: ClassVar[Mapping[str, str]] = {}
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut"), "mute": ()}
 
@@ -134,8 +135,8 @@ class ZoneWorld(SeparationWorld):
             speed = r.choice((0.5, 1.6))
             self.persons.append(Person(away * math.cos(angle), away * math.sin(angle), speed, begins, leaves))
 
-    def scanner(self, period: float, delay: float) -> None:
-        super().scanner(period, delay)
+    def scanner(self, period: float, delay: float, exact: "Callable[[], float] | None" = None) -> None:
+        super().scanner(period, delay, exact)
         reach = max(math.hypot(*corner) for corner in self.corners)
         self.far, self.angles = max(self.far, 1.1 * reach), np.linspace(-math.pi, math.pi, 360)
 
@@ -174,8 +175,9 @@ class ZoneWorld(SeparationWorld):
 
     def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
         """Note whether a thing is in the zone, also one behind another."""
-        hidden = np.arange(len(found)) % 180 < (2 if self.own else 0)  # rays that end at a part of the base
-        found[hidden] = 0.8 * self.own
+        part = (np.arange(len(found)) % 180 < 2) & (self.own > 0)  # rays that end at a part of the base
+        found[part] = 0.8 * self.own
+        hidden = found < self.own
         inside = np.zeros(found.shape, bool)
         x0, y0, turned = self.base.seen_from
         discs = [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
