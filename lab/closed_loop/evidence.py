@@ -187,8 +187,8 @@ class ArmWorld(EvidenceWorld):
         self.hundred = r.random() < 0.3
         self.commands(r.choice((30, 100, 250)))
         self.guarded({
-            "charge": self.charge, "hundred": self.hundred, "needFix": self.needs_fix, "needCheck": self.needs_check, "silent": self.silent,
-            "checked": self.checked,
+            "charge": self.charge, "hundred": self.hundred, "needFix": self.needs_fix, "needCheck": self.needs_check,
+            "silent": self.silent, "checked": self.checked,
         })  # fmt: skip
         self.battery = self.fix = self.check = (NEVER, False)
         self.fault = ""
@@ -238,7 +238,9 @@ class ArmWorld(EvidenceWorld):
         return {"fix": self.needs_fix, "check": self.needs_check}.get(topic, True)
 
     def _battery(self) -> None:
-        wrong = 0.9 if self.hundred else 15.0  # of 1, where the guard takes it for one of 100, or the other way
+        wrong = (
+            0.9 if self.hundred else 15.0
+        )  # of 1, where the guard takes it for one of 100, or the other way
         bad = {"low": self.charge - 0.02, "NaN": math.nan, "minus": -1.0}.get(self.fault)
         charge = (0.9 if bad is None else bad) * (100 if self.hundred else 1)
         if self.fault == "no battery":
@@ -288,7 +290,12 @@ class AgreeWorld(EvidenceWorld):
         self.silent = round(r.uniform(0.2, 1), 2)
         self.commands(r.choice((30, 100, 250)))
         self.guarded(
-            {"tolerance": self.tolerance, "turning": self.turning, "samples": self.samples, "silent": self.silent},
+            {
+                "tolerance": self.tolerance,
+                "turning": self.turning,
+                "samples": self.samples,
+                "silent": self.silent,
+            },
             {"by": ODOMETRY, "other": ODOMETRY},
         )
         self.fault, self.faulty_since = "", NEVER

@@ -79,7 +79,7 @@ class SpeedWorld(World):
         self.steering = self.force
         return super().publish(data, node)
 
-    def _steered(self, angle: float, rate: float, speed: float, acceleration: float, jerk: float) -> None:  # noqa: PLR0917  the fields, in their order
+    def _steered(self, angle: float, rate: float, speed: float, acceleration: float, jerk: float) -> None:
         at, before = self.steering
         most = self.rate * max(0.1, (self.now - at) / 1000) * (1 + 1e-6) + 1e-6
         if not (abs(angle) <= self.angle * (1 + 1e-6) and abs(angle - before[5]) <= most):

@@ -228,9 +228,7 @@ class StandstillWorld(MeasuredWorld):
     def plan(self) -> None:
         self.begun(0.5)
         self.settle = round(self.random.uniform(0.7, 1.5), 2)
-        self.guarded(
-            {"settle": self.settle, "still": self.still, "silent": self.silent}, {"by": ODOMETRY}
-        )
+        self.guarded({"settle": self.settle, "still": self.still, "silent": self.silent}, {"by": ODOMETRY})
         self.stopped_at = 0
         """The time of the command to stand; `NEVER` while the base is commanded to move."""
         self.stop_at = 0

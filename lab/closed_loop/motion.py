@@ -3,7 +3,7 @@
 import copy
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -359,7 +359,9 @@ class SeparationWorld(DrivenWorld):
             "reaction": self.reaction, "braking": self.braking, "person": self.speed, "margin": self.margin,
             "silent": self.silent, "width": round(self.radius + 0.01, 2),
         }, {"by": SCAN})  # fmt: skip
-        intervals = itertools.cycle((100.0, 100.0, 145.0, 60.0, 104.0) if self.case == "slowing" else (100.0,))
+        intervals = itertools.cycle(
+            (100.0, 100.0, 145.0, 60.0, 104.0) if self.case == "slowing" else (100.0,)
+        )
         self.scanner(0.0, delay, lambda: next(intervals))
         self.far = 30.0
         self.legs = (top, 0.0, 0.0, 0.0, 0.0, turning)
@@ -405,7 +407,9 @@ class SeparationWorld(DrivenWorld):
             arrived = max(arrived, self.now + (delay if exact else r.uniform(delay * 0.3, delay)))
             whole = self.fault != "cut"
             made = self.now
-            if self.case == "person" and self._left_for_age() < 0.7 * self.silent * (self.base.vx + self.speed):
+            if self.case == "person" and self._left_for_age() < 0.7 * self.silent * (
+                self.base.vx + self.speed
+            ):
                 self.fault = "dead"
             self.after(arrived, lambda: self._arrive(made, data, valid, whole=whole))
 
@@ -575,7 +579,6 @@ FIELDS: tuple[tuple[Point, ...], ...] = (
     ((-2, -2), (3, -2), (0, 3)),
     ((-3, -3), (3, -3), (3, 0), (0.5, 0), (0.5, 3), (-3, 3)),
     ((-3, -2), (0, -1), (3, -2), (2, 2), (0, 1), (-2, 2)),
-    ((-8, -8), (8, -8), (8, 8), (-8, 8)),
 )
 POSITION_FAULTS = ("dead", "NaN", "no heading", "infinite heading", "cut", "gap")
 
@@ -586,6 +589,8 @@ class FenceWorld(DrivenWorld):
     preset: ClassVar[str] = "fence"
     tick = 50
     tight: ClassVar[tuple[str, ...]] = ("straight", "late", "slowing")
+    judged_at = -1
+    """When the guard judged the last position."""
 
     def plan(self) -> None:
         r = self.random
@@ -639,14 +644,18 @@ class FenceWorld(DrivenWorld):
         """
         r = self.random
         self.live, self.by, self.world_frame, self.noise, self.outside = False, ODOMETRY, False, 0.0, False
-        self.field, self.least, self.origin, self.inward = FIELDS[-1], 0.0, (0.0, 0.0), 0.3
+        self.field: Sequence[Point] = ((-8, -8), (8, -8), (8, 8), (-8, 8))
+        self.least, self.origin, self.inward = 0.0, (0.0, 0.0), 0.3
         self.margin, self.silent, self.ahead = 0.01, 0.9, round(r.uniform(0.5, 0.9), 2)
         delay, lag, braking = r.uniform(20, 60), r.randrange(50, 150), r.uniform(1.5, 3)
         top = (self.ahead - (delay + lag) / 1000) * 2 * braking
         self.built((DIFFERENTIAL,), lag, braking, min(top, 2.0), tight=True)
         self.base.braking = self.base.full_braking = self.base.top / 2 / (self.ahead - (delay + lag) / 1000)
         corners = " ".join(f"{x},{y}" for x, y in self.field)
-        self.guarded({"margin": self.margin, "ahead": self.ahead, "silent": self.silent, "polygon": corners}, {"by": ODOMETRY})
+        self.guarded(
+            {"margin": self.margin, "ahead": self.ahead, "silent": self.silent, "polygon": corners},
+            {"by": ODOMETRY},
+        )
         pattern = {"straight": (20.0,), "late": (100.0,)}.get(self.case, (100.0, 100.0, 145.0, 60.0, 104.0))
         intervals = itertools.cycle(pattern)
         self._positions(0.0, delay, lambda: next(intervals))
@@ -654,7 +663,7 @@ class FenceWorld(DrivenWorld):
         self.after(500, lambda: void(self.drive(self.legs)))
 
     def receive(self, at: int, topic: str, data: bytes) -> None:
-        if self.case == "slowing" and travels(self.force[1]):
+        if self.case == "slowing" and travels(self.force[1]) and self.now > self.judged_at:
             self.broken("live", "a base that is slowed is stopped between two positions")
         super().receive(at, topic, data)
 
@@ -711,6 +720,7 @@ class FenceWorld(DrivenWorld):
         self.every(exact or (lambda: period * r.uniform(0.7, 1.0)), look, first=r.uniform(0, 200))
 
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
+        self.judged_at = self.now
         self.say("by", data, 5, whole=whole)
         self.measured(valid=valid)
         if self.case == "slowing" and self.now > 500:

@@ -238,7 +238,9 @@ class DiagnosticsWorld(EnableWorld):
 
     def word(self, on: bool) -> bytes:
         bad, well = (1, 2, 3, 4, -1), (0, 0, 1)
-        level = self.random.choice((well[: 2 if self.warnings else 3]) if on else bad[0 if self.warnings else 1 :])
+        level = self.random.choice(
+            (well[: 2 if self.warnings else 3]) if on else bad[0 if self.warnings else 1 :]
+        )
         return diagnostics(level, 0 if self.named == "*" else self.random.choice((0, 2)))
 
     def heard(self, switch: Switch) -> None:

@@ -326,8 +326,41 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L6", "mode", "needs no slow command first", r"free && isfinite\(v\)", "isfinite(v)"),
     ("L6", "mode", "takes a slow command from before", r'if \(manual\) \{ slow = ""; slowToo = ""; \}', ""),
 )  # fmt: skip
+_TERMS: Sequence[tuple[str, str, str, str]] = (
+    # preset, what is wrong, a regular expression, its replacement
+    ("separation", "counts no braking in the age of a scan", r"braking \* \(delay \+ look\) \+ person", "braking * delay + person"),
+    ("separation", "counts one interval of the scanner", r"1\.5 \* gap", "gap"),
+    ("separation", "lets a person stand while the base brakes", r"\(delay \+ v / braking\)", "delay"),
+    ("separation", "forgets a turn", r"\+ fabs\(turn\) \* \(look \+ delay \+ u / braking\) / 2", ""),
+    ("separation", "forgets the way of braking", r" - v \* v / \(2 \* braking\)", ""),
+    ("separation", "forgets the way of the reaction", r"- v \* delay - v", "- v"),
+    ("separation", "lets a person stand in the reaction", r"person \* \(delay \+ v / braking\)", "person * v / braking"),
+    ("separation", "lets a person stand while a scan ages", r"left / \(v \+ person \+ 1e-9\)", "left / (v + 1e-9)"),
+    ("separation", "lets the base stand while a scan ages", r"left / \(v \+ person \+ 1e-9\)", "left / (person + 1e-9)"),
+    ("separation", "takes a scan as new until it is silent", r"fmin\(silent, left / \(v \+ person \+ 1e-9\)\)", "left < 0 ? 0 : silent"),
+    ("separation", "forgets the margin", r"clear - margin - person", "clear - person"),
+    ("separation", "slows for no person who walks while the base brakes", r"\(delay \+ look\) \+ person;", "(delay + look);"),
+    ("separation", "slows for no person who walks until the next scan", r"person \* \(delay \+ look\)", "person * delay"),
+    ("separation", "slows for no reaction", r"braking \* \(delay \+ look\)", "braking * look"),
+    ("separation", "slows for no way of braking", r"2 \* braking \* \(clear - still\)", "1e9"),
+    ("separation", "has half a width", r"r \* across <= width \?", "r * across <= width / 2 ?"),
+    ("fence", "forgets the way until the next position", r"top \* since \+ v \* wait \+ u", "top * since + u"),
+    ("fence", "forgets the way of stopping", r"v \* wait \+ u \* ahead, swing", "v * wait, swing"),
+    ("fence", "forgets the way of stopping in any direction", r"v \* wait \+ u \* ahead <= here", "v * wait <= here"),
+    ("fence", "counts one interval of the positions", r"1\.5 \* gap", "gap"),
+    ("fence", "takes the last interval for all", r"fmax\(age\(pose\), 0\.7 \* gap\)", "age(pose)"),
+    ("fence", "forgets how old a position becomes", r"silent - since \+ ahead \+ 0\.02", "ahead + 0.02"),
+    ("fence", "takes a position as new until it is silent", r"age\(pose\) <= until", "age(pose) <= silent"),
+    ("fence", "judges no position", r"lastV > 0 && permitted\(lastV", "false && permitted(lastV"),
+)  # fmt: skip
+TERMS = {
+    f"{preset} {what}": Fault("live" if "interval" in what else "L3", preset, replaced(old, to))
+    for preset, what, old, to in _TERMS
+}
+"""Each forgets a term; the worlds without reserve, at the first seeds, must find it."""
 FAULTS = {
     **FAULTS,
+    **TERMS,
     **{f"{preset} {what}": Fault(law, preset, replaced(old, to)) for law, preset, what, old, to in _ROWS},
     **{
         f"a hold of {preset} holds nothing": Fault("L5", preset, patch=(RunningGuard, "hold", lambda _guard: None))

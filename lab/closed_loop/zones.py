@@ -42,7 +42,10 @@ class ZoneWorld(SeparationWorld):
         self.built(
             (DIFFERENTIAL,) if self.live else (DIFFERENTIAL, OMNIDIRECTIONAL, STEERED), lag, braking, top
         )
-        self.unseen, self.blank = 0.0, r.choice((0.0, math.nan)) if not self.live and r.random() < 0.2 else None
+        self.unseen, self.blank = (
+            0.0,
+            r.choice((0.0, math.nan)) if not self.live and r.random() < 0.2 else None,
+        )
         self.turn, self.restarts = r.choice((0.0, 0.0, 0.3)), r.random() < 0.2
         self.radius, delay = r.uniform(0.15, 0.3), r.uniform(0, 100)
         self.shaped(0.0)

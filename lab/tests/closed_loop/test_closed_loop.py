@@ -3,7 +3,8 @@ import re
 import pytest
 
 from appliance.features.guards.presets import PRESETS
-from lab.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
+from lab.closed_loop.guard_run import parameters_of
+from lab.closed_loop.planted import FAULTS, TERMS, WITHIN, no_guard, stops_everything
 from lab.closed_loop.senders import HONEST, KINDS
 from lab.closed_loop.world import ACTS, COMMAND
 from lab.closed_loop.worlds import (
@@ -17,10 +18,12 @@ from lab.closed_loop.worlds import (
     run_one,
 )
 from tests.support.examples import ALL, seeds_of_night
+from tests.support.features.guards.running_guard import Value
 from tests.support.rows import require_rows
 
-AT_GATE = {"separation": 4, "fence": 4, "zone": 3, "joints": len(KINDS)}
-"""Worlds at the gate of presets whose worlds cost 0.1 to 0.5 s, one of each sender; the others cost 5 to 40 ms."""
+AT_GATE = {"zone": 3, "joints": len(KINDS)}
+"""Worlds at the gate of presets whose worlds cost 0.2 s or more, of `joints` one of each sender. The others cost 5 to
+100 ms, and have 6."""
 AT_NIGHT = {"separation": 500, "fence": 500, "zone": 500, PAIRS: 300}
 
 
@@ -59,14 +62,30 @@ def test_every_preset_has_a_world_or_a_reason() -> None:
     assert not WORLDS.keys() & NOT_MODELLED.keys()
 
 
+def _text(value: Value) -> str:
+    try:
+        return f"{float(value):g}"
+    except ValueError:
+        return str(value)
+
+
 @pytest.mark.parametrize("preset", WORLDS)
-def test_each_act_happens_in_the_worlds_of_each_preset_or_has_a_reason(
+def test_each_act_and_another_value_of_each_parameter_happen_in_the_worlds_of_each_preset(
     preset: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A world is only planned here, not run, so its guard is not compiled."""
-    kind = WORLDS[preset]
-    monkeypatch.setattr(kind, "guarded", lambda *_values: None)
+    kind, chosen = WORLDS[preset], set[tuple[str, str]]()
+    monkeypatch.setattr(
+        kind,
+        "guarded",
+        lambda _world, values, *_types: chosen.update(
+            (name, _text(value)) for name, value in values.items() if name in parameters_of(preset)
+        ),
+    )
     planned = {planned_act(preset, seed) for seed in range(400)}
+    parameters = PRESETS[preset].parameters
+    varied = {name for name, text in chosen if text != _text(PRESETS[preset].parameter(name).default)}
+    assert {one.name for one in parameters} - varied == set()
     observes = PRESETS[preset].given_topics.keys() - {COMMAND}
     assert planned - {""} == set(ACTS) - kind.not_yet.keys() - (set() if observes else {"cut"})
     assert all(kind.not_yet.values())
@@ -151,6 +170,15 @@ def test_a_seed_gives_the_same_world_again(preset: str) -> None:
         for seed in range(4 if ALL else 3):
             run_one(preset, seed, trace=trace.append)
     assert traces[0] == traces[1] and len(traces[0]) > 10
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.nightly] if at % 4 else []) for at, name in enumerate(TERMS)],
+)
+def test_a_forgotten_term_is_found_in_the_first_worlds(name: str) -> None:
+    assert FAULTS[name].first(4) is not None
 
 
 @pytest.mark.nightly
