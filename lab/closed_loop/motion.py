@@ -214,7 +214,7 @@ class SeparationWorld(DrivenWorld):
     preset: ClassVar[str] = "separation"
     returns = False
     """Whether a scanner that was silent may send again."""
-    tight: ClassVar[tuple[str, ...]] = ("person", "slowing", "turn", "edge")
+    tight_cases: ClassVar[tuple[str, ...]] = ("person", "slowing", "turn", "edge")
 
     def plan(self) -> None:
         r = self.random
@@ -588,14 +588,14 @@ class FenceWorld(DrivenWorld):
 
     preset: ClassVar[str] = "fence"
     tick = 50
-    tight: ClassVar[tuple[str, ...]] = ("straight", "late", "slowing")
+    tight_cases: ClassVar[tuple[str, ...]] = ("straight", "late", "slowing")
     judged_at = -1
     """When the guard judged the last position."""
 
     def plan(self) -> None:
         r = self.random
         self.fault, self.live = "", not self.alone and r.random() < 0.1
-        self.field = FIELDS[0] if self.live else r.choice(FIELDS)
+        self.field: tuple[tuple[float, float], ...] = FIELDS[0] if self.live else r.choice(FIELDS)
         self.margin, ahead, self.silent = 0.2, 0.5, 0.5
         if self.case and not self.alone:
             self._plan_tight()
@@ -644,7 +644,7 @@ class FenceWorld(DrivenWorld):
         """
         r = self.random
         self.live, self.by, self.world_frame, self.noise, self.outside = False, ODOMETRY, False, 0.0, False
-        self.field: Sequence[Point] = ((-8, -8), (8, -8), (8, 8), (-8, 8))
+        self.field = ((-8, -8), (8, -8), (8, 8), (-8, 8))
         self.least, self.origin, self.inward = 0.0, (0.0, 0.0), 0.3
         self.margin, self.silent, self.ahead = 0.01, 0.9, round(r.uniform(0.5, 0.9), 2)
         delay, lag, braking = r.uniform(20, 60), r.randrange(50, 150), r.uniform(1.5, 3)

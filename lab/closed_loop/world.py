@@ -117,14 +117,14 @@ class World:
     beside: "Companion | None" = None
     """A second guard of the same topic. It may stop what the first one lets pass."""
 
-    tight: ClassVar[tuple[str, ...]] = ()
+    tight_cases: ClassVar[tuple[str, ...]] = ()
     """Cases without any reserve, of each ten seeds the first ones: a term that a guard forgets shows in them."""
 
     def __init__(
         self, seed: int, change: Change = unchanged, trace: Callable[[str], None] | None = None
     ) -> None:
         self.seed = seed
-        cases = self.tight if seed % 10 < len(self.tight) else ("",)
+        cases = self.tight_cases if seed % 10 < len(self.tight_cases) else ("",)
         self.case = cases[seed % 10 % len(cases)]
         self.random = random.Random(f"{type(self).__name__} {seed}")  # noqa: S311  a seed gives the same world again
         self.seed = seed

@@ -25,7 +25,7 @@ class ZoneWorld(SeparationWorld):
 
     preset: ClassVar[str] = "zone"
     returns = True
-    tight: ClassVar[tuple[str, ...]] = ()
+    tight_cases: ClassVar[tuple[str, ...]] = ()
     not_yet: ClassVar[Mapping[str, str]] = {}
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut"), "mute": ()}
 

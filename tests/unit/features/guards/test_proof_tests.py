@@ -174,9 +174,12 @@ def test_a_test_of_a_control_that_has_ended_sends_no_stop_and_no_answer() -> Non
     text = made("sane", {}, {})
     quiet, sent = QuietMonitors(), list[str]()
     quiet.load(text)
-    trials = GuardTrials(
-        quiet.loop, quiet.interceptor, lambda topic, _data: sent.append(topic) or (), quiet.reports.send
-    )
+
+    def send(topic: str, _data: object) -> tuple[()]:
+        sent.append(topic)
+        return ()
+
+    trials = GuardTrials(quiet.loop, quiet.interceptor, send, quiet.reports.send)
     test, before = stimulus_of(text, "sane"), len(quiet.reports.sent)
     trials.order(GuardTestWanted(7, "guard", "/cmd_vel", test.messages, test.fault, deliver=True))
     trials.forget()
