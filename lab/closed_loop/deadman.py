@@ -78,7 +78,7 @@ class DeadmanWorld(World):
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         driver = self.drivers[node]
-        if self.now - driver.heard > self.silent * 1000 + SLACK:
+        if driver.heard != NEVER and self.now - driver.heard > self.silent * 1000 + SLACK:
             driver.broke_at = self.now
         driver.heard, driver.wants_motion = self.now, self.moves(wanted)
         late = (self.now - self.made) / 1000

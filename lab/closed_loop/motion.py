@@ -221,7 +221,7 @@ class SeparationWorld(DrivenWorld):
         self.walls: list[Segment] = []
         self.persons: list[Person] = []
         self.fault = ""
-        if self.case and not self.alone:
+        if self.case:
             self._plan_tight()
             return
         self.live = not self.alone and r.random() < 0.12
@@ -597,7 +597,7 @@ class FenceWorld(DrivenWorld):
         self.fault, self.live = "", not self.alone and r.random() < 0.1
         self.field: tuple[tuple[float, float], ...] = FIELDS[0] if self.live else r.choice(FIELDS)
         self.margin, ahead, self.silent = 0.2, 0.5, 0.5
-        if self.case and not self.alone:
+        if self.case:
             self._plan_tight()
             return
         if not self.live:

@@ -214,6 +214,7 @@ class World:
     # Events
 
     def run(self) -> Report:
+        self.case = "" if self.alone else self.case
         self.plan()
         self.every(lambda: 10, self._look, first=10)
         try:
