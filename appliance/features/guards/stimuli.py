@@ -77,6 +77,7 @@ class _Robot:
     ) -> None:
         self._preset, self.topics, self.types, self.values = preset, topics, types, values
         self._moves = types["command"] in VELOCITIES
+        self._definitions = standard_definitions()  # takes longer than all messages
 
     def stimulus(self) -> Stimulus:
         speed = self.speed()
@@ -116,7 +117,7 @@ class _Robot:
             yield self._said("command", _DRIVER, command)
 
     def _said(self, topic: str, node: str, fields: Fields | None) -> SyntheticMessage:
-        data = encoded(standard_definitions(), self.types[topic], fields or {})
+        data = encoded(self._definitions, self.types[topic], fields or {})
         return SyntheticMessage(0.0, self.topics[topic], data, node)
 
     def number(self, name: str) -> float:
@@ -415,6 +416,9 @@ def encoded(definitions: Definitions, kind: str, fields: Fields) -> bytes:
         items = [None] * (one.length or 0) if value is None else value
         if one.length is None:
             data += struct.pack("<I", len(items))
+        if one.type in PRIMITIVES and value is not None and one.type not in ("time", "duration"):
+            data += struct.pack(f"<{len(items)}{PRIMITIVES[one.type][0]}", *items)
+            continue
         for item in items:
             data += _value(definitions, one.type, item)
     return bytes(data)
