@@ -175,11 +175,11 @@ def test_a_test_of_a_control_that_has_ended_sends_no_stop_and_no_answer() -> Non
     quiet, sent = QuietMonitors(), list[str]()
     quiet.load(text)
 
-    def send(topic: str, _data: object) -> tuple[()]:
+    def deliver(topic: str, _data: bytes) -> list[Any]:
         sent.append(topic)
-        return ()
+        return []
 
-    trials = GuardTrials(quiet.loop, quiet.interceptor, send, quiet.reports.send)
+    trials = GuardTrials(quiet.loop, quiet.interceptor, deliver, quiet.reports.send)
     test, before = stimulus_of(text, "sane"), len(quiet.reports.sent)
     trials.order(GuardTestWanted(7, "guard", "/cmd_vel", test.messages, test.fault, deliver=True))
     trials.forget()
