@@ -352,7 +352,7 @@ class SeparationWorld(DrivenWorld):
             case "turn":
                 angle, arc = r.uniform(1.8, 2.4), top / turning
                 x, y = abs(arc) * math.sin(angle), arc * (1 - math.cos(angle))
-                self.walls = [(x, y, x + 0.05, y)]
+                self.walls = [(x - 0.1, y, x + 0.1, y)]
             case _:
                 self.walls = [(5.0, self.radius - 0.03, 5.0, 5.0)]
         self.guarded({
@@ -363,7 +363,7 @@ class SeparationWorld(DrivenWorld):
             (100.0, 100.0, 145.0, 60.0, 104.0) if self.case == "slowing" else (100.0,)
         )
         self.scanner(0.0, delay, lambda: next(intervals))
-        self.far = 30.0
+        self.far, self.angles = 30.0, np.linspace(-math.pi, math.pi, 361)  # a ray goes straight on
         self.legs = (top, 0.0, 0.0, 0.0, 0.0, turning)
         again = 400 if self.case == "turn" else 60_000
         self.every(lambda: again, lambda: void(self.drive(self.legs)), first=1000)
