@@ -3,7 +3,8 @@ import re
 import pytest
 
 from appliance.features.guards.presets import PRESETS
-from lab.closed_loop.guard_run import parameters_of
+from lab.closed_loop.guard_run import RunningGuard, parameters_of
+from lab.closed_loop.messages import STILL, TWIST, boolean, command, legs_of, straight
 from lab.closed_loop.planted import FAULTS, TERMS, WITHIN, no_guard, stops_everything
 from lab.closed_loop.senders import HONEST, KINDS
 from lab.closed_loop.world import ACTS, COMMAND
@@ -186,3 +187,24 @@ def test_a_forgotten_term_is_found_in_the_first_worlds(name: str) -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_planted_fault_is_found(name: str) -> None:
     assert FAULTS[name].first(10 * WITHIN if ALL else WITHIN) is not None
+
+
+@pytest.mark.parametrize("forget", [0, 7])
+@pytest.mark.parametrize("preset", ["estop", "mode"])
+def test_a_press_counts_from_the_first_millisecond(preset: str, forget: int) -> None:
+    """What a node said before the first tick is not forgotten with what was known before."""
+    guard = RunningGuard(preset, {"command": TWIST}, {"silent": 0.0, "publishers": 0, "forget": forget})
+    source = guard.topics["stop" if preset == "estop" else "by"]
+
+    def tell(topic: str, data: bytes, at: int, node: int) -> bytes | None:
+        list(guard.advance(at))
+        return guard.tell(topic, data, at, node)[0]
+
+    tell(source, boolean(True), 5, 3)
+    tell(source, boolean(False), 500, 4)
+    if preset == "estop":
+        for at, pressed in ((700, False), (1000, True), (1200, False)):
+            tell(guard.topics["reset"], boolean(pressed), at, 5)
+    tell(guard.topics["command"], command(TWIST, STILL, 1500), 1500, 1)
+    passed = tell(guard.topics["command"], command(TWIST, straight(2.0), 1600), 1600, 1)
+    assert passed is None or max(map(abs, legs_of(TWIST, passed))) <= 0.25
