@@ -111,7 +111,7 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
                       "origin": row.origin, "afresh": row.afresh, "below": row.below,
                        "digest": row.digest, "last_stop": msgspec.to_builtins(row.last_stop),
-                       "times": row.times})  # fmt: skip
+                       "times": row.times, "tested": row.tested})  # fmt: skip
         else:
             about = f"guard {row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())},"
             say_row([about, state_in_words(row)], gap=" ")
