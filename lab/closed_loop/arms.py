@@ -106,6 +106,8 @@ class JointsWorld(World):
         """How far each joint has come beyond 1.1 `vMax`, as far as it has not yet waited for it."""
         self.rest: list[float] | None = [0.0] * len(JOINTS)
         """How far each joint may still move since a stop."""
+        self.unknown = False
+        """Whether the last stop was beside the guard, which does not know of it: then its own begins again."""
         self.ends = 0.0
         """When the last trajectory that was sent ends."""
         self.kept: list[Sent] = []
@@ -286,6 +288,7 @@ class JointsWorld(World):
         """Stop the arm beside the guard, as a cancelled goal does."""
         self.trace("the goal is cancelled")
         self._stop()
+        self.unknown = True
         self.ends = self.time
 
     def walk(self) -> list[Point]:
@@ -341,9 +344,8 @@ class JointsWorld(World):
     # Motion
 
     def receive(self, at: int, topic: str, data: bytes, sent: Sent | None = None) -> None:
-        """Take a trajectory; one of the guard is empty, and stops the arm."""
-        if topic == self.guard.topics[COMMAND]:
-            self.after(max(at, self.now) + self.delay, lambda: self._take(sent))
+        """Take a trajectory; what the guard sends, also to the topic that cancels goals, stops the arm."""
+        self.after(max(at, self.now) + self.delay, lambda: self._take(sent))
 
     def _take(self, sent: Sent | None) -> None:
         if sent is None or not sent.points:
@@ -354,11 +356,17 @@ class JointsWorld(World):
             self.trace("the controller rejects it")
 
     def _stop(self) -> None:
-        if self.rest is None:
+        if self.rest is None or self.unknown:
+            self.unknown = False
             most = 0.625 * self.stopping
-            velocities = (abs(self.controller.state(joint, self.time)[1]) for joint in range(len(JOINTS)))
             # It begins at the last update of the controller, or the state before.
-            self.rest = [most * one + 2 * one * self.controller.period + _NEAR for one in velocities]
+            times = self.time, self.controller.updated(self.time)
+            velocities = (
+                max(abs(self.controller.state(joint, time)[1]) for time in times)
+                for joint in range(len(JOINTS))
+            )
+            ways = [most * one + 2 * one * self.controller.period + _NEAR for one in velocities]
+            self.rest = [max(pair) for pair in zip(ways, self.rest or ways, strict=True)]
         self.controller.stop(self.time)
 
     @property
