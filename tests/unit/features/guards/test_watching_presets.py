@@ -1,20 +1,15 @@
 import itertools
 import math
-import random
-from collections import Counter
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.polynomial.polynomial import polyder, polyval
 
 from appliance.features.guards.presets import PRESETS, Guard, loaded_values, text_of
 from appliance.features.guards.robot_graph import GOAL
-from lab.closed_loop.arms import Point, curve
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.types.roles import ANY_TYPE
-from tests.unit.features.guards.guarding import BEGIN, NODES, Guarded, legs_of, seeded, twist
+from tests.unit.features.guards.guarding import BEGIN, NODES, Guarded, legs_of, twist
 
 GO = twist(0.5)
 
@@ -526,85 +521,6 @@ def test_a_stamp_of_a_simulated_clock_counts_as_now() -> None:
         guard.tell("state", state(0, 0), 1)
         given = trajectory(JOINTS, (1, [0, 0]), stamp=12.5)
         assert (guard.tell("command", given, 2).result == "passed") == simulated
-
-
-class Controller:
-    """A joint of joint_trajectory_controller: segments with begin, end and the coefficients of their curves."""
-
-    def __init__(self, place: float) -> None:
-        self.ways: list[tuple[float, float, tuple[float, ...]]] = [(-math.inf, -math.inf, (place,))]
-
-    def sample(self, time: float) -> list[float]:
-        """Return position, velocity and acceleration; the end of a trajectory is held."""
-        begin, end, way = next(one for one in reversed(self.ways) if one[0] <= time)
-        if time > end:
-            return [float(polyval(end - begin, way)) if end > begin else way[0], 0.0, 0.0]
-        return [float(polyval(time - begin, polyder(way, order))) for order in range(3)]
-
-    def take(self, now: float, stamp: float, points: Sequence[tuple[float, Sequence[float]]]) -> None:
-        """Take a trajectory, or a stop. Each point has its time, and its position, velocity and acceleration so far."""
-        begin = stamp or now
-        left = [(begin + at, values) for at, values in points if begin + at > now]
-        if not points:
-            self.ways = [(-math.inf, -math.inf, (self.sample(now)[0],))]
-        if not left:
-            return
-        at = max(begin, now)
-        before, state = at, self.sample(at)
-        self.ways = [one for one in self.ways if one[0] < at]
-        for end, values in left:
-            ends = [Point(when, *zip(some)) for when, some in ((0, state), (end - before, values))]
-            self.ways += [(before, end, curve(ends[0], ends[1], 0))] if end > before else []
-            before, state = end, [*values]
-
-
-def random_points(r: random.Random, places: list[float], v_max: float, most: float) -> list[tuple[Any, ...]]:
-    values, at, points = r.choice((1, 2, 3)), 0.0, []
-    if r.random() < 0.3:
-        points.append((0.0, *(places, [0.0] * len(places), [0.0] * len(places))[:values]))
-    for _ in range(r.choice((1, 1, 2, 4))):
-        seconds = r.choice((0.01, 0.05, 0.3, 1.0))
-        at += seconds
-        places = [max(-most, min(most, one + r.uniform(-1, 1) * v_max * seconds)) for one in places]
-        more = [[r.uniform(-1, 1) * size for _ in places] for size in (0.3 * v_max, 2.0)]
-        points.append((at, *(places, *more)[:values]))
-    return points
-
-
-def test_a_controller_that_is_preempted_keeps_limits_and_velocity() -> None:
-    """Trajectories come at any time, with stamps in the past and the future, and for some of the joints."""
-    v_max, most, jump, passed = 1.0, 1.0, 0.1, Counter[str]()
-    for seed in range(12):
-        r = seeded(seed)
-        guard = Guarded("joints", low=-most, high=most, vMax=v_max, aMax=10, jump=jump)
-        arm = {name: Controller(r.uniform(-0.9, 0.9)) for name in JOINTS}
-        line = []
-        for ms in range(0, 6000, 2):
-            now = ms / 1000
-            states = [joint.sample(now) for joint in arm.values()]
-            line.append([position for position, *_ in states])
-            if ms % 8 == 0:
-                positions, velocities, _ = map(list, zip(*states, strict=True))
-                told = message("sensor_msgs/JointState", name=JOINTS, position=positions, velocity=velocities)
-                guard.tell("state", told, ms)
-            if r.random() < 0.99:
-                continue
-            names = r.sample(JOINTS, r.choice((1, 2, 2)))
-            kind, begin = r.choice((("now", 0.0), ("past", -0.3), ("soon", 0.1), ("later", 1.0)))
-            stamp = now + r.random() * begin if begin else 0.0
-            points = random_points(r, [arm[name].sample(max(stamp, now))[0] for name in names], v_max, most)
-            given = trajectory(names, *points, stamp=BEGIN / 1e9 + stamp if stamp else 0)
-            goes = guard.tell("command", given, ms).result == "passed"
-            passed[kind] += goes
-            for place, name in enumerate(names if goes else JOINTS):
-                way = [(at, [value[place] for value in values]) for at, *values in points] if goes else []
-                arm[name].take(now, stamp, way)
-        places = np.array(line)
-        assert np.abs(places).max() <= most + 1e-3, seed
-        for window in (25, 250):
-            moved = np.abs(places[window:] - places[:-window]).max()
-            assert moved <= 1.1 * v_max * window * 0.002 + 1.2 * jump, (seed, window)
-    assert min(passed[kind] for kind in ("now", "past", "soon", "later")) >= 5, passed
 
 
 def with_id(name: str, before: int, behind: int) -> bytes:
