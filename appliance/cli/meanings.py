@@ -186,7 +186,7 @@ READING = {
     "door": "list",
     "drive": "status",
     "evidence": "verify verifier",
-    "guard": "list show suggest",
+    "guard": "list manual show suggest",
     "host": "blocks list show",
     "monitor": "check coverage diff list replay revisions run show",
     "node": "list",

@@ -48,7 +48,8 @@ GAPS = (
 NO_INTERVENTION = frozenset(
     {
         # what hosts and nodes did, and what the rules and monitors made of it
-        "decision", "registered", "adopted", "guard bypassed", "guard loaded", "unregistered", "revoked", "node lost",
+        "decision", "registered", "adopted", "guard bypassed", "guard loaded",
+        "guard late", "heartbeat begun", "heartbeat ended", "unregistered", "revoked", "node lost",
         "node returned", "replaced", "takeover",
         "approval used", "approval wanted", "authority asked", "authority refused", "motion not stopped",
         "motion stopped", "topics held", "monitor verdict", "message dropped", "message changed", "monitor fault",

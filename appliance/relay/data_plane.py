@@ -93,7 +93,7 @@ class DataPlane:
             limits,
             self.interceptor,
             publish=lambda data: self._publish(limits.heartbeat, data),
-            topics=lambda: [topic for topic in self.topics.values() if topic.is_judged],
+            topics=lambda: [topic for topic in self.topics.values() if topic.delays.judged],
             unwritten=self._unwritten_stop,
         )
         self._trials = GuardTrials(loop, self.interceptor, self._deliver, self._reporter.send)

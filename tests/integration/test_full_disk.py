@@ -59,7 +59,7 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
 UNSTORED = {
     "host block", "host revoke", "token revoke", "record now", "recording memory", "recording remove",
     "standby promote", "door remove", "drive take", "drive give", "drive ask", "sso end", "sso sign out",
-    "door visit", "approve", "approval refuse", "guard try",
+    "door visit", "approve", "approval refuse", "guard try", "guard test",
 }  # fmt: skip
 LOOKS: tuple[admin.AdminRequest[Any], ...] = (
     admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(),

@@ -88,8 +88,12 @@ class StopReached(msgspec.Struct, frozen=True):
     node: Annotated[str, doc("the subscriber")]
     host: Annotated[str, doc("its host")]
     driver: Annotated[bool, doc("it carries out the command; others only listen")]
-    accepted: Annotated[float | None, doc("until the socket of its connection had accepted all bytes")]
-    acknowledged: Annotated[float | None, doc("until the TCP of its host had acknowledged all bytes")]
+    accepted: Annotated[
+        float | None, doc("the seconds until the socket of its connection had accepted all bytes")
+    ]
+    acknowledged: Annotated[
+        float | None, doc("the seconds until the TCP of its host had acknowledged all bytes")
+    ]
 
 
 class ProofTest(msgspec.Struct, frozen=True):

@@ -20,13 +20,13 @@ def manual(
     appliance: Appliance,
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write the manual to this file")
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write the manual to this file")
     ] = None,
     diff: Annotated[
         Path | None,
         typer.Option(
             "--diff", metavar="FILE",
-            help="Compare it with an earlier manual: without --out, print only the difference; with it, the new manual"
+            help="Compare it with an earlier manual: without --output, print only the difference; with it, the new manual"
             " ends with the difference. Exit status 1 if the contents differ",
         ),
     ] = None,
@@ -36,7 +36,7 @@ def manual(
     It is Markdown with a digest, and lines for the signatures of two persons. The same guards, values and topics give
     the same digest. Nothing changes.
 
-    Example: rosrv guard manual --out manual.md --diff manual-of-may.md
+    Example: rosrv guard manual --output manual.md --diff manual-of-may.md
     """
     status = appliance.ask_or_exit(StatusWanted())
     guards = appliance.ask_or_exit(GuardsWanted(presets=False))

@@ -236,6 +236,24 @@ class _Monitoring:
     wanted: bool = False
 
 
+class Delays:
+    """How late messages of a topic were written, since the last `take`. `judged` is whether monitors judge them."""
+
+    def __init__(self, late: float) -> None:
+        self._late = late  # seconds
+        self._waited, self._told = 0.0, 0
+        self.judged = False
+
+    def waited(self, seconds: float) -> None:
+        """Note that messages waited in the publisher's socket because the relay served others."""
+        self._waited = max(self._waited, seconds)
+
+    def take(self, counters: Traffic) -> tuple[int, float]:
+        late, self._told = counters.late - self._told, counters.late
+        waited, self._waited = self._waited, 0.0
+        return late + (waited > self._late), max(counters.longest / 1e9, waited)
+
+
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
 
@@ -276,8 +294,7 @@ class RelayedTopic:
         self.plain = Version()
         """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
         self.counters = Traffic(late)
-        self._late, self._waited, self._told = late, 0.0, 0
-        self.is_judged = False
+        self.delays = Delays(late)
         self.latch = LatchedMessage(share, make_room, lambda size: refused(LatchRefused(key, topic, size)))
         self._served = ServedSubscribers(over)
         self._state = TopicState.UNKNOWN
@@ -396,7 +413,7 @@ class RelayedTopic:
         """
         self._is_command |= guarded
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
-        self.is_judged = through is not None
+        self.delays.judged = through is not None
         self.differs()
         if wanted == before.wanted:
             return
@@ -671,15 +688,9 @@ class RelayedTopic:
                 if member in members:
                     self._served.deliver(passing, member)
 
-    def waited(self, seconds: float) -> None:
-        """Note that messages waited in the publisher's socket because the relay served others."""
-        self._waited = max(self._waited, seconds)
-
     def take_late(self) -> tuple[int, float]:
         """Return the late messages since the last call, and the longest delay or wait in seconds."""
-        late, self._told = self.counters.late - self._told, self.counters.late
-        waited, self._waited = self._waited, 0.0
-        return late + (waited > self._late), max(self.counters.longest / 1e9, waited)
+        return self.delays.take(self.counters)
 
     def traffic(self) -> TopicTraffic | None:
         if self._reported and not self.counters.messages and not self._served.dropped:

@@ -115,7 +115,7 @@ class UpstreamReader:
 
     def _ready(self, _events: int) -> None:
         if self._loop.waited:
-            self._topic.waited(self._loop.waited)
+            self._topic.delays.waited(self._loop.waited)
         left = self._pumped.step()
         if left is None:
             return

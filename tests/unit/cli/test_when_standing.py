@@ -42,6 +42,7 @@ AT_ONCE = {
     "monitor rollback": "it undoes a change that may be the harm",
     "policy confirm": _NO_MOTION,
     "monitor confirm": _NO_MOTION,
+    "guard test": "it is rejected unless the robot stands still",
     "monitor replace": "a client of REST gives it: `monitor load` is the verb",
     "guard set": "a client of REST gives it: the verb `guard set` gives `monitor load` and `monitor set`",
     "monitor remove": _ENDS,

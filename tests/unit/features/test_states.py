@@ -42,8 +42,8 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
         [("approval-unanswered", "warning"), ("approval-hook", "warning")],
     ),
     "guards": (
-        {"loaded": 2, "acting": [{"name": "fence", "since": 1.5}]},
-        [("guard-acts:fence", "notice")],
+        {"loaded": 2, "acting": [{"name": "fence", "since": 1.5}], "heartbeat": "a relay is late"},
+        [("guard-acts:fence", "notice"), ("heartbeat-off", "alarm")],
     ),
     "adopt": (
         {

@@ -5,7 +5,7 @@ import random
 
 import numpy as np
 
-from lab.closed_loop import arms
+from lab.closed_loop import controller
 from lab.closed_loop.messages import (
     ODOMETRY,
     Legs,
@@ -228,7 +228,7 @@ def _keeps(points: list[Point], joints: int, most: float, v_max: float, a_max: f
 
 def _bent(points: list[Point], most: float, v_max: float) -> tuple[float, float]:
     """Return how much of the limits of position and of velocity the ways between points have, of samples."""
-    far, fast = arms.extremes([arms.Point(one[0], *map(tuple, one[1:])) for one in points], 200)
+    far, fast = controller.extremes([controller.Point(one[0], *map(tuple, one[1:])) for one in points], 200)
     return far / most, fast / (1.1 * v_max)
 
 
