@@ -26,8 +26,8 @@ def manual(
         Path | None,
         typer.Option(
             "--diff", metavar="FILE",
-            help="Compare it with an earlier manual: without --output, print only the difference; with it, the new manual"
-            " ends with the difference. Exit status 1 if the contents differ",
+            help="Compare it with an earlier manual: without --output, print only the difference; with it, the new"
+            " manual ends with it. Exit status 1 if the contents differ",
         ),
     ] = None,
 ) -> None:  # fmt: skip
