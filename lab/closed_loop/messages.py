@@ -126,7 +126,7 @@ def boolean(on: bool) -> bytes:
 
 @functools.cache
 def diagnostics(level: int, beside: int = 0) -> bytes:
-    """Return an entry, beside an entry of another name; nodes that say it are told apart."""
+    """Return an entry, beside an entry of another name; nodes that say it are different nodes."""
     entries = [{"name": "fan", "level": beside}, {"name": "motor", "level": level}]
     return message("diagnostic_msgs/DiagnosticArray", status=entries)
 

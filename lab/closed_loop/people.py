@@ -243,8 +243,10 @@ class DiagnosticsWorld(EnableWorld):
         )
         return diagnostics(level, 0 if self.named == "*" else self.random.choice((0, 2)))
 
-    def unheard(self, _slack: int) -> bool:
-        return not self.switches  # it has no `publishers`: a part that never speaks is not known
+    def unheard(self, slack: int) -> bool:
+        return (
+            not self.switches and self.now >= self.forgot + slack
+        )  # it has no `publishers`: a part that never speaks is not known
 
     def heard(self, switch: Switch) -> None:
         switch.was_off = True

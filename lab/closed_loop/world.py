@@ -137,7 +137,7 @@ class World:
         self.holding = False
         """Whether the guard has been made to hold, and is not yet resumed."""
         self.bytes: bytes | None = None
-        """What became of the last command behind the guard."""
+        """The last command, as it left the guard."""
         self.fresh_from = 0
         """A motion is only allowed if its command came after this time."""
         self.made = 0

@@ -211,7 +211,7 @@ def differences(before: Any, after: Any, at: str = "") -> Iterator[str]:
             yield from differences(before.get(key), after.get(key), f"{at} / {key}")
     elif isinstance(before, list) and isinstance(after, list):
         gone, new = Counter(before) - Counter(after), Counter(after) - Counter(before)
-        if new or (gone and "kept" not in at):  # a row of an earlier loss may be forgotten meanwhile
+        if new or (gone and "kept" not in at):  # a row of an earlier loss may be forgotten since
             yield f"{at}: gone {dict(gone)}, new {dict(new)}"
     elif before != after:
         yield f"{at}: {before!r:.300} → {after!r:.300}"

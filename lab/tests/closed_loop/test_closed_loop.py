@@ -192,7 +192,7 @@ def test_each_planted_fault_is_found(name: str) -> None:
 @pytest.mark.parametrize("forget", [0, 7])
 @pytest.mark.parametrize("preset", ["estop", "mode"])
 def test_a_press_counts_from_the_first_millisecond(preset: str, forget: int) -> None:
-    """What a node said before the first tick is not forgotten with what was known before."""
+    """A press before the first tick is not forgotten with what was known before."""
     guard = RunningGuard(preset, {"command": TWIST}, {"silent": 0.0, "publishers": 0, "forget": forget})
     source = guard.topics["stop" if preset == "estop" else "by"]
 

@@ -104,7 +104,7 @@ class ComparedRelay(Monitored):
         self.hears(UpstreamWanted, key="k", topic=topic)
         self.state(UpstreamFound("k", topic, LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)
-        while self.gets_header(peer)["callerid"] == "/rosrv_newcomer":  # which asked for a greeting meanwhile
+        while self.gets_header(peer)["callerid"] == "/rosrv_newcomer":  # which asked for a greeting
             peer.sock.close()
             peer = self.accept(self.publisher)
         peer.send(encode_header(TYPED | {"topic": topic}))
