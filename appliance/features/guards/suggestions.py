@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 from appliance.base.counted import counted
 from appliance.features.guards import robot_graph as types
-from appliance.features.guards.presets import PRESETS
 from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, SIDE, RobotGraph, TopicFacts
 
 _WORD = re.compile(r"[a-z]+")
@@ -35,7 +34,7 @@ _WORLD_FRAME = re.compile(r"/mavros/setpoint_velocity/")  # MAVROS takes them in
 _SCAN_OF_A_CAMERA = re.compile(r"camera|depth|rgbd", re.IGNORECASE)
 _MANUAL = re.compile(r"(?:is_|in_)?manual(?:_?mode)?(?:_active|_enabled|_on)?", re.IGNORECASE)
 _MODE = re.compile(r"manual|auto(?:nomous|matic)?(?=_|$)|(?:^|_)mode(?=_|$)", re.IGNORECASE)
-_RESET_TOPIC = PRESETS["estop"].given_topics["reset"]
+_RESET_TOPIC = "/emergency_stop_reset"  # of `estop`, whose text is read later
 _JOY = "sensor_msgs/Joy"
 _CLOUD = "sensor_msgs/PointCloud2"
 _BOOL = "std_msgs/Bool"
