@@ -27,6 +27,7 @@ from lab.closed_loop.senders import (
     OVERSHOOT,
     PARTIAL,
     SENDERS,
+    UNSTAMPED,
     Sent,
     bare,
     line,
@@ -119,7 +120,9 @@ class JointsWorld(World):
         limits = " ".join(f"{name}:{-self.most}..{self.most}" for name in JOINTS) if r.random() < 0.5 else ""
         values = {"vMax": self.fastest, "aMax": self.growth, "jump": self.jump, "silent": self.silent}
         bounds = {"limits": limits} if limits else {"low": -self.most, "high": self.most}
-        declared = {"stopDuration": self.stopping, "partial": self.controller.partial}
+        # Without a stamp, it makes no difference whose clock a stamp would be of.
+        simulated = self.sender in UNSTAMPED and self.seed // len(KINDS) % 3 == 1
+        declared = {"simulated": simulated, "stopDuration": self.stopping, "partial": self.controller.partial}
         self.kind = GOAL if r.random() < 0.25 and self.sender != "unstopped" else TRAJECTORY
         self.began, self.rate = float(EPOCH), 1.0
         """The second in which the controller's time begins, and the seconds of it in a second."""

@@ -461,5 +461,7 @@ SENDERS: Mapping[str, Callable[["JointsWorld"], Sends]] = {
     "stream": stream,
     "unstopped": unstopped,
 }
+UNSTAMPED = {"servo", "sliders", "stream"}
+"""Senders none of whose trajectories has a stamp."""
 PARTIAL = {"partial", "halves"}
 KINDS: Sequence[str] = sorted(SENDERS)

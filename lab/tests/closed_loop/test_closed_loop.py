@@ -75,8 +75,6 @@ def test_each_act_and_another_value_of_each_parameter_happen_in_the_worlds_of_ea
     preset: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A world is only planned here, not run, so its guard is not compiled."""
-    if preset == "joints":
-        pytest.xfail("the worlds of arms have no simulated clock")
     kind, chosen = WORLDS[preset], set[tuple[str, str]]()
     monkeypatch.setattr(
         kind,
