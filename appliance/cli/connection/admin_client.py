@@ -84,7 +84,8 @@ class AdminSocket:
                 answer = self._read(sock)
         except FileNotFoundError:
             raise self._absent(
-                "no appliance is running with this state directory; start it: rosrv up"
+                "no appliance is running with this state directory; start it:"
+                " systemctl start rosrv (the package's service), or rosrv up"
             ) from None
         except PermissionError:
             raise AccessDeniedError(f"{path}: only its owner and root have access; use sudo") from None
