@@ -252,24 +252,42 @@ def test_the_quickstart_is_quick() -> None:
     assert (text.count("\n## "), len(denied), len(words) <= 250) == (5, 1, True), len(words)
 
 
-def test_a_robot_is_protected_with_six_pages_and_eight_verbs() -> None:
-    """The way of a newcomer: from README by each page's first link after *Next*, with the commands on the way."""
-    parts = {"quickstart.md": "", "guards.md": "## Three minutes", "close-the-ports.md": "# Close the ports"}
-    page, seen, verbs = ROOT / "README.md", ["README.md", "install.md"], set[str]()
+STEPS = ("quickstart.md", "close-the-ports.md", "policy.md", "guards.md", "driving.md", "operating.md")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_step_has_its_number_and_leads_to_the_next(page: Path) -> None:
+    """The way of a newcomer to a protected robot. A running robot has another first step."""
+    text = page.read_text()
+    name = page.name if page.parent.name == "docs" else ""
+    number = STEPS.index(name) + 1 if name in STEPS else 1 if name == "try-for-an-hour.md" else 0
+    numbers = re.findall(r"^Step (\d) of (\d)\b", text, re.MULTILINE)
+    assert numbers == ([(str(number), str(len(STEPS)))] if number else [])
+    following = re.findall(r"^\*\*Next\*\*.*?\]\(([^)#]+)", text, re.MULTILINE)
+    assert not number or following == [*STEPS[number : number + 1]]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/README.md"])
+def test_the_steps_are_listed_in_their_order(page: str) -> None:
+    named = re.findall(
+        r"^(?:\d\. |\| )\[[^]]+\]\((?:docs/)?([\w-]+\.md)\)", (ROOT / page).read_text(), re.MULTILINE
+    )
+    assert tuple(one for one in named if one in STEPS) == STEPS
+
+
+def test_the_first_steps_need_eight_verbs() -> None:
+    parts = {
+        "quickstart.md": ("# Quickstart", "**Next**"),
+        "guards.md": ("## Three minutes", "\n## "),
+        "close-the-ports.md": ("# Close the ports", "\n## "),
+    }
     options = options_of_verbs()
-    following = "docs/quickstart.md"
-    while following.rpartition("/")[2] in parts:
-        page = page.parent / following
-        seen.append(page.name)
-        text = page.read_text()
-        part = text.partition(parts[page.name])[2].partition("\n## ")[0] if parts[page.name] else text
-        calls = re.findall(r"(?:^|\$ |sudo )rosrv ([a-z][^\n`|]*)", part, re.MULTILINE)
-        verbs |= {
-            max((one for one in options if f"{call} ".startswith(f"{one} ")), key=len) for call in calls
-        }
-        following = re.findall(r"^\*\*Next\*\*.*?\]\(([^)#]+)", text, re.MULTILINE)[0]
-    assert f"({following})" in text
-    assert seen == ["README.md", "install.md", *parts]
+    texts = [
+        (ROOT / "docs" / page).read_text().partition(begin)[2].partition(end)[0]
+        for page, (begin, end) in parts.items()
+    ]
+    calls = re.findall(r"(?:^|\$ |sudo )rosrv ([a-z][^\n`|]*)", "\n".join(texts), re.MULTILINE)
+    verbs = {max((one for one in options if f"{call} ".startswith(f"{one} ")), key=len) for call in calls}
     assert verbs == {
         "status", "audit search", "policy grant", "guard suggest", "guard new", "guard enforce", "monitor confirm",
         "protect",
@@ -290,10 +308,10 @@ def test_the_changelog_has_no_fact_twice() -> None:
     assert twice == []
 
 
-def test_the_first_hour_does_not_use_the_state_of_the_service() -> None:
-    """It starts with revision 1 and a first token, and its monitor is gone with it."""
-    scripts = "".join(step.script for step in steps("first-hour.md"))
-    assert set(re.findall(r"(?:--state |STATE=)(\S+)", scripts)) == {"/var/lib/rosrv-hour"}
+def test_the_example_of_the_audit_log_does_not_use_the_state_of_the_service() -> None:
+    """It starts with a new log, and its monitor is gone with it."""
+    scripts = "".join(step.script for step in steps("audit.md"))
+    assert set(re.findall(r"(?:--state |STATE=)(\S+)", scripts)) == {"/var/lib/rosrv-audit"}
 
 
 def test_the_changelog_begins_with_what_an_upgrade_asks_for() -> None:

@@ -3,7 +3,7 @@ from tests.support.sources import ROOT
 ELSEWHERE = {
     "tests/support/small_disk.py",
     "tests/integration/features/standby/test_robot_kit.py",  # in the mount namespace of a host, and ends with it
-    "tests/package/test_first_hour.py",  # detaches its own, with what late processes have open
+    "tests/package/test_audit_page.py",  # detaches its own, with what late processes have open
     "tests/package/test_arm64_machine.py",  # binfmt_misc, for the programs of another processor
     "tests/unit/support/test_small_disk.py",
 }

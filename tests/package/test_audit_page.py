@@ -18,7 +18,7 @@ pytestmark = pytest.mark.timeout(1200)  # the package is built first
 @pytest.fixture
 def hosts() -> Iterator[dict[str, Host]]:
     need_root()
-    with own_namespace(), Lab("rosrv-hour") as lab:
+    with own_namespace(), Lab("rosrv-audit") as lab:
         yield {
             "machine": lab.host("machine", "10.84.0.2/24"),
             "robot": lab.host("robot", "10.84.0.10/24"),
@@ -59,7 +59,7 @@ def test_the_page_is_true(hosts: dict[str, Host], installed: Path) -> None:
         "COLUMNS": "200",
     }
     try:
-        for step in steps("first-hour.md"):
+        for step in steps("audit.md"):
             script = f"exec 2>&1\ncd /root\n{step.script}"
             command = ["chroot", str(installed), "bash", "-euo", "pipefail", "-c", script]
             label = f"{step.host}: {step.script.splitlines()[-1]}"
