@@ -19,7 +19,7 @@ command line, unless the command's text says otherwise.
 ## Options of many commands
 
 """
-_SHARED_BY = 8  # the minimum number of commands that share an option
+_SHARED_BY = 4  # the minimum number of commands that share an option
 
 
 class _Command(NamedTuple):
@@ -32,12 +32,17 @@ class _Command(NamedTuple):
 def page() -> str:
     """Return the page: options that many commands share, then each command."""
     found = [*_commands("rosrv", app), *_commands("rosmop", rosmop_app)]
+    titles = {one.help: one.title for one in found}
     uses = Counter(option for one in found for option in one.options)
-    shared = sorted(option for option, number in uses.items() if number >= _SHARED_BY)
-    return _HEAD + _table(shared) + "".join(_section(one, set(shared)) for one in found)
+    often = [one for one, number in uses.most_common() if number >= _SHARED_BY and one[0].startswith("-")]
+    shared = sorted({flags: (flags, text) for flags, text in reversed(often)}.values())  # the most used text
+    return _HEAD + _table(shared) + "".join(_section(one, set(shared), titles) for one in found)
 
 
-def _section(one: _Command, shared: set[tuple[str, str]]) -> str:
+def _section(one: _Command, shared: set[tuple[str, str]], titles: dict[str, str]) -> str:
+    same = titles.get(re.sub(r"\brosmop\b", "rosrv monitor", one.help), one.title)
+    if same != one.title:
+        return f"\n## {one.title}\n\nThe same as [`{same}`](#{same.replace(' ', '-')}).\n"
     text = f"\n## {one.title}\n\n{one.help}\n\n    {one.title} {one.usage}\n".replace("\n\n\n", "\n\n")
     own = [option for option in one.options if option not in shared]
     common = [_name(flags) for flags, _ in one.options if (flags, _) in shared and "--help" not in flags]

@@ -91,7 +91,10 @@ _Relayed = Annotated[
 ]
 _Mediation = Annotated[
     str | None,
-    typer.Option(help="full, or monitored: nodes get each other's real URIs (needs --relay monitored)"),
+    typer.Option(
+        help="full: nodes see only the appliance; monitored (needs --relay monitored): nodes get each other's real"
+        " URIs, so the appliance is not a boundary"
+    ),
 ]
 _Api = Annotated[
     str | None,

@@ -218,7 +218,7 @@ def release(
         bool,
         typer.Option(
             "--dead",
-            help="The appliance has crashed and stays off: give the graph back from its stored state",
+            help="If the appliance has crashed and stays off, give the graph back from its stored state",
         ),
     ] = False,
     force: Annotated[

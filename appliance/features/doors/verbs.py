@@ -104,7 +104,7 @@ def ticket(
     *,
     time: Annotated[str, typer.Option("--for", help="How long it is valid: 30m, 8h; at most 30d")] = "8h",
 ) -> None:
-    """Make a ticket: a URL with which a person's browser or Foxglove opens the door. It is shown only here.
+    """Make a ticket: a URL with which a person's browser or Foxglove opens the door. It is shown once.
 
     Anyone who has the URL has the rights of the door until the ticket ends.
 

@@ -45,7 +45,7 @@ Force = Annotated[
     bool,
     typer.Option(
         "--force",
-        help="Load or enforce even if this cuts a topic, because its publisher and the monitor have different types",
+        help="Load or enforce even if this disconnects a publisher whose message type differs from the monitor's",
     ),
 ]
 
@@ -124,7 +124,7 @@ def enforce(
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
 ) -> None:
-    """Bring monitors from shadow mode into force. They keep their state.
+    """Bring monitors from shadow mode into force. They keep their state unless they missed messages.
 
     With --confirm-within they return to shadow mode after this time, even if the appliance restarts.
 
@@ -239,8 +239,8 @@ def set_given(
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
 ) -> None:
-    """While a monitor runs, change the constants in the `given` of its specification. Without values, print all of
-    it.
+    """While a monitor runs, change the constants in the `given` of its specification. Without values, print all
+    constants and topics.
 
     The monitor keeps its source and its state. A value outside its range is rejected. To change topics, use `rosrv
     monitor load --set`.

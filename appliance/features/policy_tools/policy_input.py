@@ -130,7 +130,7 @@ Enrolled = Annotated[
     typer.Option(
         "--enrolled",
         metavar="NAME=ADDRESS",
-        help="Address of an enrolled host, `host:NAME` in the policy; door:NAME=ADDRESS for a door (repeatable)",
+        help="Address of `host:NAME`; for a door: door:NAME=ADDRESS (repeatable)",
     ),
 ]
 

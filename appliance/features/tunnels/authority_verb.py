@@ -68,8 +68,8 @@ def rotate(
 ) -> None:
     """Erase the key of the hosts' authority; the next start makes a new one. Stop the appliance first.
 
-    Certificates of the earlier authority are then rejected: all tunnels stay closed until each host has a new
-    kit.
+    Certificates of the earlier authority are then rejected: each tunnel stays closed until its host has
+    a new kit.
 
     Example: rosrv host authority rotate --state /var/lib/rosrv
     """
