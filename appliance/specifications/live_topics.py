@@ -91,7 +91,8 @@ def judge_holds(
         topics = sorted(owner.held & published.keys())
         if topics and (changed or coming.monitors[name] in moved):
             why = "its source, or a definition, changes" if changed else "it moves to another relay"
-            text = f"{name} loses its state, because {why}, and then holds {', '.join(topics)}: it drops every message"
+            dropped = f"drops every message of {', '.join(topics)} until it is resumed"
+            text = f"{name} loses its state, because {why}, and {dropped}"
             refused = not hold and any(live.moving for topic in topics for live in published[topic].values())
             (found.conflicts if refused else found.warnings).append(
                 f"{owner.position}: {'error' if refused else 'warning'}: {text}; {_HOLD if refused else _RESUME} {name}"

@@ -121,7 +121,7 @@ def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | 
             " it, or leave out --audit-only"
         )
         raise usage_error(text, verb=_VERB)
-    say(f"{policy} now has `audit-only = all`: denials are recorded and pass; an alarm reminds of it")
+    say(f"{policy} now has `audit-only = all`: denials are recorded and pass; an alarm reminds you")
     try:
         answer = appliance.ask(PolicyReload())
     except NotRunningError:

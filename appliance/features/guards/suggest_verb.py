@@ -126,8 +126,8 @@ def _say_suggestion(one: Suggestion) -> None:
     rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
                      if each.name not in set_by and each.name != "limits")  # fmt: skip
     notes = [
-        f"from the present rate: {', '.join(one.measured)}" if one.measured else "",
-        f"defaults, which you should check: {rest}" if rest else "",
+        f"from the current rate: {', '.join(one.measured)}" if one.measured else "",
+        f"check these defaults: {rest}" if rest else "",
         *(f"instead of {one.topics[name]}: {', '.join(topics)}" for name, topics in one.others.items()),
     ]
     say(one.command)

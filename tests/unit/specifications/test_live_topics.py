@@ -101,8 +101,8 @@ def held(
 def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
     """The robot would get no more commands, not even a stop."""
     what = (
-        "deadman loses its state, because its source, or a definition, changes, and then holds /cmd_vel:"
-        " it drops every message"
+        "deadman loses its state, because its source, or a definition, changes,"
+        " and drops every message of /cmd_vel until it is resumed"
     )
     assert held(CHANGED) == (
         [

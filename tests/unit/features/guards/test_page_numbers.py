@@ -9,13 +9,8 @@ from rosmop.types.roles import types_of_roles
 DOCS = Path(__file__).parents[4] / "docs"
 DEFAULTS = [
     ("driving.md", "been silent for `silent` ({} s)", "deadman", "silent"),
-    (
-        "guards.md",
-        "from the present rate: silent; defaults, which you should check: resume={}",
-        "deadman",
-        "resume",
-    ),
-    ("guards.md", "defaults, which you should check: margin={}, …", "fence", "margin"),
+    ("guards.md", "from the current rate: silent; check these defaults: resume={}", "deadman", "resume"),
+    ("guards.md", "check these defaults: margin={}, …", "fence", "margin"),
     ("guards.md", "(default {} m/s and", "mode", "vMax"),
     ("guards.md", "m/s and {} rad/s)", "mode", "wMax"),
     ("reference/guards.md", "within `together` ({} s)", "estop", "together"),
@@ -23,7 +18,7 @@ DEFAULTS = [
     ("reference/guards.md", "can be driven with `person={}`", "separation", "person"),
 ]
 COUNTS = [
-    ("guards.md", "by one of six sensors", 6, len(VALUED)),
+    ("guards.md", "six sensor types", 6, len(VALUED)),
     ("reference/guards.md", "has conditions for six types", 6, len(VALUED)),
     ("guards.md", "a topic of one of twelve types", 12, len(types_of_roles()["Private"])),
 ]

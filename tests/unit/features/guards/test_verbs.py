@@ -306,7 +306,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
         "loaded: mine (deadman on /cmd_vel)\n"
         "rosrv guard new fence\n"
         "    Keeps the base inside.\n"
-        "    from the present rate: silent; defaults, which you should check: "
+        "    from the current rate: silent; check these defaults: "
         "margin=0.2, ahead=0.5, inward=0.3, worldFrame=false, wheelbase=0.25, lat0=0, lon0=0, "
         "polygon=-2,-2 2,-2 2,2 -2,2; "
         "instead of /odom: /wheels\n"
