@@ -446,7 +446,7 @@ def export(
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     as_csv: Annotated[
-        bool, typer.Option("--csv", help="CSV for a spreadsheet instead of NDJSON; it has no proofs (no `chain`)")
+        bool, typer.Option("--csv", help="CSV for a spreadsheet instead of NDJSON, without proofs")
     ] = False,
 ) -> None:
     """Write all matching records as NDJSON, oldest first, each with its position in the hash chain.
