@@ -116,6 +116,15 @@ def body_refusal(text: str, choices: Collection[str] = ()) -> str:
     return text
 
 
+def refused_field(error: ValueError, where: str = "", choices: Collection[str] = ()) -> tuple[str, str]:
+    """Return the place of msgspec's `ValidationError` below `where`, and its message."""
+    text, at, place = str(error).rpartition(" - at `")
+    if not at:
+        text, place = place, ""
+    where += place.removeprefix("key` in `").removeprefix("$").removesuffix("`")
+    return where, body_refusal(text, choices)
+
+
 def _cut(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…"
 

@@ -27,8 +27,9 @@ from appliance.channel.answers import (
     status,
     token_answers,
 )
+from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.token_answers import TokenRole
-from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
+from appliance.channel.rest_operation import Body, Operation, Versioned, parameter, rest, rows
 
 A = TypeVar("A")
 A_co = TypeVar("A_co", covariant=True)
@@ -43,17 +44,13 @@ MONITORS = Versioned(
 
 _WITHIN = ("confirm_within",)
 _LOADED = (*_WITHIN, "force", "shadow", "hold")
+_ROLLBACK = Body("Rollback", "The revision to return to, or null for the revision before the present one.")
 _NO_MONITOR = {404: "There is no such monitor, or revision."}
 
 Revision = Annotated[int, parameter("number of the revision", ge=1, le=bodies.LONGEST_REVISION, examples=[1])]
 Confirm = Annotated[
-    float | None,
-    parameter(
-        "seconds after which the change is rolled back automatically unless confirmed",
-        gt=0,
-        le=86_400,
-        allow_inf_nan=False,
-    ),
+    Annotated[float, msgspec.Meta(gt=0, le=86_400)] | None,
+    parameter("seconds after which the change is rolled back automatically unless confirmed"),
 ]
 Force = Annotated[bool, parameter("load even if this cuts a topic whose publisher has another type")]
 Hold = Annotated[
@@ -96,11 +93,11 @@ class PolicyReload(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy
     expected: int | None = None
 
 
-@rest("operator", "POST", "/v1/policy/rollback", name="roll_back_policy", body=bodies.Rollback, of=POLICY)
+@rest("operator", "POST", "/v1/policy/rollback", name="roll_back_policy", body=_ROLLBACK, of=POLICY)
 class PolicyRollback(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy rollback"):
     """Bring a kept revision into force again, as a new one."""
 
-    revision: int | None = None  # None: the one before the present
+    revision: bodies.Revision = None  # None: the one before the present
     expected: int | None = None
 
 
@@ -112,8 +109,8 @@ class PolicyConfirm(AdminRequest[policy_answers.PolicyConfirmed], frozen=True, t
 
 
 @rest(
-    "admin", "POST", "/v1/policy", _WITHIN, name="load_policy", body=bodies.PolicyText, text="the policy",
-    of=POLICY, dry_run="loading a policy",
+    "admin", "POST", "/v1/policy", _WITHIN, name="load_policy", body=Body("PolicyText", "A new policy."),
+    text="the policy", of=POLICY, dry_run="loading a policy",
 )  # fmt: skip
 class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy load"):
     """Check, test and load a new text, decide all live rights again, and report. For admins.
@@ -121,11 +118,11 @@ class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy l
     A text with an error changes nothing: the answer (422) has every finding with its line and column.
     """
 
-    text: str
-    note: str = ""
+    text: bodies.WholeText
+    note: bodies.RevisionNote = ""
     confirm_within: Confirm = None
     expected: int | None = None
-    signature: str = ""
+    signature: bodies.Signature = ""
 
 
 @rest("viewer")
@@ -173,7 +170,8 @@ class MonitorsWanted(AdminRequest[monitor_answers.Monitors], frozen=True, tag="m
 
 
 @rest(
-    "admin", "POST", "/v1/monitors", _LOADED, name="load_monitors", body=bodies.NewSpecifications, of=MONITORS,
+    "admin", "POST", "/v1/monitors", _LOADED, name="load_monitors", of=MONITORS,
+    body=Body("NewSpecifications", "Specifications to add; they replace those in files of the same name."),
     dry_run="loading specifications",
 )  # fmt: skip
 class MonitorLoad(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor load"):
@@ -182,20 +180,27 @@ class MonitorLoad(AdminRequest[monitor_answers.Replaced], frozen=True, tag="moni
     A text with an error changes nothing: the answer (422) has every finding with its line and column.
     """
 
-    files: dict[str, str]
-    definitions: dict[str, str] = {}
-    note: str = ""
+    files: Annotated[
+        dict[bodies.FileName, bodies.FileText],
+        doc("texts by the name of the file", min_length=1, max_length=1000),
+    ]
+    definitions: bodies.Definitions = {}
+    note: bodies.RevisionNote = ""
     expected: str | None = None
     confirm_within: Confirm = None
-    signatures: dict[str, str] = {}
+    signatures: bodies.Signatures = {}
     force: Force = False
     shadow: Shadow = False
     hold: Hold = False
-    given: dict[str, dict[str, bodies.GivenValue]] = {}
+    given: Annotated[
+        dict[bodies.MonitorName, bodies.GivenOfMonitor],
+        doc("constants and topics that are given to monitors, by monitor and name", max_length=1000),
+    ] = {}
 
 
 @rest(
-    "admin", "PUT", "/v1/monitors/{name}", _LOADED, name="replace_monitor", body=bodies.NewText,
+    "admin", "PUT", "/v1/monitors/{name}", _LOADED, name="replace_monitor",
+    body=Body("NewText", "The new text of the file that contains a monitor."),
     text="the specification", of=MONITORS, problems=_NO_MONITOR,
     dry_run="loading specifications",
 )  # fmt: skip
@@ -205,13 +210,13 @@ class MonitorReplace(AdminRequest[monitor_answers.Replaced], frozen=True, tag="m
     """
 
     name: OneMonitor
-    text: str
-    definitions: dict[str, str] = {}
-    note: str = ""
+    text: bodies.WholeText
+    definitions: bodies.Definitions = {}
+    note: bodies.RevisionNote = ""
     expected: str | None = None
     confirm_within: Confirm = None
-    signature: str = ""
-    signatures: dict[str, str] = {}
+    signature: bodies.Signature = ""
+    signatures: Annotated[bodies.Signatures, doc("signatures of the definitions")] = {}
     force: Force = False
     shadow: Shadow = False
     hold: Hold = False
@@ -256,13 +261,13 @@ class MonitorRemove(AdminRequest[monitor_answers.Replaced], frozen=True, tag="mo
 
 
 @rest(
-    "admin", "POST", "/v1/monitors/rollback", name="roll_back_monitors", body=bodies.Rollback, of=MONITORS,
+    "admin", "POST", "/v1/monitors/rollback", name="roll_back_monitors", body=_ROLLBACK, of=MONITORS,
 
 )  # fmt: skip
 class MonitorRollback(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor rollback"):
     """Bring a kept revision into force again, as a new one; monitors are enabled and disabled as they were."""
 
-    revision: int | None = None  # None: the one before the present
+    revision: bodies.Revision = None  # None: the one before the present
     expected: str | None = None
 
 
@@ -311,7 +316,7 @@ class MonitorSwitch(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     names: SomeMonitors
     enabled: bool
     expected: str | None = None
-    for_seconds: float | None = None
+    for_seconds: bodies.SwitchSeconds = None
 
 
 @rest("operator", "PATCH", _SEVERAL, ("force", "confirm_within"), of=MONITORS)
@@ -331,14 +336,15 @@ class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
 
 
 @rest(
-    "operator", "PATCH", "/v1/monitors/{name}/given", name="set_monitor", body=bodies.GivenValues, of=MONITORS,
+    "operator", "PATCH", "/v1/monitors/{name}/given", name="set_monitor", of=MONITORS,
+    body=Body("GivenValues", "New values of constants that are given to a monitor, by name."),
     problems=_NO_MONITOR,
 )  # fmt: skip
 class MonitorGive(AdminRequest[monitor_answers.GivenSet], frozen=True, tag="monitor set"):
     """Set constants that are given to a monitor, within their ranges; the monitor keeps its state and text."""
 
     name: OneMonitor
-    values: dict[str, bodies.GivenValue]
+    values: Annotated[bodies.GivenOfMonitor, doc("in the units of the text, within the ranges of the text")]
     expected: str | None = None
 
 

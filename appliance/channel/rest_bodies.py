@@ -1,4 +1,4 @@
-"""The bodies of REST requests; the rows in `channel/admin.py` refer to them. An unknown field is an error."""
+"""The bounded values in requests, and the bodies of REST that several requests share."""
 
 from typing import Annotated
 
@@ -8,7 +8,10 @@ from appliance.channel.answers.field_docs import doc
 
 WHOLE = r"(?!\n)"  # follows `$`, because Python's `$` also matches before a final newline
 LONGEST_REVISION = 10**15
+DATED = "dated"
+DATE = Annotated[str, msgspec.Meta(max_length=64)]  # RFC 3339, for a field with the extra `DATED`
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
+WholeText = Annotated[Text, doc("the whole text, as written")]
 Signature = Annotated[
     str,
     doc(
@@ -32,76 +35,28 @@ Definitions = Annotated[
         max_length=1000,
     ),
 ]
-Note = Annotated[str, doc("reason for the change, stored with the revision", max_length=200)]
+Note = Annotated[str, msgspec.Meta(max_length=200)]
+RevisionNote = Annotated[Note, doc("reason for the change, stored with the revision")]
 Signatures = Annotated[
     dict[MonitorName, Signature], doc("signatures by the names of files and definitions", max_length=2000)
 ]
-GivenNanoMoment = Annotated[
-    Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)] | Annotated[str, msgspec.Meta(max_length=64)] | None,
-    doc("RFC 3339, or nanoseconds since the epoch"),
-]
-
-
+Revision = Annotated[Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None, doc("its number")]
 _Number = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # the channel takes no larger ones
 GivenValue = bool | _Number | float | Annotated[str, msgspec.Meta(max_length=256)]
 GivenOfMonitor = Annotated[dict[MonitorName, GivenValue], msgspec.Meta(min_length=1, max_length=100)]
 
 
-class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A new policy."""
-
-    text: Annotated[Text, doc("the whole text, as written")]
-    note: Annotated[str, doc("reason for the change, stored with the revision", max_length=200)] = ""
-    signature: Signature = ""
-
-
-class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The revision to return to, or null for the revision before the present one."""
-
-    revision: Annotated[Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None, doc("its number")] = (
-        None
-    )
-
-
-class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Specifications to add; they replace those in files of the same name."""
-
-    files: Annotated[
-        dict[FileName, FileText], doc("texts by the name of the file", min_length=1, max_length=1000)
-    ]
-    definitions: Definitions = {}
-    note: Note = ""
-    signatures: Signatures = {}
-    given: Annotated[
-        dict[MonitorName, GivenOfMonitor],
-        doc("constants and topics that are given to monitors, by monitor and name", max_length=1000),
-    ] = {}
-
-
-class GivenValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """New values of constants that are given to a monitor, by name."""
-
-    values: Annotated[GivenOfMonitor, doc("in the units of the text, within the ranges of the text")]
-
-
-class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The new text of the file that contains a monitor."""
-
-    text: Annotated[str, doc("the whole text, as written", min_length=1, max_length=1 << 20)]
-    definitions: Definitions = {}
-    note: Note = ""
-    signature: Signature = ""
-    signatures: Annotated[Signatures, doc("signatures of the definitions")] = {}
+SwitchSeconds = Annotated[
+    Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
+    doc("with `enabled` false: enable it again automatically after this time"),
+]
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The wanted state of a monitor: exactly one of `enabled`, `shadow` and `held`."""
 
     enabled: Annotated[bool | None, doc("null: unchanged")] = None
-    for_seconds: Annotated[
-        Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
-        doc("with `enabled` false: enable it again automatically after this time"),
-    ] = None
+    for_seconds: SwitchSeconds = None
     held: Annotated[bool | None, doc("false: resume its topics")] = None
     shadow: Annotated[
         bool | None,

@@ -16,7 +16,8 @@ from appliance.base.timestamps import parse_date
 from appliance.channel.admin import AdminRequest, operation_of
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.operations import OPERATIONS
-from appliance.channel.rest_operation import Operation, plain
+from appliance.channel.rest_bodies import DATED
+from appliance.channel.rest_operation import Operation, extra_of, plain
 
 _TAG = re.compile(r'"([\x21\x23-\x7e]{1,90})"')
 _REVISION = re.compile(r"[0-9]{1,18}")
@@ -144,8 +145,7 @@ def _read(kind: object, given: list[str]) -> object:
 
 
 def _moment(field: msgspec.structs.FieldInfo, value: object) -> object:
-    kind = plain(field.type)
-    if not isinstance(value, str) or kind not in (int, float):
+    if not isinstance(value, str) or not extra_of(field.type, DATED):
         return value
     try:
         moment = parse_date(value)
@@ -153,7 +153,7 @@ def _moment(field: msgspec.structs.FieldInfo, value: object) -> object:
         raise NoOrderError(
             f"body.{field.name}: {value[:80]!r} is not a date: write 2026-03-01T12:00:00Z"
         ) from None
-    return moment if kind is int else moment / _SECOND
+    return moment if plain(field.type) is int else moment / _SECOND
 
 
 def _body(asked: ClientRequest) -> dict[str, object]:

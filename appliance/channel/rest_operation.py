@@ -5,7 +5,7 @@ The api's routes, the command line's calls and control's check (`rest_meaning.py
 
 import functools
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin
 
@@ -17,22 +17,29 @@ ANSWER_SECONDS = 15.0
 R = TypeVar("R", bound=msgspec.Struct)
 
 
-class RequestParameter(NamedTuple):
-    """The description, bounds and name of a field in the path or the query, for FastAPI."""
+class Body(NamedTuple):
+    """The name and description of a body that is made of the fields of its request."""
 
     name: str
-    rules: Mapping[str, Any]
+    description: str
 
 
-def parameter(description: str = "", *, name: str = "", **rules: Any) -> RequestParameter:
-    return RequestParameter(name, {**({"description": description} if description else {}), **rules})
+def parameter(description: str | None = None, *, name: str = "", **bounds: Any) -> msgspec.Meta:
+    """Return the rules of a field in the path or the query, where it may have another name."""
+    return msgspec.Meta(description=description, extra={"name": name}, **bounds)
 
 
-def parameter_of(kind: object) -> RequestParameter:
-    if get_origin(kind) is Annotated:
-        rules = (one for one in get_args(kind)[1:] if isinstance(one, RequestParameter))
-        return next(rules, RequestParameter("", {}))
-    return RequestParameter("", {})
+def rules_of(kind: object) -> Iterator[msgspec.Meta]:
+    """Yield the descriptions and bounds of a field, also those of a value that may be null."""
+    for part in get_args(kind):
+        if isinstance(part, msgspec.Meta):
+            yield part
+        elif get_origin(kind) is Annotated or type(None) in get_args(kind):
+            yield from rules_of(part)
+
+
+def extra_of(kind: object, name: str) -> Any:
+    return next((rule.extra[name] for rule in rules_of(kind) if rule.extra and name in rule.extra), None)
 
 
 def plain(kind: object) -> object:
@@ -76,8 +83,8 @@ class Operation:
     status: int = 200
     good: str = "OK"
     problems: Mapping[int, str] = field(default_factory=dict)
-    # The class of the body. The body may also be sent as `text` (text/plain).
-    body: type[msgspec.Struct] | None = None
+    # The body, or its class if it has more than the fields of the request. It may also be sent as `text` (text/plain).
+    body: Body | type[msgspec.Struct] | None = None
     text: str = ""
     # Further fields of the body, and fields that the operation implies. Operations with the same path differ in these
     # fields; the first matching operation is used.
@@ -135,7 +142,7 @@ class Operation:
 
 @functools.cache
 def _fields(request: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
-    return {parameter_of(one.type).name or one.name: one for one in msgspec.structs.fields(request)}
+    return {extra_of(one.type, "name") or one.name: one for one in msgspec.structs.fields(request)}
 
 
 _ROWS: dict[type, tuple[Operation, ...]] = {}

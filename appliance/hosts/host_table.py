@@ -30,7 +30,6 @@ from appliance.store.state_file import StateStore
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _REVISION = "hosts.revision"
 MOST_HOSTS = 4096
-LONGEST_DAYS = 398  # longest life of a certificate; the authority has the same limit
 MOST_MACHINES = 1024
 
 

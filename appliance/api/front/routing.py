@@ -13,7 +13,7 @@ from fastapi import APIRouter, Depends, Request, Response, params
 from appliance.api.front.etags import etag
 from appliance.api.front.moments import in_full
 from appliance.api.front.problems import BadInput, ProblemError, bad_input
-from appliance.base.validation_messages import body_refusal, meant
+from appliance.base.validation_messages import meant, refused_field
 
 A = TypeVar("A")
 Responses = dict[int | str, dict[str, Any]]
@@ -144,11 +144,7 @@ def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
 
 
 def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
-    text, at, place = str(error).rpartition(" - at `")
-    if not at:
-        text, place = place, ""
-    where += place.removeprefix("key` in `").removeprefix("$").removesuffix("`")
-    return BadInput(where, body_refusal(text, _choices(kind)))
+    return BadInput(*refused_field(error, where, _choices(kind)))
 
 
 def _choices(kind: Any) -> tuple[str, ...]:

@@ -4,8 +4,9 @@ import inspect
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated, Any, Generic, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import msgspec
 from fastapi import Depends, Header, Path, Query, Request, Response
 from pydantic import StringConstraints, create_model
 
@@ -21,9 +22,12 @@ from appliance.channel.admin import MONITORS, A, AdminAnswer, AdminRequest, answ
 from appliance.channel.answers.token_answers import may
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.operations import OPERATIONS
+from appliance.channel.rest_bodies import DATE, DATED, WHOLE
 from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
-from appliance.channel.rest_operation import Operation, parameter_of, plain
+from appliance.channel.rest_operation import Body, Operation, extra_of, plain, rules_of
 
+_RULES = ("description", "examples", "gt", "ge", "lt", "le", "min_length", "max_length", "pattern")
+_BODIES: dict[Body, type[msgspec.Struct]] = {}
 Q_co = TypeVar("Q_co", bound=AdminRequest[object], covariant=True)
 
 
@@ -124,7 +128,8 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
     given = _answer_type(operation, own)
     least = "operator" if operation.dry_run else operation.role or "viewer"
     subject = _of_path(operation)
-    sent = body(operation.body, text=operation.text or None) if operation.body is not None else Depends(_none)
+    kind = body_of(operation)
+    sent = body(kind, text=operation.text or None) if kind is not None else Depends(_none)
     tag = Depends(_if_match if operation.is_change and operation.of is not None else _none)
     trial = Depends(_dry_run if operation.dry_run else _none)
     wanted = _of_query(operation)
@@ -201,13 +206,53 @@ def _answer_type(operation: Operation, own: Answer | None) -> object:
     return Tagged[kind] if operation.of is not None else kind  # type: ignore[valid-type]  # a type at run time
 
 
+def _rules(kind: object) -> dict[str, Any]:
+    """Return the rules of a parameter for FastAPI, whose patterns cannot look ahead."""
+    found = {
+        name: value
+        for rule in rules_of(kind)
+        for name in _RULES
+        if (value := getattr(rule, name)) is not None
+    }
+    return found | ({"pattern": found["pattern"].removesuffix(WHOLE)} if "pattern" in found else {})
+
+
+def body_of(operation: Operation) -> type[msgspec.Struct] | None:
+    given = operation.body
+    if not isinstance(given, Body):
+        return given
+    if given not in _BODIES:
+        fields = [
+            (
+                one.name,
+                _in_body(one.type),
+                msgspec.field(default=one.default, default_factory=one.default_factory),
+            )
+            for one in operation.in_body()
+        ]
+        _BODIES[given] = msgspec.defstruct(
+            given.name, fields, namespace={"__doc__": given.description}, kw_only=True, frozen=True,
+            forbid_unknown_fields=True,
+        )  # fmt: skip
+    return _BODIES[given]
+
+
+def _in_body(kind: Any) -> Any:
+    """Return the type of a field in the body, which takes a date for a moment."""
+    if not extra_of(kind, DATED):
+        return kind
+    moment, *rules = get_args(kind)
+    first, *others = get_args(moment)
+    return Annotated[Union[first, DATE, *others], *rules]
+
+
 def _of_path(operation: Operation) -> Any:
     in_path = [(name, field) for name, field in operation.fields().items() if f"{{{name}}}" in operation.path]
     if not in_path:
         return Depends(_nothing)
     [(name, field)] = in_path
     kind: Any = get_args(plain(field.type))[0] if get_origin(plain(field.type)) is list else field.type
-    rule = Path(alias=name, **parameter_of(kind).rules)
+    rule = Path(alias=name, **_rules(kind))
 
     async def of_path(subject: Annotated[plain(kind), rule]) -> dict[str, object]:  # type: ignore[valid-type]  # at run time
         return {name: subject}
@@ -238,10 +283,11 @@ def _in_query(kind: Any) -> Any:
     base = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if get_origin(base) is list:
         (element,) = get_args(base)
-        rules = parameter_of(element).rules
-        bounds = {name: rules[name] for name in ("min_length", "max_length") if name in rules}
+        bounds = {
+            name: rule for name, rule in _rules(element).items() if name in ("min_length", "max_length")
+        }
         base = list[Annotated[plain(element), StringConstraints(**bounds)]]  # type: ignore[misc]  # a type at run time
-    return Annotated[base, Query(**parameter_of(kind).rules)]
+    return Annotated[base, Query(**_rules(kind))]
 
 
 def _responses(operation: Operation, own: Answer | None) -> Responses:

@@ -11,6 +11,7 @@ import structlog
 
 from appliance.base.actors import OPERATOR
 from appliance.base.unix_sockets import KEEP_PATH
+from appliance.base.validation_messages import refused_field
 from appliance.base.withdrawal import awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
@@ -56,9 +57,11 @@ class AdminServer:
         try:
             request = self._decoder.decode(line)
         except ValueError as error:
-            return admin.AdminAnswer(
-                False, error=f"not a request of this version: {error}", trouble="request"
-            )
+            text = f"not a request of this version: {error}"
+            if str(error).startswith("Expected"):
+                where, said = refused_field(error)
+                text = f"{where.lstrip('.')}: {said}"
+            return admin.AdminAnswer(False, error=text, trouble="request")
         try:
             return await self._administration.carry_out(request, who=OPERATOR)
         except Exception as error:  # noqa: BLE001  a defect ends one order, not the connection of its operator

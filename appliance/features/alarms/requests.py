@@ -7,27 +7,11 @@ import msgspec
 from appliance.channel.admin import AdminRequest
 from appliance.channel.alarms import AlarmList
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.rest_operation import rest
+from appliance.channel.rest_bodies import Note
+from appliance.channel.rest_operation import Body, rest
 
 LONGEST_SILENCE_SECONDS = 7 * 86_400.0
-
-
-class OneAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An alarm to acknowledge."""
-
-    kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
-    note: Annotated[str, doc("shown to operators", max_length=200)] = ""
-
-
-class SilencedAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An alarm to silence."""
-
-    kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
-    seconds: Annotated[
-        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_SILENCE_SECONDS)] | None,
-        doc("the silence ends after this time; with null, it ends now"),
-    ] = None
-    note: Annotated[str, doc("reason, shown to operators", max_length=200)] = ""
+Kind = Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
 
 
 @rest("viewer", "GET", "/v1/alarms", name="alarms", tag="status")
@@ -36,26 +20,31 @@ class AlarmsWanted(AdminRequest[AlarmList], frozen=True, tag="alarms"):
 
 
 @rest(
-    "operator", "POST", "/v1/alarms/acknowledge", name="acknowledge_alarm", tag="status", body=OneAlarm,
+    "operator", "POST", "/v1/alarms/acknowledge", name="acknowledge_alarm", tag="status",
+    body=Body("OneAlarm", "An alarm to acknowledge."),
     problems={404: "There is no such alarm now."},
 )  # fmt: skip
 class AlarmAcknowledge(AdminRequest[AlarmList], frozen=True, tag="alarm acknowledge"):
     """Record who takes care of an alarm. It remains an alarm, with that name, until its condition ends."""
 
-    kind: str
-    note: str = ""
+    kind: Kind
+    note: Annotated[Note, doc("shown to operators")] = ""
 
 
 @rest(
-    "operator", "POST", "/v1/alarms/silence", name="silence_alarm", tag="status", body=SilencedAlarm,
+    "operator", "POST", "/v1/alarms/silence", name="silence_alarm", tag="status",
+    body=Body("SilencedAlarm", "An alarm to silence."),
     problems={404: "There is no such alarm now."},
 )  # fmt: skip
 class AlarmSilence(AdminRequest[AlarmList], frozen=True, tag="alarm silence"):
     """Make an alarm a notice for a time: `rosrv status` then exits with 0. Without `seconds`, end its silence."""
 
-    kind: str
-    seconds: float | None = None
-    note: str = ""
+    kind: Kind
+    seconds: Annotated[
+        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_SILENCE_SECONDS)] | None,
+        doc("the silence ends after this time; with null, it ends now"),
+    ] = None
+    note: Annotated[Note, doc("reason, shown to operators")] = ""
 
 
 REQUESTS = (AlarmsWanted, AlarmAcknowledge, AlarmSilence)

@@ -165,10 +165,6 @@ class ApprovalOrders:
             )
         if seconds is None and entry.call.category is not Category.CALL:
             seconds = APPROVED_SECONDS  # a publisher registers once, so only a time bounds its messages
-        if seconds is not None and not requests.SHORTEST <= seconds <= requests.LONGEST:
-            raise SenselessError(
-                f"an approval cannot last {seconds:g} s: give {requests.SHORTEST:g}s to {requests.LONGEST:g}s"
-            )
         if not self._asks(entry):
             raise SenselessError(
                 f"the policy no longer asks about {entry.call.resource}: there is nothing to approve"

@@ -6,7 +6,7 @@ import msgspec
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.rest_operation import parameter, rest
+from appliance.channel.rest_operation import Body, parameter, rest
 
 SHORTEST, LONGEST = 1.0, 3600.0
 WITHHELD = "withheld"
@@ -15,18 +15,6 @@ _PROBLEMS = {
     422: "The approval cannot last so long, or another operator has answered the call.",
 }
 Number = Annotated[int, parameter("number of the held call", ge=1, le=10**15, examples=[48213])]
-
-
-class ApprovalTime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How long the approval lasts; by default one call of a service, or 60 s for a topic or a parameter."""
-
-    seconds: Annotated[
-        Annotated[float, msgspec.Meta(ge=SHORTEST, le=LONGEST)] | None,
-        doc("for all calls of the same host and name in this time, with any arguments"),
-    ] = None
-    waits: Annotated[
-        bool, doc("approve only a call that still waits, so that no answer of another operator is replaced")
-    ] = False
 
 
 class Approval(msgspec.Struct, frozen=True):
@@ -73,14 +61,23 @@ class ApprovalsWanted(AdminRequest[Approvals], frozen=True, tag="approvals"):
 
 
 @rest(
-    "operator", "POST", "/v1/approvals/{number}/approve", name="approve", body=ApprovalTime, problems=_PROBLEMS
+    "operator", "POST", "/v1/approvals/{number}/approve", name="approve", problems=_PROBLEMS,
+    body=Body(
+        "ApprovalTime",
+        "How long the approval lasts; by default one call of a service, or 60 s for a topic or a parameter.",
+    ),
 )  # fmt: skip
 class ApproveCall(WaitingRequest[Approval], frozen=True, tag="approve"):
     """Approve a held call, once or for some time."""
 
     number: Number
-    seconds: float | None = None
-    waits: bool = False
+    seconds: Annotated[
+        Annotated[float, msgspec.Meta(ge=SHORTEST, le=LONGEST)] | None,
+        doc("for all calls of the same host and name in this time, with any arguments"),
+    ] = None
+    waits: Annotated[
+        bool, doc("approve only a call that still waits, so that no answer of another operator is replaced")
+    ] = False
 
 
 @rest("operator", "POST", "/v1/approvals/{number}/refuse", name="approval_refuse", problems=_PROBLEMS)

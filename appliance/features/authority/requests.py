@@ -6,25 +6,15 @@ import msgspec
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.rest_operation import parameter, rest
+from appliance.channel.rest_operation import Body, parameter, rest
 from appliance.features.authority.view import NotCarried
 
 _NO_GROUP = {404: "The policy has no such group in [Authority].", 422: "The host may not."}
 GroupName = Annotated[str, parameter("name of the group", min_length=1, max_length=64, examples=["base"])]
 
 
-class GroupHost(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The host that takes or asks for a group."""
-
-    host: Annotated[
-        Annotated[str, msgspec.Meta(min_length=1, max_length=300)], doc("address or name of a host")
-    ]
-
-
-class GroupGift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The host that gets the group next, or empty for the first waiting host."""
-
-    to: Annotated[Annotated[str, msgspec.Meta(max_length=300)], doc("address or name of a host")] = ""
+Host = Annotated[str, doc("address or name of a host", min_length=1, max_length=300)]
+_GROUP_HOST = Body("GroupHost", "The host that takes or asks for a group.")
 
 
 class GroupState(msgspec.Struct, frozen=True):
@@ -65,17 +55,18 @@ class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/assign", name="drive_assign", body=GroupHost, problems=_NO_GROUP,
+    "operator", "POST", "/v1/drive/{group}/assign", name="drive_assign", body=_GROUP_HOST, problems=_NO_GROUP,
 )  # fmt: skip
 class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
     """Assign a group to a host that may take it, or that may override its holder."""
 
     group: GroupName
-    host: str
+    host: Host
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/free", name="drive_free", body=GroupGift, problems=_NO_GROUP,
+    "operator", "POST", "/v1/drive/{group}/free", name="drive_free", problems=_NO_GROUP,
+    body=Body("GroupGift", "The host that gets the group next, or empty for the first waiting host."),
 )  # fmt: skip
 class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
     """Take a group from its holder; it is assigned to a host, or to the first waiting host.
@@ -84,17 +75,17 @@ class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
     """
 
     group: GroupName
-    to: str = ""
+    to: Annotated[str, doc("address or name of a host", max_length=300)] = ""
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/ask", name="drive_ask", body=GroupHost, problems=_NO_GROUP
+    "operator", "POST", "/v1/drive/{group}/ask", name="drive_ask", body=_GROUP_HOST, problems=_NO_GROUP
 )  # fmt: skip
 class DriveAsk(WaitingRequest[GroupState], frozen=True, tag="drive ask"):
     """Let a host wait for a group. A host that may take the group gets it as soon as it is free."""
 
     group: GroupName
-    host: str
+    host: Host
 
 
 REQUESTS = (DriveStatus, DriveTake, DriveGive, DriveAsk)

@@ -16,7 +16,6 @@ from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.blocks import requests
 from appliance.features.blocks.requests import (
-    LONGEST_BLOCK_SECONDS,
     HostBlock,
     HostBlocks,
     HostUnblock,
@@ -32,7 +31,6 @@ from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
 MOST = 1000
-_LONGEST_NOTE = 200
 _NOT_BLOCKED = "not blocked"
 _LONGEST_NAME = 300
 _MOST_NAMED = 5
@@ -261,14 +259,8 @@ class BlockOrders:
 
 
 def _require_sensible(request: HostBlock) -> None:
-    seconds = request.for_seconds
-    if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
-        raise SenselessError(
-            f"a block with a time lasts 1 second to {LONGEST_BLOCK_SECONDS // 86_400} days; without one it lasts until"
-            " it is lifted"
-        )
-    if len(request.note) > _LONGEST_NOTE or not request.note.isprintable():
-        raise SenselessError(f"a note has at most {_LONGEST_NOTE} characters, all of them printable")
+    if not request.note.isprintable():
+        raise SenselessError("a note has only printable characters")
 
 
 def is_own(address: Address) -> bool:

@@ -6,24 +6,10 @@ import msgspec
 
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers.field_docs import Moment, RevisionNote, VirtualAddress, doc
-from appliance.channel.rest_operation import parameter, rest
+from appliance.channel.rest_bodies import Note
+from appliance.channel.rest_operation import Body, parameter, rest
 
 LONGEST_BLOCK_SECONDS = 365 * 86_400
-
-
-class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A host to block."""
-
-    address: Annotated[
-        str, doc("an IPv4 or IPv6 address, or the name of an enrolled host", min_length=1, max_length=64)
-    ]
-    for_seconds: Annotated[
-        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_BLOCK_SECONDS)] | None,
-        doc("the block ends after this time; by default, only by an order"),
-    ] = None
-    note: Annotated[str, doc("reason for the block, shown to operators", max_length=200)] = ""
-    force: Annotated[bool, doc("block the robot's own host, or the caller's own, also")] = False
-    dry_run: Annotated[bool, doc("only answer what the block would end")] = False
 
 
 class BlockedHost(msgspec.Struct, frozen=True):
@@ -74,7 +60,7 @@ class HostUnblocked(BlockedHost, frozen=True, kw_only=True):
 
 
 @rest(
-    "operator", "POST", "/v1/blocks", name="block_host", body=NewBlock, tag="hosts",
+    "operator", "POST", "/v1/blocks", name="block_host", body=Body("NewBlock", "A host to block."), tag="hosts",
     problems={422: "The address cannot be blocked, or only with `force`."},
 )  # fmt: skip
 class HostBlock(AdminRequest[HostBlocked], frozen=True, tag="host block"):
@@ -84,11 +70,16 @@ class HostBlock(AdminRequest[HostBlocked], frozen=True, tag="host block"):
     The block of a host that is already blocked is replaced. The same block, without an end, changes nothing.
     """
 
-    address: str
-    for_seconds: float | None = None
-    note: str = ""
-    force: bool = False
-    dry_run: bool = False
+    address: Annotated[
+        str, doc("an IPv4 or IPv6 address, or the name of an enrolled host", min_length=1, max_length=64)
+    ]
+    for_seconds: Annotated[
+        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_BLOCK_SECONDS)] | None,
+        doc("the block ends after this time; by default, only by an order"),
+    ] = None
+    note: Annotated[Note, doc("reason for the block, shown to operators")] = ""
+    force: Annotated[bool, doc("block the robot's own host, or the caller's own, also")] = False
+    dry_run: Annotated[bool, doc("only answer what the block would end")] = False
 
 
 @rest(

@@ -6,12 +6,16 @@ import msgspec
 
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.channel.rest_operation import parameter, rest
+from appliance.channel.rest_bodies import WHOLE
+from appliance.channel.rest_operation import Body, parameter, rest
 
+LONGEST_SECONDS = 30 * 86_400
 _NO_DOOR = {404: "There is no such door."}
 DoorName = Annotated[
     str,
-    parameter("name of the door", name="door_name", pattern="^[a-z][a-z0-9_-]{0,30}$", examples=["alice"]),
+    parameter(
+        "name of the door", name="door_name", pattern="^[a-z][a-z0-9_-]{0,30}$" + WHOLE, examples=["alice"]
+    ),
 ]
 
 
@@ -89,39 +93,26 @@ class NewTicket(Ticket, frozen=True, kw_only=True):
     path: Annotated[str, doc("of the WebSocket at the REST port, with the ticket")]
 
 
-class NewDoor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A door; an agent's door has a port, and may be limited to the agent's address or network."""
-
-    name: Annotated[str, doc("its name", max_length=31)]
-    port: Annotated[
-        Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None,
-        doc("port of an agent; without it, only tickets open the door"),
-    ] = None
-    source: Annotated[
-        str, doc("address or network of the agent; by default, any"), msgspec.Meta(max_length=64)
-    ] = ""
-
-
-class TicketTime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How long a ticket is valid."""
-
-    seconds: Annotated[float, doc("from now on"), msgspec.Meta(ge=1, le=30 * 86_400)]
-
-
 @rest("viewer", "GET", "/v1/doors", name="doors")
 class DoorsWanted(AdminRequest[DoorList], frozen=True, tag="doors"):
     """All doors, with their connections and valid tickets."""
 
 
 @rest(
-    "admin", "POST", "/v1/doors", name="add_door", body=NewDoor, status=201, good="The door was added.",
+    "admin", "POST", "/v1/doors", name="add_door", status=201, good="The door was added.",
+    body=Body(
+        "NewDoor", "A door; an agent's door has a port, and may be limited to the agent's address or network."
+    ),
 )  # fmt: skip
 class DoorAdd(WaitingRequest[DoorState], frozen=True, tag="door add"):
     """Add a door for one identity. Its rights are those of the host `door:NAME` in the policy."""
 
-    name: str
-    port: int | None = None
-    source: str = ""
+    name: Annotated[str, doc("its name", max_length=31)]
+    port: Annotated[
+        Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None,
+        doc("port of an agent; without it, only tickets open the door"),
+    ] = None
+    source: Annotated[str, doc("address or network of the agent; by default, any", max_length=64)] = ""
 
 
 @rest("admin", "DELETE", "/v1/doors/{door_name}", name="remove_door", problems=_NO_DOOR)
@@ -132,14 +123,14 @@ class DoorRemove(WaitingRequest[DoorState], frozen=True, tag="door remove"):
 
 
 @rest(
-    "operator", "POST", "/v1/doors/{door_name}/tickets", name="make_door_ticket", body=TicketTime, status=201,
-    good="The ticket was made.", problems=_NO_DOOR,
+    "operator", "POST", "/v1/doors/{door_name}/tickets", name="make_door_ticket", status=201,
+    body=Body("TicketTime", "How long a ticket is valid."), good="The ticket was made.", problems=_NO_DOOR,
 )  # fmt: skip
 class DoorTicket(WaitingRequest[NewTicket], frozen=True, tag="door ticket"):
     """Make a ticket, with which a person's browser or viewer opens a door."""
 
     name: DoorName
-    seconds: float
+    seconds: Annotated[float, doc("from now on", ge=1, le=LONGEST_SECONDS)]
 
 
 @rest("viewer", "GET", "/v1/door", name="own_door", tag="doors")

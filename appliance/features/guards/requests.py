@@ -10,58 +10,13 @@ import msgspec
 from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMonitor, WaitingRequest
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.monitor_answers import Replacement
-from appliance.channel.rest_operation import parameter, rest
+from appliance.channel.rest_operation import Body, parameter, rest
 from appliance.features.guards.guard_answers import DriverCheck, GuardList, GuardPlan, ProofTest, Suggestions
 
 _NO_GUARD = {404: "There is no such guard."}
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
 _Name = Annotated[str, msgspec.Meta(max_length=256)]
 _Values = Annotated[dict[_Name, _Text], msgspec.Meta(max_length=50)]
-
-
-class NewGuard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A guard to make: its preset, its topics, and values of its parameters."""
-
-    preset: Annotated[_Name, doc("the preset")]
-    topics: Annotated[_Values, doc("by the names that the preset has for them; `command` is needed")]
-    values: Annotated[_Values, doc("by parameter, as text")] = {}
-    types: Annotated[_Values, doc("types of topics that no node has yet, by the names of the topics")] = {}
-    name: Annotated[_Name, doc("its name; by default, that of the preset")] = ""
-    shadow: Annotated[bool, doc("only record what it would have done")] = False
-
-
-class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """New values of a guard's parameters, as text."""
-
-    values: Annotated[_Values, doc("by parameter")]
-
-
-class GuardTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Topics of a guard that is made again, instead of those that it has, or beside them."""
-
-    topics: Annotated[_Values, doc("by the names that the preset has for them")] = {}
-
-
-class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A change of a guard to try: with `preset` a new guard, otherwise new values of the guard `name`."""
-
-    preset: Annotated[_Name, doc("the preset of a new guard, or empty for a guard that is loaded")] = ""
-    topics: Annotated[_Values, doc("of a new guard, or of an `upgrade` instead of those that it has")] = {}
-    types: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
-    name: Annotated[_Name, doc("the guard; by default, it has the name of the preset")] = ""
-    values: Annotated[_Values, doc("by parameter, as text")] = {}
-    shadow: Annotated[bool, doc("a new guard only records what it would have done")] = False
-    enforce: Annotated[bool, doc("bring the guard from shadow mode into force")] = False
-    upgrade: Annotated[bool, doc("make the guard again from the present version of its preset")] = False
-
-
-class NewDriverCheck(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A check of a robot's driver to begin; a person drives the base slowly while it lasts."""
-
-    command: Annotated[_Name, doc("the topic of the base's velocities")]
-    by: Annotated[_Name, doc("the topic that shows how the base moves")]
-    seconds: Annotated[float, doc("motions are withheld for at most this time", ge=0.2, le=10)] = 2.0
-    patience: Annotated[float, doc("how long it waits for a slow drive, in seconds", ge=1, le=300)] = 30.0
 
 
 @rest("viewer", "GET", "/v1/guards", ("presets",), name="guards")
@@ -77,24 +32,28 @@ class GuardSuggestionsWanted(WaitingRequest[Suggestions], frozen=True, tag="guar
 
 
 @rest(
-    "admin", "POST", "/v1/guards", ("confirm_within", "hold"), name="new_guard", body=NewGuard, of=MONITORS,
+    "admin", "POST", "/v1/guards", ("confirm_within", "hold"), name="new_guard", of=MONITORS,
+    body=Body("NewGuard", "A guard to make: its preset, its topics, and values of its parameters."),
 )  # fmt: skip
 class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
     """Make a guard from a preset and load it; refused if a monitor has its name, or the topic has another type."""
 
-    preset: str
-    topics: dict[str, str]
-    values: dict[str, str] = msgspec.field(default_factory=dict)
-    types: dict[str, str] = msgspec.field(default_factory=dict)
-    name: str = ""
-    shadow: bool = False
+    preset: Annotated[_Name, doc("the preset")]
+    topics: Annotated[_Values, doc("by the names that the preset has for them; `command` is needed")]
+    values: Annotated[_Values, doc("by parameter, as text")] = msgspec.field(default_factory=dict)
+    types: Annotated[_Values, doc("types of topics that no node has yet, by the names of the topics")] = (
+        msgspec.field(default_factory=dict)
+    )
+    name: Annotated[_Name, doc("its name; by default, that of the preset")] = ""
+    shadow: Annotated[bool, doc("only record what it would have done")] = False
     expected: str | None = None
     confirm_within: Confirm = None
     hold: Hold = False
 
 
 @rest(
-    "admin", "PATCH", "/v1/guards/{name}", ("hold",), name="set_guard", body=GuardValues, of=MONITORS,
+    "admin", "PATCH", "/v1/guards/{name}", ("hold",), name="set_guard", of=MONITORS,
+    body=Body("GuardValues", "New values of a guard's parameters, as text."),
     problems=_NO_GUARD,
 )  # fmt: skip
 class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
@@ -104,14 +63,15 @@ class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
     """
 
     name: OneMonitor
-    values: dict[str, str]
+    values: Annotated[_Values, doc("by parameter")]
     expected: str | None = None
     hold: Hold = False
 
 
 @rest(
-    "admin", "POST", "/v1/guards/{name}/upgrade", ("confirm_within", "hold"), name="upgrade_guard", body=GuardTopics,
+    "admin", "POST", "/v1/guards/{name}/upgrade", ("confirm_within", "hold"), name="upgrade_guard",
     of=MONITORS, problems=_NO_GUARD,
+    body=Body("GuardTopics", "Topics of a guard that is made again, instead of those that it has, or beside them."),
 )  # fmt: skip
 class GuardUpgrade(AdminRequest[Replacement], frozen=True, tag="guard upgrade"):
     """Make a guard of an older version again from the present preset, with its topics and values.
@@ -120,27 +80,35 @@ class GuardUpgrade(AdminRequest[Replacement], frozen=True, tag="guard upgrade"):
     """
 
     name: OneMonitor
-    topics: dict[str, str] = msgspec.field(default_factory=dict)
+    topics: Annotated[_Values, doc("by the names that the preset has for them")] = msgspec.field(
+        default_factory=dict
+    )
     expected: str | None = None
     confirm_within: Confirm = None
     hold: Hold = False
 
 
 @rest(
-    "operator", "POST", "/v1/guards/plan", ("hold",), name="plan_guard", body=GuardDraft, problems=_NO_GUARD,
+    "operator", "POST", "/v1/guards/plan", ("hold",), name="plan_guard", problems=_NO_GUARD,
+    body=Body(
+        "GuardDraft",
+        "A change of a guard to try: with `preset` a new guard, otherwise new values of the guard `name`.",
+    ),
 )  # fmt: skip
 class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
     """Report what a new guard, new values, `enforce` or `upgrade` would load, change and hold; nothing changes."""
 
-    preset: str = ""
-    topics: dict[str, str] = msgspec.field(default_factory=dict)
-    types: dict[str, str] = msgspec.field(default_factory=dict)
-    name: str = ""
-    values: dict[str, str] = msgspec.field(default_factory=dict)
-    shadow: bool = False
-    enforce: bool = False
+    preset: Annotated[_Name, doc("the preset of a new guard, or empty for a guard that is loaded")] = ""
+    topics: Annotated[_Values, doc("of a new guard, or of an `upgrade` instead of those that it has")] = (
+        msgspec.field(default_factory=dict)
+    )
+    types: Annotated[_Values, doc("of a new guard, as in a new guard")] = msgspec.field(default_factory=dict)
+    name: Annotated[_Name, doc("the guard; by default, it has the name of the preset")] = ""
+    values: Annotated[_Values, doc("by parameter, as text")] = msgspec.field(default_factory=dict)
+    shadow: Annotated[bool, doc("a new guard only records what it would have done")] = False
+    enforce: Annotated[bool, doc("bring the guard from shadow mode into force")] = False
     hold: Hold = False
-    upgrade: bool = False
+    upgrade: Annotated[bool, doc("make the guard again from the present version of its preset")] = False
 
 
 @rest("operator", "POST", "/v1/guards/{name}/test", name="test_guard", problems=_NO_GUARD, seconds=40.0)
@@ -155,7 +123,11 @@ class GuardTest(WaitingRequest[ProofTest], frozen=True, tag="guard test"):
 
 
 @rest(
-    "admin", "POST", "/v1/guards/driver-check", name="check_driver", body=NewDriverCheck, seconds=40.0,
+    "admin", "POST", "/v1/guards/driver-check", name="check_driver", seconds=40.0,
+    body=Body(
+        "NewDriverCheck",
+        "A check of a robot's driver to begin; a person drives the base slowly while it lasts.",
+    ),
 )  # fmt: skip
 class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check"):
     """Withhold the motions of a slowly driven base once, to measure how long its driver takes to stop the base.
@@ -164,10 +136,10 @@ class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check
     at least every three seconds; otherwise the check ends.
     """
 
-    command: str
-    by: str
-    seconds: float = 2.0
-    patience: float = 30.0
+    command: Annotated[_Name, doc("the topic of the base's velocities")]
+    by: Annotated[_Name, doc("the topic that shows how the base moves")]
+    seconds: Annotated[float, doc("motions are withheld for at most this time", ge=0.2, le=10)] = 2.0
+    patience: Annotated[float, doc("how long it waits for a slow drive, in seconds", ge=1, le=300)] = 30.0
 
 
 @rest("viewer", "GET", "/v1/guards/driver-check", name="driver_check")

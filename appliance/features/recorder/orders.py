@@ -93,7 +93,7 @@ class RecordingOrders:
                 f"before must be 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
             )
         text = f"{who}: {request.note}" if request.note else who
-        begun = await self._begin("order", request.note[:_LONGEST_NOTE], text, who, (before, after))
+        begun = await self._begin("order", request.note, text, who, (before, after))
         return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:

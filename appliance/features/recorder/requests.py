@@ -6,8 +6,8 @@ import msgspec
 
 from appliance.channel.admin import WaitingRequest
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.rest_bodies import GivenNanoMoment
-from appliance.channel.rest_operation import parameter, rest
+from appliance.channel.rest_bodies import DATED, WHOLE
+from appliance.channel.rest_operation import Body, parameter, rest
 from appliance.features.recorder.recording_answers import Recording, RecordingBegun, Recordings
 
 _NO_RECORDING = {404: "There is no such recording, or the flight recorder is off."}
@@ -16,25 +16,16 @@ RecordingId = Annotated[
     parameter(
         "id of the recording",
         name="recording_id",
-        pattern="^[0-9a-f]{20}$",
+        pattern="^[0-9a-f]{20}$" + WHOLE,
         examples=["18ea0bb9b11c1024196c"],
     ),
 ]
 
 
-class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The wanted recording: seconds before and after now (by default, as configured), and why."""
-
-    before: Annotated[Annotated[float, msgspec.Meta(ge=0, le=3600)] | None, doc("seconds")] = None
-    after: Annotated[Annotated[float, msgspec.Meta(gt=0, le=3600)] | None, doc("seconds")] = None
-    note: Annotated[str, doc("reason given by the person who loaded it", max_length=300)] = ""
-
-
-class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A period from `since` (by default, the first data) to `until` (by default, now)."""
-
-    since: GivenNanoMoment = None
-    until: GivenNanoMoment = None
+NanoMoment = Annotated[
+    Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)] | None,
+    doc("RFC 3339, or nanoseconds since the epoch", extra={DATED: True}),
+]
 
 
 @rest("viewer", "GET", "/v1/recordings", name="recordings", problems=_NO_RECORDING)
@@ -50,15 +41,18 @@ class RecordingWanted(WaitingRequest[Recording], frozen=True, tag="recording"):
 
 
 @rest(
-    "operator", "POST", "/v1/recordings", name="record_now", body=NewRecording, status=201,
+    "operator", "POST", "/v1/recordings", name="record_now", status=201,
+    body=Body(
+        "NewRecording", "The wanted recording: seconds before and after now (by default, as configured), and why."
+    ),
     good="The recording is being made.", problems=_NO_RECORDING,
 )  # fmt: skip
 class RecordNow(WaitingRequest[RecordingBegun], frozen=True, tag="record now"):
     """Record the messages of the seconds before and after now."""
 
-    before: float | None = None  # seconds before now; None: as configured
-    after: float | None = None
-    note: str = ""
+    before: Annotated[Annotated[float, msgspec.Meta(ge=0, le=3600)] | None, doc("seconds")] = None
+    after: Annotated[Annotated[float, msgspec.Meta(gt=0, le=3600)] | None, doc("seconds")] = None
+    note: Annotated[str, doc("reason given by the person who loaded it", max_length=300)] = ""
 
 
 @rest("investigator", "GET", "/v1/recordings/{recording_id}/bag")
@@ -77,14 +71,14 @@ class RecordingRead(WaitingRequest[Recording], frozen=True, tag="recording read"
 
 
 @rest(
-    "investigator", "POST", "/v1/recordings/memory", name="recording_of_memory", body=MemorySpan,
-    problems=_NO_RECORDING,
+    "investigator", "POST", "/v1/recordings/memory", name="recording_of_memory", problems=_NO_RECORDING,
+    body=Body("MemorySpan", "A period from `since` (by default, the first data) to `until` (by default, now)."),
 )  # fmt: skip
 class RecordingOfMemory(WaitingRequest[Recording], frozen=True, tag="recording memory"):
     """Make a recording of the data in memory, which can be fetched for ten minutes, or until four later requests."""
 
-    since: int | None = None  # nanoseconds since the epoch; None: all that there is
-    until: int | None = None
+    since: NanoMoment = None
+    until: NanoMoment = None
 
 
 @rest("admin", "DELETE", "/v1/recordings/{recording_id}", name="remove_recording", problems=_NO_RECORDING)

@@ -7,6 +7,7 @@ import msgspec
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.token_answers import SignedOn
+from appliance.channel.rest_bodies import WHOLE
 from appliance.channel.rest_operation import parameter, rest
 from appliance.features.sso.link import SessionKeys
 
@@ -58,7 +59,9 @@ class SessionsWanted(AdminRequest[SignedOnList], frozen=True, tag="sso list"):
 class SignOut(AdminRequest[SignedOn], frozen=True, tag="sso sign out"):
     """End one of the caller's own sessions now."""
 
-    session: Annotated[str, parameter("id of the session", pattern=_SESSION, examples=["5f0c2a9be417"])]
+    session: Annotated[
+        str, parameter("id of the session", pattern=_SESSION + WHOLE, examples=["5f0c2a9be417"])
+    ]
 
 
 @rest(

@@ -23,10 +23,10 @@ from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.certification import NO_TUNNELS, Certification
 from appliance.features.tunnels.enrolment_kit import filled
-from appliance.features.tunnels.enrolment_tokens import LONGEST_SECONDS, MOST, BadEnrolmentTokenError
+from appliance.features.tunnels.enrolment_tokens import MOST, BadEnrolmentTokenError
 from appliance.features.tunnels.host_view import HostView, span
 from appliance.features.tunnels.tunnel_answers import Endpoint, KitParts, NewCertificate, PortsReport, Renewed
-from appliance.hosts.host_table import LONGEST_DAYS, HostForbiddenError, HostRefusedError
+from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHostsError
 from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.host_names import HostInWords
@@ -322,7 +322,7 @@ class HostEnrolment(TunnelHosts):
             self._table.require_name(name)
             if request.new:
                 self._require_not_enrolled(name)
-            await self._require_token_possible(request)
+            await self._require_token_possible()
             promised = self._table.address_for(name, request.address, self._awaited.addresses())
             await self._tunnels.open()
             authority = await self._certification.authority_certificate()
@@ -468,13 +468,7 @@ class HostEnrolment(TunnelHosts):
                 f"{name} is already enrolled: `rosrv host kit {name}` issues a new certificate"
             )
 
-    async def _require_token_possible(self, request: host_requests.HostToken) -> None:
-        if not 0 < request.token_seconds <= LONGEST_SECONDS:
-            raise HostRefusedError(
-                f"a one-time token is valid for at most {LONGEST_SECONDS / 86_400:.0f} days"
-            )
-        if not 0 < request.days <= LONGEST_DAYS:
-            raise HostRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
+    async def _require_token_possible(self) -> None:
         if self._certification.rest.port is None:
             raise HostRefusedError(self._certification.rest.trouble)
         if not await self._certification.served.wait():

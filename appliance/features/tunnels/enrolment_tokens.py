@@ -10,7 +10,6 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
 _FORM = SecretForm("rosrv-enrol_")
-LONGEST_SECONDS = 7 * 86_400.0
 MOST = 1000
 ENROLMENT = EndKind("enrolment", dated=True)
 

@@ -7,8 +7,8 @@ import msgspec
 from appliance.channel.admin import AdminRequest, WaitingRequest
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.host_answers import PortsState
-from appliance.channel.rest_bodies import WHOLE
-from appliance.channel.rest_operation import Versioned, parameter, rest
+from appliance.channel.rest_bodies import DATED, WHOLE
+from appliance.channel.rest_operation import Body, Versioned, parameter, rest
 from appliance.features.tunnels import tunnel_answers
 
 # Define the bodies of REST requests about hosts in tunnels. An unknown field is an error.
@@ -22,41 +22,43 @@ LONGEST_DAYS = 398
 LONGEST_TOKEN_SECONDS = 7 * 86_400
 HostName = Annotated[str, doc("name of the host, `host:NAME` in the policy", pattern=HOST_NAME + WHOLE)]
 Endpoint = Annotated[str, msgspec.Meta(pattern=ENDPOINT + WHOLE)]
+GivenEndpoint = Annotated[
+    Endpoint | None,
+    doc(
+        "address or name at which the host reaches the appliance; by default, `ipsec.endpoint` of the"
+        " configuration, else the machine's address towards its default route (422 if it has none)"
+    ),
+]
+Ports = Annotated[str, doc("the host's local port range, which its firewall closes", pattern=PORTS + WHOLE)]
 Service = Annotated[str, msgspec.Meta(pattern=SERVICE + WHOLE)]
-Address = Annotated[str, msgspec.Meta(max_length=64)]
+GivenAddress = Annotated[
+    Annotated[str, msgspec.Meta(max_length=64)] | None,
+    doc("its virtual address; by default, the next free one"),
+]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 Days = Annotated[float, doc("until the certificate ends", gt=0, le=LONGEST_DAYS)]
-TokenSeconds = Annotated[float, msgspec.Meta(ge=60, le=LONGEST_TOKEN_SECONDS)]
+TokenSeconds = Annotated[
+    float, doc("seconds for which the one-time token is valid", ge=60, le=LONGEST_TOKEN_SECONDS)
+]
+FilledRequest = Annotated[str, msgspec.Meta(max_length=LONGEST_REQUEST)]  # empty until the api fills it in
 SigningRequest = Annotated[str, doc("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
-GivenMoment = (
-    Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)] | Annotated[str, msgspec.Meta(max_length=64)]
-)
+Open = Annotated[list[Service], doc("the host's services that stay open, such as tcp/22", max_length=100)]
 
 
 class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The contents of a kit besides the certificate."""
 
-    endpoint: Annotated[
-        Endpoint | None,
-        doc(
-            "address or name at which the host reaches the appliance; by default, `ipsec.endpoint` of the"
-            " configuration, else the machine's address towards its default route (422 if it has none)"
-        ),
-    ] = None
-    ports: Annotated[
-        str, doc("the host's local port range, which its firewall closes", pattern=PORTS + WHOLE)
-    ] = "32768-60999"
-    open: Annotated[
-        list[Service], doc("the host's services that stay open, such as tcp/22", max_length=100)
-    ] = []
+    endpoint: GivenEndpoint = None
+    ports: Ports = "32768-60999"
+    open: Open = msgspec.field(default_factory=list)
 
 
 class TokenWishes(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A one-time token for a host, new or enrolled before."""
 
-    address: Annotated[Address | None, doc("its virtual address; by default, the next free one")] = None
+    address: GivenAddress = None
     days: Days = 90
-    token_seconds: Annotated[TokenSeconds, doc("seconds for which the one-time token is valid")] = 3600
+    token_seconds: TokenSeconds = 3600
 
 
 class NewHost(TokenWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -83,16 +85,6 @@ class NewKit(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
     request: SigningRequest | None = None
 
 
-class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The findings of `rosrv protect --check`."""
-
-    state: Annotated[PortsState, doc("its state")]
-    open: Annotated[list[Port], doc("TCP ports that accepted a connection", max_length=100)] = []
-    checked: Annotated[GivenMoment | None, doc("RFC 3339, or seconds since the epoch; by default, now")] = (
-        None
-    )
-
-
 HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 _NO_HOST = {404: "There is no such host."}
 _KIT = (
@@ -102,7 +94,7 @@ _KIT = (
 _CHARON_SECONDS = 45.0  # charon may have to be started first
 OneHost = Annotated[
     str,
-    parameter("name of the host", min_length=1, max_length=63, pattern=HOST_NAME, examples=["ocu-1"]),
+    parameter("name of the host", min_length=1, max_length=63, pattern=HOST_NAME + WHOLE, examples=["ocu-1"]),
 ]
 
 
@@ -121,12 +113,12 @@ class HostToken(WaitingRequest[tunnel_answers.EnrolmentToken], frozen=True, tag=
 
     name: OneHost
     # These three are kept with the token, to make the host's kit later; endpoint None: the appliance finds it.
-    endpoint: str | None = None
-    ports: str = "32768-60999"
-    open: list[str] = []  # noqa: RUF012  each struct gets one of its own
-    token_seconds: float = 3600
-    days: float = 90
-    address: str | None = None
+    endpoint: GivenEndpoint = None
+    ports: Ports = "32768-60999"
+    open: Open = msgspec.field(default_factory=list)
+    token_seconds: TokenSeconds = 3600
+    days: Days = 90
+    address: GivenAddress = None
     expected: int | None = None
     new: bool = False  # rejected for a host that is enrolled; else such a host may come with another key
 
@@ -141,10 +133,10 @@ class HostAdd(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host ad
     `address` is its virtual address; None: the next free one.
     """
 
-    name: str
-    request: str
-    days: float = 90
-    address: str | None = None
+    name: HostName
+    request: FilledRequest
+    days: Days = 90
+    address: GivenAddress = None
     expected: int | None = None
 
 
@@ -165,8 +157,8 @@ class HostRenew(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host 
     """A new certificate for an enrolled host, in a kit; the earlier one is revoked and its tunnel closed."""
 
     name: OneHost
-    request: str
-    days: float = 90
+    request: FilledRequest
+    days: Days = 90
     expected: int | None = None
 
 
@@ -218,8 +210,8 @@ class HostRevoke(AdminRequest[tunnel_answers.Revoked], frozen=True, tag="host re
 
 
 @rest(
-    "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", body=PortsTold, of=HOSTS,
-    problems=_NO_HOST, answer_field="ports",
+    "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", of=HOSTS,
+    body=Body("PortsTold", "The findings of `rosrv protect --check`."), problems=_NO_HOST, answer_field="ports",
 )  # fmt: skip
 class HostPorts(AdminRequest[tunnel_answers.PortsReport], frozen=True, tag="host ports"):
     """Report whether the ROS ports of a host are closed, as `rosrv protect --check` found from outside."""
@@ -230,9 +222,14 @@ class HostPorts(AdminRequest[tunnel_answers.PortsReport], frozen=True, tag="host
             "name of the host, or a machine's address", min_length=1, max_length=63, examples=["ocu-1"]
         ),
     ]
-    state: Literal["closed", "open", "unknown"]
-    open: list[int] = []  # noqa: RUF012  each struct gets one of its own
-    checked: float | None = None  # seconds since the epoch; None: now
+    state: Annotated[PortsState, doc("its state")]
+    open: Annotated[list[Port], doc("TCP ports that accepted a connection", max_length=100)] = msgspec.field(
+        default_factory=list
+    )
+    checked: Annotated[
+        Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)] | None,
+        doc("RFC 3339, or seconds since the epoch; by default, now", extra={DATED: True}),
+    ] = None
     expected: int | None = None
 
 

@@ -13,23 +13,31 @@ from appliance.channel.rest_meaning import BadTagError, NoOrderError, RestCall, 
 from appliance.channel.rest_operation import Operation, plain
 
 ASKED = [operation for operation in OPERATIONS if operation.path]
-TEXT = st.text(st.characters(codec="utf-8"), max_size=9)
+CHARACTERS = st.characters(codec="utf-8")
+BOUNDS = ("ge", "gt", "le", "min_length", "max_length", "pattern")
 
 
-def values(kind: Any) -> st.SearchStrategy[Any]:
+def values(kind: Any, **bounds: Any) -> st.SearchStrategy[Any]:
     if get_origin(kind) is Annotated:
-        return values(get_args(kind)[0])
+        inner, *rules = get_args(kind)
+        told = ((name, getattr(rule, name)) for rule in rules for name in BOUNDS)
+        return values(inner, **{name: bound for name, bound in told if bound is not None})
+    size = {"min_size": bounds.get("min_length") or 0, "max_size": min(bounds.get("max_length") or 9, 9)}
+    least, above = bounds.get("ge"), bounds.get("gt")
     if get_origin(kind) is Literal:
         return st.sampled_from(get_args(kind))
     if get_origin(kind) is list:
         return st.lists(values(get_args(kind)[0]), min_size=1, max_size=3)
     if get_origin(kind) is dict:
-        return st.dictionaries(*map(values, get_args(kind)), max_size=3)
+        return st.dictionaries(*map(values, get_args(kind)), min_size=size["min_size"], max_size=3)
     if get_args(kind):
         return st.one_of([values(one) for one in get_args(kind)])
     plainly: dict[Any, st.SearchStrategy[Any]] = {
-        bool: st.booleans(), int: st.integers(1, 10**15), str: TEXT, type(None): st.none(),
-        float: st.floats(allow_nan=False, allow_infinity=False),
+        bool: st.booleans(), type(None): st.none(),
+        int: st.integers(1 if least is None else least, bounds.get("le") or 10**15),
+        str: st.from_regex(bounds["pattern"]) if bounds.get("pattern") else st.text(CHARACTERS, **size),
+        float: st.floats(above if least is None else least, bounds.get("le"), exclude_min=above is not None,
+                         allow_nan=False, allow_infinity=False),
     }  # fmt: skip
     return plainly[kind]
 

@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import msgspec
 import pytest
+from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from structlog.testing import capture_logs
 
@@ -23,9 +24,12 @@ from appliance.channel.rest_meaning import call_of, filled_in, meant
 from appliance.channel.rest_operation import Operation
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.errors import SenselessError, TokenRefusedError, UnknownThingError
+from appliance.control.operators.admin_socket import AdminServer
+from appliance.control.operators.administration import Administration
 from appliance.hosts.host_table import HostForbiddenError
 from appliance.specifications.specification_files import MonitorsChangedError
 from appliance.store.writer_thread import StoreError
+from tests.support.idle import idle
 from tests.support.rest_world import ROLES, RestWorld, idle_application
 from tests.support.rows import require_rows
 
@@ -603,3 +607,88 @@ def test_without_an_answer_that_makes_a_dry_run_the_operation_is_not_offered() -
     assert any(one.dry_run for one in named)
     assert [one for one in named if not is_offered(one, None)] == [one for one in named if one.dry_run]
     assert all(is_offered(one, Answer(makes_it)) for one in named)
+
+
+KEYS = ("x{}", "a{}.rv", "a/B{}.msg", "10-2{}", "tcp/{}", "f{}".rjust(14, "f"), "f{}".rjust(22, "f"))
+ONLY_THE_API = {"endpoint", "ports", "open", "dry_run", "held", "how"}
+"""Fields that choose an order, and those of a kit, which the api itself uses."""
+
+
+def valid(schema: dict[str, Any], number: int = 1) -> Any:
+    """Return a value that a schema permits; those of two numbers differ if they are strings."""
+    if "anyOf" in schema:
+        return valid(schema["anyOf"][0], number)
+    if schema["type"] in ("array", "object"):
+        return collection(schema, 1)
+    texts = (text.format(number) for text in KEYS)
+    text = next((text for text in texts if re.search(schema.get("pattern", ""), text)), "")
+    return {"string": text, "boolean": False}.get(schema["type"], schema.get("minimum", 1))
+
+
+def collection(schema: dict[str, Any], size: int) -> Any:
+    if schema["type"] == "array":
+        return [valid(schema["items"], number) for number in range(size)]
+    return {valid(keys(schema), number): valid(schema["additionalProperties"]) for number in range(size)}
+
+
+def keys(schema: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "string"} | schema.get("propertyNames", {})
+
+
+def beyond(schema: dict[str, Any]) -> Iterator[Any]:
+    """Yield a value beyond each bound of a schema."""
+    for bound, limit in schema.items():
+        match bound:
+            case "maxLength" | "minLength":
+                yield "x" * (limit + 1 if bound == "maxLength" else limit - 1)
+            case "pattern":
+                yield "\n"
+            case "minimum" | "maximum" | "exclusiveMinimum":
+                yield limit + {"maximum": 1, "minimum": -1}.get(bound, 0)
+            case "maxItems" | "maxProperties" | "minItems" | "minProperties":
+                yield collection(schema, limit + (1 if bound.startswith("max") else -1))
+            case "anyOf":
+                yield from (wrong for arm in limit for wrong in beyond(arm))
+            case "items":
+                yield from ([wrong] for wrong in beyond(limit))
+            case "additionalProperties" if limit:
+                yield from ({valid(keys(schema)): wrong} for wrong in beyond(limit))
+                yield from ({wrong: valid(limit)} for wrong in beyond(keys(schema)))
+            case _:
+                assert bound not in {"exclusiveMaximum", "multipleOf", "$ref"}, bound
+
+
+def bounded(operation: Operation, document: dict[str, Any]) -> Iterator[tuple[Operation, str, Any]]:
+    """Yield each value beyond a bound of the contract, with its field and each operation that takes the field."""
+    shown = document["paths"][operation.path][operation.method.lower()]
+    schemas = {one["name"]: one["schema"] for one in shown.get("parameters", ()) if one["in"] != "header"}
+    if operation.body is not None:
+        name = shown["requestBody"]["content"]["application/json"]["schema"]["$ref"].rpartition("/")[2]
+        schemas |= document["components"]["schemas"][name]["properties"]
+    same = [one for one in OPERATIONS if (one.method, one.path) == (operation.method, operation.path)]
+    for name, schema in schemas.items():
+        fields = [
+            (one, field.name)
+            for one in same
+            for known, field in one.fields().items()
+            if name in (known, field.name)
+        ]
+        assert fields or name in ONLY_THE_API, name
+        yield from ((one, field, wrong) for wrong in beyond(schema) for one, field in fields)
+
+
+@pytest.mark.parametrize("operation", NAMED, ids=lambda one: one.name)
+def test_control_checks_each_bound_of_the_contract(operation: Operation, app: FastAPI) -> None:
+    server = AdminServer(idle(Administration))
+    for taker, field, wrong in bounded(operation, app.openapi()):
+        if (field, wrong) == ("request", ""):
+            continue  # the api makes the request
+        order = orders().get(taker.request) or taker.request(
+            **{name: FIELDS[name] for name in fields_of(taker)}
+        )
+        sample = msgspec.to_builtins(order)
+        listed = isinstance(sample[field], list) and not isinstance(wrong, list)
+        line = json.dumps(sample | {field: [wrong] if listed else wrong}).encode()
+        answer = asyncio.run(server.answer(line))
+        assert (answer.ok, answer.trouble) == (False, "request"), (field, str(wrong)[:80])
+        assert answer.error.startswith(field), answer.error

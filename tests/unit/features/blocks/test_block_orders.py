@@ -279,17 +279,10 @@ def test_own_addresses_are_those_that_a_socket_can_have() -> None:
     assert [is_own(ipaddress.ip_address(one)) for one in addresses] == [True, False, False]
 
 
-@pytest.mark.parametrize("seconds", [0.0, -1.0, 0.5, 365 * 86_400 + 1, float("nan"), float("inf")])
-async def test_a_duration_out_of_bounds_is_rejected(tmp_path: Path, seconds: float) -> None:
+@pytest.mark.parametrize("note", ["a\nb", "\x1b[31m"])
+async def test_a_note_is_printable(tmp_path: Path, note: str) -> None:
     async with control(tmp_path) as made:
-        with pytest.raises(SenselessError, match="1 second to 365 days"):
-            await made.block(NODE, seconds)
-
-
-@pytest.mark.parametrize("note", ["n" * 201, "a\nb", "\x1b[31m"])
-async def test_a_note_is_short_and_printable(tmp_path: Path, note: str) -> None:
-    async with control(tmp_path) as made:
-        with pytest.raises(SenselessError, match="at most 200 characters"):
+        with pytest.raises(SenselessError, match="printable characters"):
             await made.block(NODE, note=note)
 
 
