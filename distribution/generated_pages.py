@@ -17,6 +17,7 @@ from appliance.audit.log.schema import FIELDS, json_schema
 from appliance.channel.alarms import ALARM_KINDS
 from appliance.configuration.settings import Settings
 from appliance.features.guards import guard_order
+from appliance.features.guards.guard_answers import ProofTest
 from appliance.features.metrics.metric_table import METRICS
 from appliance.features.table import FEATURES
 from appliance.quotas.table import AUDIT_RESERVE, AUDIT_ROBOT_PART, QUOTA_ROWS, QuotaRow
@@ -285,9 +286,14 @@ _MONITOR = (
     "monitor", "happened", "number", "seq", "stamp", "before", "after", "before_fields", "after_fields", "size",
     "count", "first_time", "last_time", "first_text", "last_text",
 )  # fmt: skip
+_UNKNOWN, _PASSED = "?", "**"
+_NOTHING = ast.Constant(0)
+_Scope = ast.FunctionDef | ast.AsyncFunctionDef | None
 _LED = ("at", "events", "timer", "conditions")
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
+    "evidence exported": ("robot",),
+    "guard tested": tuple(name for name in ProofTest.__struct_fields__ if name not in ("at", "who")),
     "decision": ("call", "key", "node", "subgraph", "needs", "parts", "unknown_host"),
     "revoked": ("call", "needs"),
     "denials folded": _FOLDED,
@@ -296,7 +302,8 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "monitor fault": (*_MONITOR, *_LED, "values"),
     "monitor verdict": (*_MONITOR, *_LED, "why"),
     "message dropped": (*_MONITOR, *_LED, "values", "handler", "why"),
-    "monitor published": (*_MONITOR, "because_of", *_LED, "handler", "why"),
+    **dict.fromkeys(("monitor published", "monitor called"), (*_MONITOR, "because_of", *_LED, "handler", "why")),
+    "stop begun": (*_MONITOR, "changed_by", "because_of", *_LED, "handler", "why"),
     "message changed": (*_MONITOR, "changed_by", *_LED),
     "shadow observed": (*_MONITOR, "changed_by", "shadow", "would", *_LED, "values", "handler", "why"),
 }  # fmt: skip
@@ -323,6 +330,14 @@ class EventUse(NamedTuple):
     denies: bool
 
 
+class _Helper(NamedTuple):
+    """A function that records an event for its caller: the one of an argument, by its number, or always the same."""
+
+    function: ast.FunctionDef | ast.AsyncFunctionDef
+    event: int | ast.expr
+    fields: tuple[str, ...]
+
+
 class _Recorded(NamedTuple):
     """The events that a module records."""
 
@@ -341,8 +356,18 @@ def _modules() -> tuple[_Recorded, ...]:
 def _recorded(path: Path) -> _Recorded:
     text = path.read_text(encoding="utf-8")
     within, place = fact_cache.nodes(ast.parse(text)), path.relative_to(ROOT / "appliance")
-    calls = (node for node in within if isinstance(node, ast.Call))
-    uses = tuple(use for node in calls for use in _use(node, f"{place}:{node.lineno}"))
+    scopes = {
+        id(call): function
+        for function in within
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        for call in fact_cache.nodes(function)
+        if isinstance(call, ast.Call)
+    }
+    calls = [(node, scopes.get(id(node))) for node in within if isinstance(node, ast.Call)]
+    helpers = {helper.function.name: helper for call in calls for helper in _helper(*call)}
+    uses = tuple(
+        use for node, scope in calls for use in _use(node, f"{place}:{node.lineno}", scope, helpers, within)
+    )
     return _Recorded(uses, frozenset(_written(within)))
 
 
@@ -395,15 +420,103 @@ def _event(node: ast.Call) -> ast.expr | None:
     return node.args[0] if records else None
 
 
-def _use(node: ast.Call, place: str) -> Iterator[EventUse]:
+def _helper(node: ast.Call, scope: _Scope) -> Iterator[_Helper]:
+    """Yield the function of a call that takes the event, or further fields, from its own caller."""
+    event = _event(node) if _called(node) == "happened" else None
+    if scope is not None and event is not None:
+        fields = tuple(_fields(node, scope))
+        parameters = [one.arg for one in scope.args.args if one.arg != "self"]
+        if isinstance(event, ast.Name) and event.id in parameters:
+            yield _Helper(scope, parameters.index(event.id), fields)
+        elif _PASSED in fields:
+            yield _Helper(scope, event, fields)
+
+
+def _fields(node: ast.Call, scope: _Scope) -> Iterator[str]:
+    """Yield the fields of `detail` in a call of `happened`, or in the `partial` of it that is called."""
+    for one in node.keywords:
+        if one.arg in (None, "more"):
+            yield from _keys(one.value, scope)
+        elif one.arg not in _FIELDS:
+            yield one.arg
+    if isinstance(node.func, ast.Name):
+        made = [one for one in _values_of(node.func.id, scope) if isinstance(one, ast.Call)]
+        yield from (field for one in made for field in _fields(one, scope))
+
+
+def _keys(node: ast.expr, scope: _Scope) -> Iterator[str]:
+    """Yield the keys of a mapping; `_PASSED` for those that the caller gives, and `_UNKNOWN` if they cannot be read."""
+    match node:
+        case ast.Constant(value=None):
+            pass
+        case ast.Constant(value=str(key)):
+            yield key
+        case ast.IfExp(body=one, orelse=other):
+            yield from (*_keys(one, scope), *_keys(other, scope))
+        case ast.Dict(keys=keys, values=values):
+            for key, value in zip(keys, values, strict=True):
+                yield from _keys(value if key is None else key, scope)
+        case ast.Name(id=name) if scope and scope.args.kwarg and scope.args.kwarg.arg == name:
+            yield _PASSED
+        case ast.Name(id=name):
+            yield from (key for value in _values_of(name, scope) or [_NOTHING] for key in _keys(value, scope))
+        case _:
+            yield _UNKNOWN
+
+
+def _values_of(name: str, scope: _Scope) -> list[ast.expr]:
+    """Return what a function gives to a name, and the keys that it adds to it."""
+    found: list[ast.expr] = []
+    for node in fact_cache.nodes(scope) if scope else ():
+        match node:
+            case ast.Assign(targets=[ast.Name(id=given)], value=value) if given == name:
+                found.append(value)
+            case ast.AugAssign(target=ast.Name(id=given), value=value) if given == name:
+                found.append(value)
+            case ast.Assign(targets=[ast.Subscript(value=ast.Name(id=given), slice=key)]) if given == name:
+                found.append(key)
+    return found
+
+
+def _events_of(event: ast.expr, scope: _Scope, module: Sequence[ast.AST]) -> Iterator[str]:
+    """Yield the events that an expression may be: a literal, a name that the function gives, or a row of a table."""
+    match event:
+        case ast.Name(id=name):
+            yield from (text for value in _values_of(name, scope) for text in _texts(value))
+        case ast.Subscript(value=ast.Name(id=name)):
+            for node in module:
+                match node:
+                    case ast.AnnAssign(target=ast.Name(id=table), value=ast.Dict(values=rows)) if (
+                        table == name
+                    ):
+                        yield from (text for row in rows for text in _texts(row))
+        case _:
+            yield from _texts(event)
+
+
+def _use(
+    node: ast.Call, place: str, scope: _Scope, helpers: Mapping[str, _Helper], module: Sequence[ast.AST]
+) -> Iterator[EventUse]:
     called, event = _called(node), _event(node)
+    named = {one.arg: one.value for one in node.keywords if one.arg is not None}
+    fields = [*_fields(node, scope)] if called == "happened" else [_UNKNOWN]
+    helper = helpers.get(called)
+    if helper is not None and (not isinstance(helper.event, int) or len(node.args) > helper.event):
+        known = {one.arg for one in (*helper.function.args.args, *helper.function.args.kwonlyargs)}
+        passed = [
+            field
+            for one in node.keywords
+            if one.arg not in known
+            for field in (_keys(one.value, scope) if one.arg is None else [one.arg])
+        ]
+        called, event = "happened", node.args[helper.event] if isinstance(helper.event, int) else helper.event
+        fields = [one for name in helper.fields for one in (passed if name == _PASSED else [name])]
+    fields = [one for one in fields if one not in {*_FIELDS, _PASSED}]
     if event is None:
         return
-    named = {one.arg: one.value for one in node.keywords if one.arg is not None}
-    fields = tuple(name for name in named if name not in _FIELDS) if called == "happened" else ()
-    for name in _texts(event):
+    for name in _events_of(event, scope, module):
         denies = "decision" in named and any("deny" in _texts(one) for one in ast.walk(named["decision"]))
-        yield EventUse(name, place, _severities(node, called, name), fields, denies)
+        yield EventUse(name, place, _severities(node, called, name), tuple(dict.fromkeys(fields)), denies)
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
@@ -425,20 +538,27 @@ def _severities(node: ast.Call, called: str, event: str) -> frozenset[str]:
     }
     plain = not any(one.arg == "severity" for one in node.keywords)
     usual = SEVERITIES.get(event, Severity.INFO).value
-    return frozenset(found or ({usual} if called in ("happened", "_record") and plain else set()))
+    return frozenset(found or ({usual} if called == "happened" and plain else set()))
 
 
 def audit_events_markdown() -> str:
     severities: dict[str, set[str]] = {name: set() for name in EVENTS}
+    read: set[str] = set()
     fields: dict[str, list[str]] = {name: list(ELSEWHERE.get(name, ())) for name in EVENTS}
     for use in uses():
         if use.event in EVENTS:
             severities[use.event] |= use.severities
             fields[use.event] += [one for one in use.fields if one not in fields[use.event]]
+            read.add(use.event)
+    unread = [
+        name for name in EVENTS if name not in ELSEWHERE and (name not in read or _UNKNOWN in fields[name])
+    ]
+    if unread:
+        raise BuildError(f"no call shows the fields of {', '.join(unread)}: list them in `ELSEWHERE`")
     order = [one.value for one in Severity]
     rows = [
         f"| `{name}` | {meaning} | {', '.join(sorted(severities[name], key=order.index)) or 'by case'} |"
-        f" {', '.join(f'`{one}`' for one in fields[name]) or '-'} |"
+        f" {', '.join(f'`{one}`' for one in fields[name] if one != _UNKNOWN) or '-'} |"
         for name, meaning in EVENTS.items()
     ]
     return _HEAD + "\n".join(rows) + "\n"
