@@ -20,8 +20,10 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.channel.messages.api import RequestMade
 from appliance.channel.operations import CHANGES, OPERATIONS
+from appliance.channel.operations import REQUESTS as REQUESTS_OF_CONTROL
+from appliance.channel.rest_bodies import DATED
 from appliance.channel.rest_meaning import call_of, filled_in, meant
-from appliance.channel.rest_operation import Operation
+from appliance.channel.rest_operation import Operation, extra_of, plain
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.errors import SenselessError, TokenRefusedError, UnknownThingError
 from appliance.control.operators.admin_socket import AdminServer
@@ -692,3 +694,27 @@ def test_control_checks_each_bound_of_the_contract(operation: Operation, app: Fa
         answer = asyncio.run(server.answer(line))
         assert (answer.ok, answer.trouble) == (False, "request"), (field, str(wrong)[:80])
         assert answer.error.startswith(field), answer.error
+
+
+def test_a_post_that_makes_something_answers_201() -> None:
+    """These rules have the exceptions of earlier releases; a new operation has none."""
+    listed = {one.path for one in NAMED if one.method == "GET"}
+    made = [one for one in NAMED if one.method == "POST" and one.path in listed]
+    otherwise = {one.name for one in made if one.status != 201}
+    assert otherwise == {"load_monitors", "block_host", "new_guard", "check_driver"}
+
+
+def test_an_unknown_name_is_answered_with_404() -> None:
+    otherwise = {one.name for one in NAMED if "{" in one.path and 404 not in one.problems}
+    assert otherwise == {"revoke_token", "host_token"}
+
+
+def test_lengths_of_time_end_in_seconds() -> None:
+    numbers = {
+        field.name
+        for request in REQUESTS_OF_CONTROL
+        for field in msgspec.structs.fields(request)
+        if plain(field.type) is float and not extra_of(field.type, DATED)
+    }
+    otherwise = {name for name in numbers if not name.endswith("seconds")}
+    assert otherwise == {"confirm_within", "before", "after", "days", "grace", "patience"}
