@@ -22,7 +22,6 @@ from appliance.features.guards.guard_answers import (
     LastStop,
     LoadedSuggestion,
     ProofTest,
-    Suggestion,
     Suggestions,
 )
 from appliance.features.guards.guard_facts import facts_of, preset_row, values_of
@@ -46,7 +45,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import origin_of
 from appliance.features.guards.robot_graph import RobotGraph
-from appliance.features.guards.suggestions import LoadedGuard, advice
+from appliance.features.guards.suggestions import advice
 from appliance.features.guards.upgrades import Upgrade, planned, same, upgraded
 from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState, OlderGuard
 from appliance.specifications.specification_files import SpecificationsRefusedError
@@ -311,17 +310,10 @@ class GuardOrders:
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
         loaded = [
-            LoadedGuard(name, preset.name, self._row(name, preset).topics)
+            LoadedSuggestion(name, preset.name, self._row(name, preset).topics)
             for name, preset in self._guards().items()
         ]
-        found = advice(facts_of(self._graph()), loaded, self._monitors.checked.monitors)
-        return Suggestions(
-            [Suggestion(one.preset, one.name, PRESETS[one.preset].what, dict(one.topics), dict(one.measured),
-                        dict(one.values), one.command, {name: [*topics] for name, topics in one.others.items()})
-             for one in found.proposals],
-            [LoadedSuggestion(guard.name, guard.preset, dict(guard.topics)) for guard in found.loaded],
-            found.left_out, found.not_protected,
-        )  # fmt: skip
+        return advice(facts_of(self._graph()), loaded, self._monitors.checked.monitors)
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
         file, text = self._made(request)

@@ -7,10 +7,11 @@ left out, and a sentence names the alternatives. The advice ends with what no gu
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 
 from appliance.base.counted import counted
 from appliance.features.guards import robot_graph as types
+from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
+from appliance.features.guards.presets import PRESETS
 from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, SIDE, RobotGraph, TopicFacts
 
 _WORD = re.compile(r"[a-z]+")
@@ -64,53 +65,14 @@ NOT_SUGGESTED = {
 """The presets that are never proposed, and why."""
 
 
-@dataclass(frozen=True)
-class LoadedGuard:
-    """A guard in use, with its topics by the preset's names for them."""
-
-    name: str
-    preset: str
-    topics: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """A guard that fits the graph."""
-
-    preset: str
-    name: str
-    topics: Mapping[str, str]
-    measured: Mapping[str, str] = field(default_factory=dict)
-    """The values that come from present rates; `values` has the others that fit the topics."""
-    values: Mapping[str, str] = field(default_factory=dict)
-    others: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    """Alternatives, by the preset's names for its topics."""
-
-    @property
-    def command(self) -> str:
-        words = [f"rosrv guard new {self.preset} {self.topics['command']}"]
-        words += [f"--by {topic}" if name == "by" else f"--topic {name}={topic}"
-                  for name, topic in self.topics.items() if name != "command"]  # fmt: skip
-        if self.name != self.preset:
-            words.append(f"--name {self.name}")
-        words += [
-            "--shadow",
-            *(f"{name}={value}" for name, value in {**self.measured, **self.values}.items()),
-        ]
-        return " ".join(words)
-
-
-@dataclass(frozen=True)
-class Advice:
-    """Proposals, the guards in use that make further ones unnecessary, and sentences.
-
-    `left_out` has what is ambiguous, and `not_protected` what neither the proposals nor the guards in use protect.
-    """
-
-    proposals: list[Proposal]
-    loaded: list[LoadedGuard]
-    left_out: list[str]
-    not_protected: list[str]
+def _command_line(preset: str, name: str, topics: Mapping[str, str], values: Mapping[str, str]) -> str:
+    words = [f"rosrv guard new {preset} {topics['command']}"]
+    words += [f"--by {topic}" if part == "by" else f"--topic {part}={topic}"
+              for part, topic in topics.items() if part != "command"]  # fmt: skip
+    if name != preset:
+        words.append(f"--name {name}")
+    words += ["--shadow", *(f"{parameter}={value}" for parameter, value in values.items())]
+    return " ".join(words)
 
 
 def _by_host(topics: Iterable[TopicFacts]) -> list[TopicFacts]:
@@ -129,8 +91,8 @@ def _by_host(topics: Iterable[TopicFacts]) -> list[TopicFacts]:
 
 
 def advice(
-    topics: Iterable[TopicFacts], loaded: Sequence[LoadedGuard] = (), names: Collection[str] = ()
-) -> Advice:
+    topics: Iterable[TopicFacts], loaded: Sequence[LoadedSuggestion] = (), names: Collection[str] = ()
+) -> Suggestions:
     """Return guards for all topics that command a base or an arm. `names` are those of all monitors in use."""
     read = [
         topic
@@ -174,13 +136,13 @@ def advice(
             f"{topic.name} ({topic.type}) goes from {ends}, and may be a command or a measurement; if it moves the"
             f" robot: rosrv guard new deadman {topic.name} --shadow"
         )
-    return Advice(writer.found, writer.in_use, writer.left_out, [*writer.not_protected()])
+    return Suggestions(writer.found, writer.in_use, writer.left_out, [*writer.not_protected()])
 
 
 class _Writer:
     """Collects the advice."""
 
-    def __init__(self, graph: RobotGraph, loaded: Sequence[LoadedGuard], names: set[str]) -> None:
+    def __init__(self, graph: RobotGraph, loaded: Sequence[LoadedSuggestion], names: set[str]) -> None:
         self.graph, self._loaded, self._names = graph, loaded, names
         self._stops = {
             topic.name
@@ -188,8 +150,8 @@ class _Writer:
             if _stops(f"{topic.name.rsplit('/', 1)[0]}/{graph.leaf(topic)}")
         }
         self._alone = len([*graph.bases, *graph.arms, *graph.arm_velocities]) == 1
-        self.found: list[Proposal] = []
-        self.in_use: list[LoadedGuard] = []
+        self.found: list[Suggestion] = []
+        self.in_use: list[LoadedSuggestion] = []
         self.left_out: list[str] = []
 
     def add_base(self, base: TopicFacts) -> None:
@@ -586,9 +548,11 @@ class _Writer:
         name = next(name for name in _names(parts, command.name) if name not in self._names)
         self._names.add(name)
         alternatives = [topic.name for topic in others if topic.name != topics.get("by")]
+        measured, values = dict(measured or {}), dict(values or {})
+        line = _command_line(preset, name, topics, measured | values)
         self.found.append(
-            Proposal(preset, name, topics, measured or {}, values or {},
-                     {"by": alternatives} if alternatives else {})
+            Suggestion(preset, name, PRESETS[preset].what, topics, measured, values, line,
+                       {"by": alternatives} if alternatives else {})
         )  # fmt: skip
 
     def _leave(self, preset: str, command: TopicFacts, why: str, topics: Sequence[TopicFacts]) -> None:

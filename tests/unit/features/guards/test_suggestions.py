@@ -5,9 +5,10 @@ from typing import Any
 import pytest
 import yaml
 
+from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS, GuardError, text_of
 from appliance.features.guards.robot_graph import MOST_COMMANDS, TopicFacts
-from appliance.features.guards.suggestions import NOT_SUGGESTED, Advice, LoadedGuard, Proposal, advice
+from appliance.features.guards.suggestions import NOT_SUGGESTED, advice
 from appliance.features.guards.upgrades import planned
 from rosmop.check.sources import compiled_from
 from tests.support.examples import sample
@@ -29,13 +30,13 @@ def graph_of(robot: str) -> list[TopicFacts]:
     return rows
 
 
-def text(proposal: Proposal, graph: list[TopicFacts]) -> str:
+def text(proposal: Suggestion, graph: list[TopicFacts]) -> str:
     values = {**proposal.measured, **proposal.values}
     return text_of(planned(PRESETS[proposal.preset], proposal.name, proposal.topics, graph, values, {}))
 
 
-def printed(found: Advice) -> Iterator[str]:
-    for one in found.proposals:
+def printed(found: Suggestions) -> Iterator[str]:
+    for one in found.suggestions:
         yield one.command.removeprefix("rosrv guard new ")
         yield from (f"  instead: {', '.join(topics)}" for topics in one.others.values())
     yield from (f"! {sentence}" for sentence in found.left_out)
@@ -48,11 +49,11 @@ def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
     found = advice(graph)
     assert [*printed(found)] == ROBOTS[robot]["proposal"].splitlines()
     assert found.not_protected[-1].startswith("never by a guard: ")
-    sources = {f"{one.name}.rv": text(one, graph) for one in found.proposals}
-    assert len(sources) == len(found.proposals)
+    sources = {f"{one.name}.rv": text(one, graph) for one in found.suggestions}
+    assert len(sources) == len(found.suggestions)
     if robot not in sample(ROBOTS, 4):
         return
-    assert len(compiled_from(sources, DEFINITIONS, lints=False).specifications) == len(found.proposals)
+    assert len(compiled_from(sources, DEFINITIONS, lints=False).specifications) == len(found.suggestions)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -64,7 +65,7 @@ def test_the_order_of_topics_and_further_observers_change_nothing(robot: str) ->
         mixed = [one._replace(subscribers=(*one.subscribers, "/record_1", "/rqt_plot")) for one in graph]
         seeded(seed).shuffle(mixed)
         again = advice(mixed)
-        assert {one.command for one in again.proposals} == {one.command for one in found.proposals}
+        assert {one.command for one in again.suggestions} == {one.command for one in found.suggestions}
         assert {*again.left_out} == {*found.left_out}
         assert [len(one) for one in again.not_protected] == [len(one) for one in found.not_protected]
 
@@ -72,13 +73,16 @@ def test_the_order_of_topics_and_further_observers_change_nothing(robot: str) ->
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_nothing_is_proposed_that_is_loaded(robot: str) -> None:
     graph = graph_of(robot)
-    found = advice(graph).proposals
-    loaded = [LoadedGuard(f"mine_{place}", one.preset, one.topics) for place, one in enumerate(found)]
+    found = advice(graph).suggestions
+    loaded = [LoadedSuggestion(f"mine_{place}", one.preset, one.topics) for place, one in enumerate(found)]
     again = advice(graph, loaded)
-    assert (again.proposals, {guard.name for guard in again.loaded}) == ([], {guard.name for guard in loaded})
+    assert (again.suggestions, {guard.name for guard in again.loaded}) == (
+        [],
+        {guard.name for guard in loaded},
+    )
     one_less = advice(graph, loaded[1:], ["deadman", "deadman_2"])
-    assert [one.topics for one in one_less.proposals] == [found[0].topics]
-    assert one_less.proposals[0].name not in {"deadman", "deadman_2"}
+    assert [one.topics for one in one_less.suggestions] == [found[0].topics]
+    assert one_less.suggestions[0].name not in {"deadman", "deadman_2"}
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -89,13 +93,13 @@ def test_a_second_robot_changes_nothing_for_the_first(robot: str) -> None:
         advice([*moved(graph_of(robot), "b"), *moved(graph_of(robot), "a")]),
     )
 
-    def essence(one: Proposal) -> tuple[str, dict[str, str]]:
+    def essence(one: Suggestion) -> tuple[str, dict[str, str]]:
         return one.preset, {name: topic for name, topic in one.topics.items() if name != "reset"}
 
-    assert [essence(one) for one in alone.proposals] == [
-        essence(one) for one in both.proposals if one.topics["command"].startswith("/a/")
+    assert [essence(one) for one in alone.suggestions] == [
+        essence(one) for one in both.suggestions if one.topics["command"].startswith("/a/")
     ]
-    for one in both.proposals:
+    for one in both.suggestions:
         assert len({topic.split("/")[1] for topic in one.topics.values()}) == 1
 
 
@@ -114,10 +118,10 @@ def moved(graph: list[TopicFacts], space: str) -> list[TopicFacts]:
 def test_without_its_source_a_guard_is_left_out(robot: str) -> None:
     """No neighbour's source takes its place."""
     graph = moved(graph_of(robot), "a")
-    for one in advice(graph).proposals:
+    for one in advice(graph).suggestions:
         sources = {topic for name, topic in one.topics.items() if name not in {"command", "reset"}}
         less = [topic for topic in graph if topic.name not in sources]
-        again = advice([*moved(graph_of(robot), "b"), *less]).proposals
+        again = advice([*moved(graph_of(robot), "b"), *less]).suggestions
         assert all(topic.startswith("/a/") for each in again if each.topics["command"].startswith("/a/")
                    for topic in each.topics.values())  # fmt: skip
 
@@ -147,7 +151,7 @@ def test_a_velocity_is_a_command_by_its_direction(
 ) -> None:
     for graph in ([*BASE, velocity], [velocity, *BASE]):
         found = advice(graph)
-        assert {one.topics["command"] for one in found.proposals if one.preset == "deadman"} == guarded
+        assert {one.topics["command"] for one in found.suggestions if one.preset == "deadman"} == guarded
         assert any("may be a command" in one for one in found.left_out) == asked
 
 
@@ -156,14 +160,14 @@ def test_a_navigation_that_also_publishes_odometry_commands_the_base() -> None:
         TopicFacts("/cmd_vel", TWIST, ("/nav",), ("/base",)),
         TopicFacts("/odom", ODOMETRY, ("/nav",), ()),
     ]
-    assert {"deadman", "fence"} <= {one.preset for one in advice(graph).proposals}
+    assert {"deadman", "fence"} <= {one.preset for one in advice(graph).suggestions}
 
 
 def test_the_list_of_what_is_not_protected_is_never_empty_and_knows_the_guards_in_use() -> None:
     for graph in ([], [TopicFacts("/chatter", "std_msgs/String", ("/a",), ("/b",))]):
         assert len(advice(graph).not_protected) == 2
     loaded = [
-        LoadedGuard(preset, preset, {"command": "/cmd_vel", "by": "/x"})
+        LoadedSuggestion(preset, preset, {"command": "/cmd_vel", "by": "/x"})
         for preset in ("deadman", "estop", "zone", "fence", "mode", "enable", "overspeed")
     ]
     assert len(advice(BASE, loaded).not_protected) == 1
@@ -190,7 +194,7 @@ def test_a_button_is_as_many_publishers_as_there_are_at_the_slowest_rate(
 ) -> None:
     nodes = tuple(f"/button_{place}" for place in range(len(rates)))
     found = advice([*BASE, TopicFacts("/e_stop", "std_msgs/Bool", nodes, ("/base",), sum(rates), (), rates)])
-    assert [one.command.partition("--shadow ")[2] for one in found.proposals if one.preset == "estop"] == [
+    assert [one.command.partition("--shadow ")[2] for one in found.suggestions if one.preset == "estop"] == [
         values
     ]
     assert any("failure" in one for one in found.left_out) == said
@@ -198,7 +202,7 @@ def test_a_button_is_as_many_publishers_as_there_are_at_the_slowest_rate(
     slowest = min((rate for rate in rates if rate), default=0)
     silent = f"silent={min(max(5 / slowest, 0.2), 2):.3g}" if slowest else "--shadow"
     assert any(
-        one.command.endswith(f" {silent}") for one in advice([command]).proposals if one.preset == "deadman"
+        one.command.endswith(f" {silent}") for one in advice([command]).suggestions if one.preset == "deadman"
     )
 
 
@@ -217,7 +221,7 @@ def test_a_stop_is_proposed_only_if_its_name_says_what_true_means(topic: str, st
         TopicFacts("/cmd_vel", "geometry_msgs/Twist", ("/teleop",), ("/base",)),
         TopicFacts(topic, "std_msgs/Bool", ("/plc",), (), 10),
     ]
-    found = {one.topics["stop"] for one in advice(graph).proposals if one.preset == "estop"}
+    found = {one.topics["stop"] for one in advice(graph).suggestions if one.preset == "estop"}
     assert found == ({topic} if stops else set())
 
 
@@ -236,11 +240,11 @@ def test_a_reset_is_a_word_of_its_name_and_never_the_stop_itself(topic: str, res
         TopicFacts("/e_stop", "std_msgs/Bool", ("/plc",), (), 10),
         TopicFacts(topic, "std_msgs/Bool", ("/plc",), (), 10),
     ]
-    found = [one.topics for one in advice(graph).proposals if one.preset == "estop"]
+    found = [one.topics for one in advice(graph).suggestions if one.preset == "estop"]
     assert found and all(("reset" in one) == resets and one["stop"] != one.get("reset") for one in found)
 
 
-def scanned(command: str, kind: str, scan: str) -> Advice:
+def scanned(command: str, kind: str, scan: str) -> Suggestions:
     return advice([
         TopicFacts(command, kind, ("/teleop",), ("/base",), 10),
         TopicFacts(scan, "sensor_msgs/LaserScan", ("/lidar",), ("/base",), 10),
@@ -259,7 +263,7 @@ def scanned(command: str, kind: str, scan: str) -> Advice:
 )
 def test_a_scanner_that_may_not_look_ahead_needs_its_direction(scan: str, said: bool) -> None:
     found = scanned("/cmd_vel", "geometry_msgs/Twist", scan)
-    assert "separation" in {one.preset for one in found.proposals}
+    assert "separation" in {one.preset for one in found.suggestions}
     assert any("set mounted and sector" in one for one in found.left_out) == said
 
 
@@ -267,7 +271,7 @@ def test_a_scanner_that_may_not_look_ahead_needs_its_direction(scan: str, said: 
 def test_no_separation_is_proposed_for_velocities_in_the_frame_of_the_map(leaf: str) -> None:
     kind = "geometry_msgs/TwistStamped" if leaf == "cmd_vel" else "geometry_msgs/Twist"
     found = scanned(f"/mavros/setpoint_velocity/{leaf}", kind, "/scan")
-    presets = {one.preset for one in found.proposals}
+    presets = {one.preset for one in found.suggestions}
     assert "sensor" in presets and "separation" not in presets
     assert any("separation of /mavros" in one for one in found.left_out)
 
@@ -278,13 +282,13 @@ def test_a_flood_of_topics_is_cut_and_said() -> None:
         for number in range(700)
     ]
     found = advice(graph)
-    assert len({one.topics["command"] for one in found.proposals}) == MOST_COMMANDS
+    assert len({one.topics["command"] for one in found.suggestions}) == MOST_COMMANDS
     assert "only the first" in found.left_out[-1]
 
 
 @pytest.mark.complete
 def test_each_preset_is_proposed_for_some_robot_or_has_a_reason() -> None:
-    found = {one.preset for robot in ROBOTS for one in advice(graph_of(robot)).proposals}
+    found = {one.preset for robot in ROBOTS for one in advice(graph_of(robot)).suggestions}
     where = (
         "suggestions.py: propose it for a robot of robots.yaml, or list it in NOT_SUGGESTED with the reason"
     )
@@ -366,8 +370,8 @@ def test_topics_of_another_host_crowd_out_none_of_the_robot() -> None:
             for number in range(600)
         ),
     ]
-    assert "/cmd_vel" in {one.command for one in advice(graph).proposals} | {
-        topic for one in advice(graph).proposals for topic in one.topics.values()
+    assert "/cmd_vel" in {one.command for one in advice(graph).suggestions} | {
+        topic for one in advice(graph).suggestions for topic in one.topics.values()
     }
 
 
@@ -395,11 +399,13 @@ def test_diagnostics_stop_the_base_with_all_entries_until_a_person_names_those_t
         *(TopicFacts(name, array, (f"/of{name}",), (), 1.0) for name in more),
     ]
     found = advice(graph)
-    assert [one.topics["by"] for one in found.proposals if one.preset == "diagnostics"] == [by] * bool(by)
+    assert [one.topics["by"] for one in found.suggestions if one.preset == "diagnostics"] == [by] * bool(by)
     [said] = [sentence for sentence in found.left_out if sentence.startswith("diagnostics of /cmd_vel")]
     assert ("is not known" in said) == bool(by)
     for topic in graph:
         if topic.type == array:
             unheard = [one if one is not topic else one._replace(publishers=()) for one in graph]
-            names = {one.topics.get("by") for one in advice(unheard).proposals if one.preset == "diagnostics"}
+            names = {
+                one.topics.get("by") for one in advice(unheard).suggestions if one.preset == "diagnostics"
+            }
             assert topic.name not in names
