@@ -116,7 +116,7 @@ def body_refusal(text: str, choices: Collection[str] = ()) -> str:
     return text
 
 
-def refused_field(error: ValueError, where: str = "", choices: Collection[str] = ()) -> tuple[str, str]:
+def refused_field(error: Exception, where: str = "", choices: Collection[str] = ()) -> tuple[str, str]:
     """Return the place of msgspec's `ValidationError` below `where`, and its message."""
     text, at, place = str(error).rpartition(" - at `")
     if not at:
