@@ -454,8 +454,8 @@ def _keys(node: ast.expr, scope: _Scope) -> Iterator[str]:
         case ast.IfExp(body=one, orelse=other):
             yield from (*_keys(one, scope), *_keys(other, scope))
         case ast.Dict(keys=keys, values=values):
-            for key, value in zip(keys, values, strict=True):
-                yield from _keys(value if key is None else key, scope)
+            for word, value in zip(keys, values, strict=True):
+                yield from _keys(value if word is None else word, scope)
         case ast.Name(id=name) if scope and scope.args.kwarg and scope.args.kwarg.arg == name:
             yield _PASSED
         case ast.Name(id=name):

@@ -222,12 +222,9 @@ def body_of(operation: Operation) -> type[msgspec.Struct] | None:
     if not isinstance(given, Body):
         return given
     if given not in _BODIES:
+        field: Any = msgspec.field  # it takes both defaults if one is `NODEFAULT`
         fields = [
-            (
-                one.name,
-                _in_body(one.type),
-                msgspec.field(default=one.default, default_factory=one.default_factory),
-            )
+            (one.name, _in_body(one.type), field(default=one.default, default_factory=one.default_factory))
             for one in operation.in_body()
         ]
         _BODIES[given] = msgspec.defstruct(

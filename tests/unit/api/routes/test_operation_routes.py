@@ -634,7 +634,8 @@ def collection(schema: dict[str, Any], size: int) -> Any:
 
 
 def keys(schema: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "string"} | schema.get("propertyNames", {})
+    names: dict[str, Any] = schema.get("propertyNames", {})
+    return {"type": "string"} | names
 
 
 def beyond(schema: dict[str, Any]) -> Iterator[Any]:
