@@ -9,7 +9,7 @@ Orders (`Dialogue.say`): `b` is the file b.rv with the text `b` of `TEXTS`, `c.r
     relay begins b                                  its answers name the monitors that began in their initial state
     relay starts | relay takes 1 held=b             another relay is sent its statement; its answer
     revisions                                       list the kept revisions
-    eve load b shadow confirm_within=0              an operator's order, with fields of its request
+    eve load b shadow confirm_within=1e-9           an operator's order, with fields of its request
     revision 3                                      the time limit of a change ends; its rollback is this revision
 
 Effects follow: the answer (or refusal), the statements to the relay, the records, and the monitors if they have
