@@ -54,7 +54,9 @@ _BODY: dict[str, Callable[..., str]] = {
 """Patterns of msgspec's messages, and the messages for users."""
 
 
-_NAME = re.compile(r"\^\(?\[([\w.-]+)\]\[([\w.-]+)\]\{0,(\d+)\}(?:\)\?)?(?:\$|\\Z)")
+_NAME = re.compile(
+    r"\^\(?\[([\w.-]+)\](?:\(\?:)?\[([\w.-]+)\]\{0,(\d+)\}(\[[\w.-]+\])?(?:\)\?)?(?:\\+(\.\w+))?(?:\$|\\Z)"
+)
 _HEX = re.compile(r"\^\[0-9a-f\]\{(\d+)\}\$")
 _YAML = {
     r"'\\t'": "indent with spaces, not tabs",
@@ -135,9 +137,12 @@ def _shape(pattern: str) -> str:
     found = _NAME.fullmatch(pattern)
     if found is None:
         return f"a string that matches {pattern}"
-    first, rest, most = found.groups()
+    first, rest, most, last, suffix = found.groups()
     begin = " or ".join(word.removesuffix("s") for word in _characters(first))
-    return f"a name of {', '.join(_characters(rest))}, at most {int(most) + 1}, that begins with a {begin}"
+    ends = " and ends" if last else ""
+    longest = int(most) + 1 + bool(last)
+    name = f"a name of {', '.join(_characters(rest))}, at most {longest}, that begins{ends} with a {begin}"
+    return f"{name}, followed by {suffix}" if suffix else name
 
 
 def _characters(members: str) -> list[str]:

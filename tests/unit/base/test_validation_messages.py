@@ -35,6 +35,10 @@ LIBRARY = re.compile(
         (r"^[a-z][a-z0-9_-]{0,30}\Z",
          "a name of small letters, digits, '_', '-', at most 31, that begins with a small letter"),
         ("^[0-9a-f]{64}$", "64 hexadecimal digits (0-9, a-f)"),
+        (r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$",
+         "a name of letters, digits, '.', '_', '-', at most 63, that begins and ends with a letter or digit"),
+        (r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,190}\\.rv$", "a name of letters, digits, '_', '.', '-', at most 191, that"
+         " begins with a letter or digit or '_', followed by .rv"),
     ],
 )  # fmt: skip
 def test_the_form_of_a_name_is_described_in_words(pattern: str, words: str) -> None:
