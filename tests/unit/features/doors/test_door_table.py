@@ -53,7 +53,6 @@ def test_a_name_keeps_its_address_and_no_other_name_gets_it(tmp_path: Path) -> N
         ("a" * 32, None, "", "not a name"),
         ("agent-1", None, "", "already"),
         ("agent_1", None, "", "only in - and _"),
-        ("bob", 80, "", "use 1024"),
         ("bob", 9091, "", "port of the door agent-1"),
         ("bob", None, "10.0.0.7", "needs --port"),
         ("bob", 9092, "10.0.0.0/33", "not an address or network"),
