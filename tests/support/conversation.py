@@ -43,9 +43,11 @@ conversations (`# title`). A file that begins with `only answers` lists all answ
 import asyncio
 import ipaddress
 import json
+import os
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from appliance.channel import messages
@@ -72,11 +74,6 @@ class Conversation:
         self._held = False  # changes wait for the ROS master
 
     async def say(self, line: str) -> list[str]:
-        given = line.removeprefix("given ")
-        effects = await self._effects(given)
-        return effects if line == given else []
-
-    async def _effects(self, line: str) -> list[str]:
         self.parts.seen.clear()
         self.parts.records.clear()
         call = line.removeprefix("begin ")
@@ -351,8 +348,23 @@ def conversations_of(text: str) -> ConversationFile:
 
 async def taken_place(file: ConversationFile, title: str) -> str:
     conversation = Conversation(await ControlParts.begun(), file.policies, only_answers=file.only_answers)
+    return await played(file.conversations[title], conversation.say)
+
+
+async def played(written: str, say: Callable[[str], Awaitable[list[str]]]) -> str:
     lines: list[str] = []
-    for line in file.conversations[title].splitlines():
-        if not line.startswith(" "):
-            lines += [line, *(f"    {effect}" for effect in await conversation.say(line))]
+    for line in written.splitlines():
+        if line and not line.startswith(" "):
+            action = line.removeprefix("given ")
+            effects = await say(action)
+            lines += [line, *(f"    {effect}" for effect in effects if action == line)]
     return "\n".join(lines)
+
+
+def compare(file: Path, title: str, written: str, took_place: str) -> None:
+    """Compare the text of a conversation with what took place; with `TRANSCRIPTS=write`, write that to the file."""
+    if took_place != written and os.environ.get("TRANSCRIPTS") == "write":
+        text = file.read_text(encoding="utf-8")
+        text = text.replace(f"# {title}\n{written}\n", f"# {title}\n{took_place}\n")
+        file.write_text(text, encoding="utf-8")
+    assert took_place.splitlines() == written.splitlines()

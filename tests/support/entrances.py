@@ -120,15 +120,14 @@ CELLS: dict[str, dict[str, str]] = {
     },
     "door's port": {
         "block": f"{_DOORS}test_process.py::test_a_blocked_host_is_not_served",
-        "end of a right": f"{_DOORS}test_session.py::test_a_will_ends_with_the_right"
-        f" {_DOORS}test_session.py::test_a_revoked_right_is_refused_in_words_beside_a_client_that_stays",
+        "end of a right": f"{_DOORS}test_conversations.py::test_conversation",
         "unknown": f"{_DOORS}test_door_processes.py::test_refusals_are_denials_of_the_peer_and_connections_are_folded",
         "folding": f"{_DOORS}test_door_processes.py::test_refusals_are_denials_of_the_peer_and_connections_are_folded",
         "share": f"{_DOORS}test_connections.py::test_a_host_leaves_connections_for_others"
         f" {_DOORS}test_lookout.py::test_names_that_never_answer_delay_only_those_of_their_host",
         "binding": f"{_FIREWALL}test_the_addresses_of_doors_are_bound_to_control",
         "failure": f"{_DOORS}test_known_types.py::test_a_definition_that_cannot_be_used_is_parsed_once"
-        f" {_DOORS}test_session.py::test_a_held_publisher_gets_through_after_the_operators_yes",
+        f" {_DOORS}test_conversations.py::test_conversation",
     },
     "door's ticket": {
         "block": f"{_DOORS}test_door_entry.py::test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked"

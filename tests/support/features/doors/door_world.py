@@ -1,6 +1,6 @@
 import asyncio
 import json
-from collections.abc import AsyncIterator, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -81,6 +81,9 @@ class WebSocketClient:
     def stop_reading(self) -> None:
         self._reading.cancel()
 
+    def read_on(self) -> None:
+        self._reading = asyncio.ensure_future(self._read())
+
     @property
     def is_open(self) -> bool:
         return self.socket.state is State.OPEN
@@ -97,8 +100,10 @@ class DoorWorld:
         self.memories = [self.waiting, self.calls]
         self.sessions: list[DoorSession] = []
         self.queues: list[ViewerQueue[Any]] = []
+        self.rosbridge, self.foxglove = RosbridgeLimits(), FoxgloveLimits()
         self.options = SessionOptions(origins=("https://robot.example",))
         self.types = KnownTypes(standard_definitions(), ValueLimits())
+        self.ended: Callable[[DoorSession], None] = lambda _session: None
         self.nodes: list[RosNode] = []
         self.hosts: dict[str, str] = {}  # of nodes
         self.node: RosNode
@@ -151,9 +156,9 @@ class DoorWorld:
             door=self.door,
             lookout=self.lookout,
             protocols=lambda name: (
-                Rosbridge("/door_alice", RosbridgeLimits(), queue)
+                Rosbridge("/door_alice", self.rosbridge, queue)
                 if name is None
-                else Foxglove("/door_alice", FoxgloveLimits(), queue)
+                else Foxglove("/door_alice", self.foxglove, queue)
             ),
             subprotocols=SUBPROTOCOLS,
             options=self.options,
@@ -161,6 +166,7 @@ class DoorWorld:
         )
         self.sessions.append(session)
         await session.run()
+        self.ended(session)
 
     async def client(
         self,

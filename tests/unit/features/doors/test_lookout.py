@@ -1,8 +1,12 @@
 import asyncio
+import json
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import pytest
+from msgspec import Raw
 
+from appliance.features.doors.client_requests import CallOfService
 from appliance.features.doors.known_types import KnownType, KnownTypes
 from appliance.features.doors.lookout import Lookout, in_turn
 from appliance.features.doors.rosapi import Rosapi
@@ -13,10 +17,15 @@ from roswire.node import MasterDenialError
 from roswire.node.network import PeerUnreachableError
 from roswire.standard import standard_definitions
 from roswire.xmlrpc import Value
-from tests.unit.features.doors.test_rosapi import ask
 
 pytestmark = pytest.mark.anyio
 OWN = Definitions.from_files({"own/Load.msg": "int8 x"})
+
+
+async def ask(rosapi: Rosapi, service: str, values: str = "{}") -> Any:
+    answer = rosapi.answer(CallOfService(service, 1, Raw(values.encode())))
+    assert answer is not None
+    return json.loads(bytes(await answer))
 
 
 class Robot:
@@ -132,18 +141,6 @@ async def test_an_answer_about_many_does_not_fail_for_one(service: str) -> None:
     if service == "topics_and_raw_types":
         texts = dict(zip(answer["topics"], answer["typedefs_full_text"], strict=True))
         assert [topic for topic, text in texts.items() if text] == ["/robot/00"]
-
-
-async def test_a_denial_of_the_whole_list_is_words() -> None:
-    robot = Robot("service", 1)
-
-    async def denied() -> VisibleGraph:
-        raise MasterDenialError("getSystemState is denied (site.ini:2)")
-
-    robot.graph = denied  # type: ignore[method-assign]  # the graph of the test
-    with pytest.raises(MasterDenialError, match=r"site\.ini:2"):
-        await robot.lookout.service_types()
-    assert (await robot.lookout.look()).denial == "getSystemState is denied (site.ini:2)"
 
 
 def test_a_thing_of_several_hosts_counts_for_the_one_with_the_fewest() -> None:
