@@ -200,11 +200,11 @@ class ApprovalOrders:
 
     def policy_changed(self) -> None:
         """End all entries about which the policy no longer asks. The next check stops their motions."""
-        self._table.forget_unanswered(lambda call: self._asks_about(call, ""))
         for entry in self._table.entries():
             if not self._asks(entry):
                 self._end(entry, "the policy no longer asks")
                 self._cut_off.append(entry)
+        self._table.forget_unanswered(lambda call: self._asks_about(call, ""))
 
     async def watch(self) -> None:
         async with asyncio.TaskGroup() as checks:

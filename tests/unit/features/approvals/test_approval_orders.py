@@ -2,10 +2,10 @@ import asyncio
 import hashlib
 import random
 import re
-from collections.abc import Iterable
+from collections.abc import Awaitable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -98,9 +98,6 @@ class Site:
             return None
         return ["deadman"] if topic in self.guarded else []
 
-    def events(self) -> list[str]:
-        return [event.removeprefix("approval ") for event in self.trail.events if event != "decision"]
-
     async def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / CHECK_SECONDS)):
             self.time.advance(CHECK_SECONDS)
@@ -135,54 +132,173 @@ def number_in(text: str) -> int:
     return int(found[1])
 
 
-async def test_an_approval_of_one_call_is_used_once(site: Site) -> None:
-    first = number_in(await site.call(b"1"))
-    assert first == number_in(await site.call(b"1")) == 17
-    assert number_in(await site.call(b"2")) != first
-    shown = await site.orders.approve(ApproveCall(first), "ann")
-    assert (shown.state, shown.who, shown.left_seconds) == ("approved", "ann", WAIT_SECONDS)
-    for refusal in (
-        await site.call(b"2"),
-        await site.call(b"1", OTHER),
-        await site.call(b"1", service="/other"),
-    ):
-        assert number_in(refusal) != first
-    assert await site.call(b"1") == ""
-    assert number_in(await site.call(b"1")) != first
-    assert [record.decision for record in site.trail.records].count("allow") == 1
-    assert site.events().count("used") == 1
+class Held(NamedTuple):
+    """A held call as operators see it, and the tokens of its approver."""
+
+    number: int
+    state: str  # or `lease`, for some time
+    until: float
+    who: str = ""
+    tokens: frozenset[str] = frozenset()
 
 
-async def test_an_approval_of_a_service_for_some_time_is_for_any_arguments_until_its_time(site: Site) -> None:
-    number = number_in(await site.call(b"1"))
-    await site.orders.approve(ApproveCall(number, 10.0), "ann")
-    assert [await site.call(body) for body in (b"1", b"2", b"1")] == ["", "", ""]
-    assert number_in(await site.call(b"1", OTHER)) != number
-    site.time.advance(10)
-    assert await site.call(b"1"), "also before the watch has ended it"
-    await site.pass_time(CHECK_SECONDS)
-    assert number_in(await site.call(b"1")) != number
+Key = tuple[Address, Category, str, bytes | None]  # None: any arguments
+ANN, AGAIN, BOB = bearer("1", "ann"), bearer("4", "ann"), bearer("2", "bob", "admin")
+TOKENS = ([ANN, BOB], [AGAIN, BOB], [ANN, AGAIN], [BOB, bearer("1", "ann", "viewer")])
 
 
-async def call_approved_for_some_time(site: Site) -> int:
-    number = number_in(await site.call(b"1"))
-    await site.orders.approve(ApproveCall(number, 10.0), "ann")
-    return number
+class Promises:
+    """The promises about approvals: the calls that are held, and the records about them."""
+
+    def __init__(self) -> None:
+        self.held: dict[Key, Held] = {}
+        self.numbers: dict[Key, int] = {}  # of calls that no operator answered
+        self.bearers = TOKENS[0]
+        self.asks = True
+        self.next = 17
+        self.records: list[str] = []
+
+    def call(self, key: Key) -> str:
+        """Return a part of the answer to its host; nothing if the call passes."""
+        if not self.asks:
+            return ""
+        one = wide if (wide := (*key[:3], None)) in self.held else key
+        now = self.held.get(one)
+        if now is not None and key[1] is Category.CALL and now.tokens and (over := self.over(now)):
+            self.end(one, over)
+            now = self.held.get(key)
+        elif now is not None and now.tokens:
+            if now.state == "approved":
+                del self.held[one]
+                self.records.append(f"used approval {now.number}")
+            return ""
+        if now is None:
+            if sum(other[0] == key[0] for other in self.held) == 8:
+                return "the quota of one host is 8"
+            number = self.numbers.pop(key, self.next)
+            self.next = max(self.next, number + 1)
+            now = self.held[key] = Held(number, "waits", clock.now() + WAIT_SECONDS)
+            self.records.append(f"waits for approval {number}")
+        return f"{'an operator refused' if now.state == 'refused' else 'held for'} approval {now.number}"
+
+    def approve(self, number: int, seconds: float | None, who: str, *, waits: bool) -> str:
+        """Return a part of the error, or nothing."""
+        if (key := self.key(number)) is None:
+            return "rosrv approve lists all"
+        one, is_call = self.held[key], key[1] is Category.CALL
+        if waits and one.state != "waits":
+            return f"is already {'approved' if one.tokens else 'refused'} by {one.who}"
+        if seconds is None and one.state == "lease" and is_call:
+            return "is for some time"
+        seconds = APPROVED_SECONDS if seconds is None and not is_call else seconds
+        tokens = {token.id for token in self.bearers if token.name == who and token.role != "viewer"}
+        del self.held[key]
+        once, until = seconds is None, clock.now() + (seconds or WAIT_SECONDS)
+        approved = Held(number, "approved" if once else "lease", until, who, frozenset(tokens or {who}))
+        self.held[key if once else (*key[:3], None)] = approved
+        self.records.append(f"{who} gave approval {number}, {'once' if once else f'for {seconds:g} s'}")
+        return ""
+
+    def refuse(self, number: int, who: str) -> str:
+        if (key := self.key(number)) is None:
+            return "rosrv approve lists all"
+        if self.held[key].tokens:
+            self.end(key, f"{who} ended it")
+        else:
+            self.held[key] = Held(number, "refused", clock.now() + WAIT_SECONDS, who)
+            self.records.append(f"{who} refused approval {number}")
+        return ""
+
+    def key(self, number: int) -> Key | None:
+        found = (key for key, one in self.held.items() if one.number == number and one.until > clock.now())
+        return next(found, None)
+
+    def over(self, one: Held) -> str:
+        if one.until <= clock.now():
+            return "no operator answered in time" if one.state == "waits" else "its time is over"
+        approvers = {token.id for token in self.bearers if token.role != "viewer"} | {"operator"}
+        lost = one.tokens and not one.tokens & approvers
+        words = f"{one.who}, who approved it, no longer has a token or session with the role operator"
+        return words if lost else ""
+
+    def end(self, key: Key, why: str) -> None:
+        self.records.append(f"approval {self.held.pop(key).number} ended: {why}")
+
+    def check(self) -> None:
+        for key, one in [*self.held.items()]:
+            if why := self.over(one):
+                if one.state == "waits":
+                    self.numbers[key] = one.number
+                self.end(key, why)
+
+    def change_policy(self) -> None:
+        self.asks = not self.asks
+        if not self.asks:
+            self.numbers.clear()
+        for key in [*self.held]:
+            self.end(key, "the policy no longer asks")
 
 
-@pytest.mark.parametrize("category", [Category.PUBLISH, Category.WRITE])
-async def test_a_topic_and_a_parameter_are_approved_for_some_time(site: Site, category: Category) -> None:
-    number = number_in(site.publish("/x", category))
-    assert number_in(site.publish("/x", category)) == number
-    assert number_in(site.publish("/y", category)) != number
-    assert (await site.orders.approve(ApproveCall(number), "ann")).left_seconds == APPROVED_SECONDS
-    assert site.publish("/x", category) == ""
-    await site.pass_time(APPROVED_SECONDS - 1)
-    assert site.publish("/x", category) == ""
-    await site.pass_time(1)
-    assert number_in(site.publish("/x", category)) != number
-    with pytest.raises(SenselessError, match="is for some time"):
-        await site.orders.approve(ApproveCall(await call_approved_for_some_time(site)), "ann")
+@pytest.mark.parametrize("seed", range(16))
+async def test_approvals_are_as_promised_in_any_order(site: Site, seed: int) -> None:
+    chance, promised = random.Random(seed), Promises()  # noqa: S311  a history by seed
+    asking, site.bearers = site.text, TOKENS[0]
+    for _step in range(150):
+        category = chance.choice((Category.CALL, Category.CALL, Category.PUBLISH, Category.WRITE))
+        number = chance.choice([*(one.number for one in promised.held.values()), promised.next])
+        who, host = chance.choice(("ann", "bob", "operator")), chance.choice((AGENT, OTHER))
+        match chance.choice("ccccccaaarrttbp"):
+            case "c":
+                is_call, name = category is Category.CALL, chance.choice(("/x", "/y"))
+                body = chance.choice((b"1", b"2", b"3", b"4"))
+                told = await site.call(body, host, name) if is_call else site.publish(name, category)
+                key = (host, category, name, body) if is_call else (AGENT, category, name, None)
+                expected = promised.call(key)
+                assert expected in told and bool(expected) == bool(told)
+            case "a":
+                seconds, waits = chance.choice((None, None, 1.0, 3.0, 60.0, 3600.0)), chance.random() < 0.3
+                order = site.orders.approve(ApproveCall(number, seconds, waits=waits), who)
+                await is_answered(order, promised.approve(number, seconds, who, waits=waits))
+            case "r":
+                await is_answered(site.orders.refuse(RefuseCall(number), who), promised.refuse(number, who))
+            case "t" if chance.random() < 0.2:  # no check comes in time
+                site.time.advance(chance.choice((3, 60, 120)))
+            case "t":
+                for _quarter in range(chance.choice((1, 4, 12, 480))):
+                    await site.pass_time(CHECK_SECONDS)
+                    promised.check()
+            case "b":
+                site.bearers = promised.bearers = chance.choice(TOKENS)
+            case "p" if chance.random() < 0.5:
+                allowing = compile_policy(f"[Publishers]\ndefault = {AGENT}\n", file="site.ini")
+                blocking = replace(asking, blocks=dict.fromkeys((AGENT, OTHER), "blocked by ann"))
+                blocks = promised.asks and chance.random() < 0.5
+                for other in (blocking, asking) if blocks else (allowing if promised.asks else asking,):
+                    site.text = other
+                    promised.change_policy()
+                    site.decide_again()
+                await site.orders.check()
+                promised.check()
+        shown = {(one.number, one.state, one.who, one.left_seconds) for one in await site.held()}
+        assert shown == {
+            (one.number, one.state, one.who, max(0.0, round(one.until - clock.now(), 1)))
+            for one in promised.held.values()
+        }
+        leases = {key[:3] for key, one in promised.held.items() if one.state == "lease"}
+        enforced = frozenset(one for one in leases if one[1] is not Category.CALL)
+        assert not promised.asks or site.policy.approved == enforced
+        assert site.orders.limits()[0].used == len(shown)
+        texts = [row["reason"] for row in site.trail.rows if row["event"].startswith("approval")]
+        assert sorted(text.partition(": ")[2] for text in texts) == sorted(promised.records)
+
+
+async def is_answered(order: Awaitable[object], error: str) -> None:
+    try:
+        await order
+    except (SenselessError, UnknownThingError) as refusal:
+        assert error and error in str(refusal)
+    else:
+        assert not error
 
 
 async def test_an_approved_motion_ends_by_silence_and_the_guards_stop_the_robot(site: Site) -> None:
@@ -270,27 +386,6 @@ async def test_a_namespace_is_approved_although_only_what_is_below_it_asks(site:
     assert decide_right(site.policy, below).allowed
 
 
-async def test_an_operator_refuses_a_call_and_ends_an_approval(site: Site) -> None:
-    number = number_in(await site.call())
-    await site.orders.refuse(RefuseCall(number), "ann")
-    first, again = [(await site.call()).rpartition(" [")[0] for _call in range(2)]  # without the record's id
-    assert first == again
-    assert f"an operator refused approval {number}" in again
-    await site.pass_time(WAIT_SECONDS)
-    [ended] = [row["reason"] for row in site.trail.rows if row["event"] == "approval ended"]
-    assert ended.endswith(f"approval {number} ended: its time is over")
-    approval = number_in(site.publish("/x"))
-    await site.orders.approve(ApproveCall(approval), "ann")
-    await site.orders.refuse(RefuseCall(approval), "ann")
-    assert number_in(site.publish("/x")) != approval
-    for order in (
-        site.orders.approve(ApproveCall(approval), "ann"),
-        site.orders.refuse(RefuseCall(number), "ann"),
-    ):
-        with pytest.raises(UnknownThingError, match="rosrv approve lists all"):
-            await order
-
-
 async def test_a_call_without_an_answer_ends_with_an_alarm(site: Site) -> None:
     [view] = APPROVALS_VIEW.states
     number = number_in(await site.call())
@@ -302,21 +397,6 @@ async def test_a_call_without_an_answer_ends_with_an_alarm(site: Site) -> None:
     await site.pass_time(1)
     site.time.advance(600)
     assert not [*view.alarms(site.orders.state())]
-
-
-async def test_an_approval_ends_when_the_policy_no_longer_asks(site: Site) -> None:
-    """At once: the next policy may ask again before the next check."""
-    for change in ("[Publishers]\n", "block"):
-        number = number_in(site.publish("/x"))
-        await site.orders.approve(ApproveCall(number, 3600.0), "ann")
-        before = site.text
-        site.text = compile_policy("[Publishers]\n", file="site.ini")
-        if change == "block":
-            site.text = replace(before, blocks={AGENT: "blocked by ann"})
-        site.decide_again()
-        site.text = before
-        site.decide_again()
-        assert number_in(site.publish("/x")) != number
 
 
 async def test_a_door_that_is_added_again_has_no_approval_of_the_removed_one(site: Site) -> None:
@@ -338,54 +418,15 @@ async def test_a_door_that_is_added_again_has_no_approval_of_the_removed_one(sit
     assert "approval 17 ended: the policy no longer asks" in site.trail.rows[-2]["reason"]
 
 
-@pytest.mark.parametrize(
-    "left",
-    [
-        pytest.param([], id="removed"),
-        pytest.param([bearer("2", "ann", "viewer")], id="another role"),
-        pytest.param([bearer("2", "ann", "admin")], id="another token of this name"),
-    ],
-)
-async def test_an_approval_ends_with_the_role_of_its_approver(site: Site, left: list[TokenKept]) -> None:
-    """The robot stops, and the record has the reason."""
+async def test_the_robot_stops_when_the_approver_loses_the_role(site: Site) -> None:
     number = number_in(site.publish("/cmd_vel"))
     await site.orders.approve(ApproveCall(number, 60.0), "ann")
     await site.pass_time(10)
     assert site.publish("/cmd_vel") == "" and not site.stops
-    site.bearers = left
+    site.bearers = [bearer("1", "ann", "viewer")]
     await site.pass_time(CHECK_SECONDS)
     assert number_in(site.publish("/cmd_vel")) != number
     assert site.stops == [(str(AGENT), {"/cmd_vel"})]
-    [ended] = [one for one in site.trail.rows if one["event"] == "approval ended"]
-    assert ended["reason"].endswith(
-        f"approval {number} ended: ann, who approved it, no longer has a token or session with the role operator"
-    )
-
-
-@pytest.mark.parametrize("seconds", [None, 60.0])
-async def test_a_call_is_refused_as_soon_as_its_approver_has_lost_the_role(
-    site: Site, seconds: float | None
-) -> None:
-    number = number_in(await site.call())
-    await site.orders.approve(ApproveCall(number, seconds), "ann")
-    site.bearers = []
-    assert number_in(await site.call()) != number
-    assert site.events()[-2:] == ["ended", "wanted"]
-
-
-async def test_an_approval_outlives_one_of_two_tokens_of_its_approver_and_any_other(site: Site) -> None:
-    """The admin socket needs no token. A later approval of the same call replaces the approver."""
-    site.bearers = [bearer("1", "ann"), bearer("2", "ann"), bearer("3", "bob", "admin")]
-    numbers = [number_in(site.publish(topic)) for topic in ("/a", "/b", "/c")]
-    for number, who in zip(numbers, ("ann", "operator", "ann"), strict=True):
-        await site.orders.approve(ApproveCall(number, 60.0), who)
-    await site.orders.approve(ApproveCall(numbers[2], 60.0), "bob")
-    site.bearers = site.bearers[1:]
-    await site.pass_time(1)
-    assert [site.publish(topic) for topic in ("/a", "/b", "/c")] == ["", "", ""]
-    site.bearers = site.bearers[1:]
-    await site.pass_time(1)
-    assert [bool(site.publish(topic)) for topic in ("/a", "/b", "/c")] == [True, False, False]
 
 
 async def test_a_host_has_a_quota_of_waiting_calls(site: Site) -> None:
@@ -419,77 +460,12 @@ async def test_many_addresses_leave_another_host_its_calls(site: Site) -> None:
     assert site.orders.limits()[0].used == 0
 
 
-async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None:
-    chance = random.Random(11)  # noqa: S311  a history by seed
-    once: list[tuple[Address, bytes]] = []
-    ends: dict[Address, float] = {}
-    for _ in range(2000):
-        host, body = chance.choice((AGENT, OTHER)), chance.choice((b"1", b"2", b"3"))
-        match chance.randrange(4):
-            case 0:
-                if waiting := [one for one in await site.held() if one.state == "waits"]:
-                    one, seconds = chance.choice(waiting), chance.choice((None, 3.0))
-                    await site.orders.approve(ApproveCall(one.number, seconds), "ann")
-                    if seconds is None:
-                        assert one.size == 1
-                        once.append((address_of(one.host), bytes.fromhex(one.arguments)))
-                    else:
-                        ends[address_of(one.host)] = clock.now() + seconds
-            case 1:
-                await site.pass_time(chance.choice((0.25, 1, 2)))
-            case _:
-                approved = ends.get(host, 0.0) > clock.now()
-                if not await site.call(body, host) and not approved:
-                    once.remove((host, body))
-
-
-async def test_a_repeated_call_keeps_its_number_only_with_equal_arguments(site: Site) -> None:
-    number = number_in(await site.call(b"a"))
-    await site.pass_time(WAIT_SECONDS)
-    assert number_in(await site.call(b"b")) != number
-    assert number_in(await site.call(b"a")) == number
-    await site.orders.approve(ApproveCall(number, None), "ann")
-    assert not await site.call(b"a")
-    assert number_in(await site.call(b"a")) != number  # an approval that was used is not renewed
-
-
-async def test_the_number_of_a_call_ends_with_the_right_of_its_host(site: Site) -> None:
-    """A door that is removed and added again has the same name and address."""
-    number = number_in(site.publish("/x"))
-    await site.pass_time(WAIT_SECONDS)
-    before = site.text
-    site.text = compile_policy("[Publishers]\n", file="site.ini")
-    site.decide_again()
-    site.text = before
-    site.decide_again()
-    assert number_in(site.publish("/x")) != number
-
-
-@pytest.mark.parametrize("waited", [0.0, 60.0, 119.0])
-async def test_a_refusal_pauses_for_two_minutes_however_often_the_call_is_repeated(
-    site: Site, waited: float
+async def test_a_number_ends_with_the_right_of_its_host_although_no_check_came_since_its_time(
+    site: Site,
 ) -> None:
-    number = number_in(await site.call())
-    await site.pass_time(waited)
-    await site.orders.refuse(RefuseCall(number), "ann")
-    for _second in range(int(WAIT_SECONDS) - 1):
-        assert "an operator refused" in await site.call()
-        await site.pass_time(1)
-    await site.pass_time(1)
-    assert number_in(await site.call()) != number
-
-
-def test_doors_know_the_words_of_a_held_call(site: Site) -> None:
-    assert "held for approval" in site.publish("/x")
-
-
-async def test_no_operator_replaces_the_answer_of_another_unseen(site: Site) -> None:
-    await site.call(b"one")
-    [one] = await site.held()
-    await site.orders.refuse(RefuseCall(one.number), "ann")
-    with pytest.raises(SenselessError, match="already refused by ann"):
-        await site.orders.approve(ApproveCall(one.number, 30.0, waits=True), "bob")
-    assert [row.state for row in await site.held()] == ["refused"]
-    await site.orders.approve(ApproveCall(one.number, 30.0), "bob")
-    with pytest.raises(SenselessError, match="already approved by bob"):
-        await site.orders.approve(ApproveCall(one.number, 300.0, waits=True), "ann")
+    number, asking = number_in(site.publish("/x")), site.text
+    site.time.advance(WAIT_SECONDS)
+    for text in (compile_policy("[Publishers]\n", file="site.ini"), asking):
+        site.text = text
+        site.decide_again()
+    assert number_in(site.publish("/x")) != number
