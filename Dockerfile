@@ -40,14 +40,15 @@ RUN awk '/^[a-z]/ { taken = /^cython==/ } taken' /build/requirements-bootstrap.l
 COPY appliance /opt/rosrv/lib/python3.11/site-packages/appliance
 COPY roswire /opt/rosrv/lib/python3.11/site-packages/roswire
 COPY rosmop /opt/rosrv/lib/python3.11/site-packages/rosmop
-COPY policies /build/etc/policies
-COPY monitors /build/etc/monitors
+# What verbs read beside the program (appliance/base/shipped.py), such as the presets; also the first configuration, below.
+COPY policies /opt/rosrv/share/rosrv/policies
+COPY monitors /opt/rosrv/share/rosrv/monitors
 # Rights and times of a checkout are its owner's. He may keep his files to himself (umask 077): the processes' users
 # read them all the same; and when he fetched them is nothing that an image is to say.
-RUN cd /opt/rosrv/lib/python3.11/site-packages \
+RUN share=/opt/rosrv/share/rosrv && cd /opt/rosrv/lib/python3.11/site-packages \
  && cp /build/appliance/relay/transport/*.so appliance/relay/transport/ \
- && chmod -R u=rwX,go=rX appliance roswire rosmop /build/etc \
- && find appliance roswire rosmop /build/etc -exec touch {} + \
+ && chmod -R u=rwX,go=rX appliance roswire rosmop $share \
+ && find appliance roswire rosmop $share -exec touch {} + \
  && printf '#!/opt/rosrv/bin/python -P\nfrom appliance.cli.main import main\n\nmain()\n' > /opt/rosrv/bin/rosrv \
  && chmod 755 /opt/rosrv/bin/rosrv \
  && find /opt/rosrv/lib -name __pycache__ -prune -exec rm -rf {} + \
@@ -96,7 +97,7 @@ RUN apt-get update -q \
  && sed -i '/^rosrv-api:/s/$/root/' /etc/group \
  && install -d -m 711 /var/lib/rosrv
 COPY --from=python /opt/rosrv /opt/rosrv
-COPY --from=python /build/etc /etc/rosrv
+COPY --from=python /opt/rosrv/share/rosrv /etc/rosrv
 # The configuration of the container: mount another file here, or override a key with ROSRV_… (docs/operating.md).
 # REST listens on all addresses because only then it can be published; the firewall lets in whom `api_networks` names.
 RUN printf '%s\n' 'isolation: container' 'policy: policies/default.ini' 'monitors: monitors' 'enable: none' \

@@ -55,7 +55,7 @@ for folder, folders, files in os.walk("/"):
 """
 # Those that the image contains: our own files, files of the build, files that packages write during setup.
 EXPECTED = re.compile(
-    r"/opt/rosrv/lib/python3\.11/site-packages/(appliance|roswire|rosmop)/.+|/opt/rosrv/share/rosrv/(build|sbom\.cdx)\.json"
+    r"/opt/rosrv/lib/python3\.11/site-packages/(appliance|roswire|rosmop)/.+|/opt/rosrv/share/rosrv/.+"
     r"|/opt/rosrv/(bin/(python\S*|rosrv)|pyvenv\.cfg|lib64)|/etc/.+|/usr/local/share/ca-certificates/.+\.crt"
     r"|/var/lib/(apt|dpkg|pam|python|sgml-base|systemd|xml-core)/.+|/var/lib/shells\.state|/usr/share/info/dir"
     r"|/root/\.(bashrc|profile)|/\.dockerenv"

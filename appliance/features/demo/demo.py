@@ -47,7 +47,8 @@ def demo(
     Example: rosrv demo --keep --output drive.svg
     """
     if not (SHIPPED / "examples").is_dir():
-        raise refused([f"rosrv demo: the simulated robot is missing from {SHIPPED}: install rosrv again"])
+        why = f"the simulated robot is missing from {SHIPPED}: install rosrv again"
+        raise refused([f"rosrv demo: {why}; beside the container it is `docker compose --profile demo up`"])
     if (standby or adopt) and output is not None:
         raise refused(
             [

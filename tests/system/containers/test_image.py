@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from appliance.features.guards.presets import PRESETS
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution.extension import IN_PLACE
 from tests.support.docker import APPLIANCE, BASE, DEMO, ROOT
@@ -122,6 +123,23 @@ def test_every_process_finds_its_user(site: Site) -> None:
     users = {fields[0]: fields for fields in (line.split(":") for line in lines)}
     assert {name: int(users[name][2]) for name in NUMERIC_IDS} == NUMERIC_IDS
     assert {users[name][6] for name in NUMERIC_IDS} == {"/usr/sbin/nologin"}
+
+
+def test_each_file_that_a_verb_reads_beside_the_program_is_there(
+    contents: list[tuple[str, tarfile.TarInfo, bool]], site: Site
+) -> None:
+    """All but the nodes of `rosrv demo`, which has a container of its own, and what a release adds to the image."""
+    sources = "".join(path.read_text() for path in (ROOT / "appliance").rglob("*.py"))
+    folders = set(re.findall(r'SHIPPED / "(\w+)"', sources)) - {"examples"}
+    assert {"policies", "monitors"} <= folders
+    listed = subprocess.run(
+        ["git", "-c", f"safe.directory={ROOT}", "ls-files", *folders],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    found = {path for path, _, _ in contents}
+    assert [path for path in listed if f"/opt/rosrv/share/rosrv/{path}" not in found] == []
+    presets = run(site, "rosrv", "guard", "list")
+    assert [name for name in PRESETS if f"\n{name}: " not in f"\n{presets}"] == []
 
 
 def test_the_configuration_of_the_image_is_right(site: Site) -> None:
