@@ -5,17 +5,20 @@
 3. A phase of an earlier boot says nothing: all rules, nodes and masters of that boot are gone.
 """
 
+import os
 from enum import StrEnum
 from pathlib import Path
 
 import msgspec
 
 from appliance.base.atomic_files import write_whole
+from appliance.base.full_disk import is_full
 from appliance.network.namespaces import NetworkError
 
 FILE = "adopt.json"
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _LONGEST = 64 << 10  # bytes
+_BLOCK = 512  # bytes: the unit of `st_blocks`
 
 
 class Phase(StrEnum):
@@ -74,8 +77,24 @@ def load_record(state: Path) -> AdoptRecord:
 
 def save_record(state: Path, record: AdoptRecord) -> None:
     """Write the record. Raises `NetworkError`."""
+    file, data = state / FILE, msgspec.json.encode(record)
     try:
         state.mkdir(mode=0o711, parents=True, exist_ok=True)
-        write_whole(state / FILE, msgspec.json.encode(record), 0o644)
+        try:
+            write_whole(file, data, 0o644)
+        except OSError as error:
+            if not (is_full(error, state) and file.exists() and _overwritten(file, data)):
+                raise
     except OSError as error:
-        raise NetworkError(f"{state / FILE} cannot be written: {error.strerror}") from error
+        raise NetworkError(f"{file} cannot be written: {error.strerror}") from error
+
+
+def _overwritten(file: Path, data: bytes) -> bool:
+    """Write into the blocks that the file has: a full disk must not keep a graph from being given back."""
+    with file.open("r+b", buffering=0) as opened:
+        found = os.fstat(opened.fileno())
+        if len(data) > found.st_blocks * _BLOCK:
+            return False
+        opened.write(data.ljust(found.st_size))
+        os.fsync(opened.fileno())
+    return True

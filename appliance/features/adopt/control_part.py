@@ -71,7 +71,7 @@ async def begin(core: Core) -> ControlPart:
     return ControlPart(
         (
             RequestMethod(AdoptStatus, part.status, order=False),
-            RequestMethod(AdoptOrder, part.adopt, full_disk=True),
+            RequestMethod(AdoptOrder, part.adopt),
             RequestMethod(ReleaseOrder, part.release, full_disk=True),
         ),
         {"the adoption of the robot's graph": part.run},
@@ -207,6 +207,7 @@ class AdoptPart:
     # --- orders ---
 
     async def adopt(self, _request: AdoptOrder) -> TakeOverReport:
+        self._core.store.database.require_room()  # without a record nothing is granted
         async with self._one:
             try:
                 report = await self._operation.adopt()
