@@ -196,16 +196,28 @@ class Rollout:
         After a `SpecificationsRefusedError`, nothing has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.live_resources())
+        await self._make(coming, _of(plan))
+        try:
+            take_effect()  # from here on, relays that give nothing up use the new specifications
+        except WithdrawnError:
+            self._forget()
+            raise
         self._began = set()
-        for _ in range(_TRIES):
-            await self._try(coming, plan)
-            shadowed, plan = plan, self.allocation.plan(coming.checked, self.relays.live_resources())
-            if plan == shadowed:
-                return self._settle(coming, plan)
-            for relay in plan.losing - shadowed.losing:
+        try:
+            for _ in range(_TRIES):
+                await self._try(coming, plan)
+                shadowed, plan = plan, self.allocation.plan(coming.checked, self.relays.live_resources())
+                if plan == shadowed:
+                    return self._settle(coming, plan)
+                for relay in plan.losing - shadowed.losing:
+                    self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+                await self._make(coming, _of(plan))
+            raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
+        except SpecificationsRefusedError:
+            self._forget()
+            for relay in range(self.allocation.relays):
                 self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
-        self._restate()
-        raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
+            raise
 
     def moved_files(self, coming: CheckedSpecifications) -> frozenset[str]:
         return self.allocation.plan(coming, self.relays.live_resources()).moved_files
@@ -221,12 +233,6 @@ class Rollout:
                 self._stop_waiting(relay)
 
     async def _try(self, coming: InForce, plan: AllocationPlan) -> None:
-        await self._make(coming, _of(plan))
-        try:
-            take_effect()  # from here on, relays that give nothing up use the new specifications
-        except WithdrawnError:
-            self._forget()
-            raise
         answers: dict[int, asyncio.Future[list[str]]] = {}
         self._coming = (coming, plan)
         for relay in range(self.allocation.relays):
@@ -241,7 +247,6 @@ class Rollout:
             for relay in answers:
                 self._stop_waiting(relay)
         if findings:
-            self._restate()
             raise SpecificationsRefusedError(findings)
 
     def _ask(
@@ -300,11 +305,6 @@ class Rollout:
             topics=names[:1000],
             monitors=monitors,
         )
-
-    def _restate(self) -> None:
-        self._forget()
-        for relay in range(self.allocation.relays):
-            self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     async def _make(self, revision: InForce, of_file: Callable[[str], int]) -> None:
         compiled = revision.checked.compiled

@@ -208,6 +208,20 @@ async def test_a_topic_published_during_a_load_moves_as_well(fleet: Fleet) -> No
     assert fleet.story[-1] == ("placed", "/b", 0)
 
 
+async def test_a_compiler_that_fails_during_a_load_leaves_no_relay_with_it(fleet: Fleet) -> None:
+    async def parts(_compiled: bytes, _wanted: object) -> list[bytes]:
+        raise SpecificationsRefusedError(["the compiler has failed"])
+
+    def answer(_relay: int, statement: messages.SpecificationsStated) -> messages.Message:
+        fleet.carried, fleet.rollout.parts = {(TOPIC, "/c")}, parts  # now c.rv belongs to the other relay
+        return taken(statement)
+
+    fleet.answer = answer
+    with pytest.raises(SpecificationsRefusedError, match="the compiler has failed"):
+        await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/c")))
+    assert {relay: message.revision for relay, message in fleet.stated} == {0: 1, 1: 1}
+
+
 async def test_an_answer_to_an_earlier_try_does_not_count(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
