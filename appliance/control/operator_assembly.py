@@ -61,7 +61,7 @@ def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> Quer
     base.ends.when_cut_short(clock.cut_short)
     switched_off = SwitchedOffWatch(
         lambda: parts.monitors.switches.switched_off(),  # noqa: PLW0108  of those in force then
-        parts.monitors.returns.until,
+        parts.monitors.until,
         lambda: base.policies.current,
         store=base.store,
         trail=trail,

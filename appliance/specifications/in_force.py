@@ -7,6 +7,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeVar
 
+import msgspec
+
+from appliance.base.actors import DISK
 from appliance.channel.messages import GivenValue
 from appliance.specifications.givens import DroppedValue, Given, Givens, parsed, require_topics
 from appliance.specifications.specification_files import (
@@ -22,11 +25,19 @@ _SIGNED_TOPICS = (
 )
 
 
+class Return(msgspec.Struct, frozen=True):
+    """After a time, the switch `of` gives way to `back`."""
+
+    back: Switch
+    of: Switch = False
+
+
 @dataclass(frozen=True)
 class InForce:
     """Specifications with everything that operators ordered about them.
 
-    `number` is that of the revision; `acts` counts all switches and resumptions so far.
+    `number` is that of the revision; `acts` counts all switches and resumptions so far. `returns` are of switches for a
+    time. Unless it is confirmed in time, the revision gives way to the revision `back_to`.
     """
 
     number: int = 0
@@ -35,6 +46,8 @@ class InForce:
     switches: Switches = field(default_factory=Switches)
     givens: Givens = field(default_factory=Givens)
     acts: int = 0
+    returns: Mapping[str, Return] = field(default_factory=dict)
+    back_to: int | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "switches", self.switches.of(self.checked))
@@ -47,16 +60,39 @@ class InForce:
     def states(self) -> Mapping[str, Switch]:
         return self.switches.states
 
+    @property
+    def promoted(self) -> list[str]:
+        """The monitors that return to shadow mode unless confirmed."""
+        return [name for name, one in self.returns.items() if one.of is True]
+
+
+class Consent(NamedTuple):
+    """The operator's consent to cut topics whose publishers have another type, and to hold topics with traffic."""
+
+    force: bool = False
+    hold: bool = False
+
+
+_NO_CONSENT = Consent()
+
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """The sources of an order, and its words about their monitors.
+class Order:
+    """The sources that an operator wants in force, with words about their monitors.
 
-    `shadow` and `enable` name files. `topics` and `constants` are given values. `switches` and `given` are for monitors
-    that are not in force yet.
+    `within` is the time in which it must be confirmed. `author` is the author of the revision, unless it is `who`.
+    `kept` are files that are not in the folder, `loaded` those that the operator named. `shadow` and `enable` name
+    files. `topics` and `constants` are given values. `switches` and `given` are for monitors that are not in force yet.
     """
 
     sources: Sources
+    who: str = DISK
+    note: str = ""
+    within: float | None = None
+    consent: Consent = _NO_CONSENT
+    author: str = ""
+    kept: Collection[str] = ()
+    loaded: Collection[str] = ()
     shadow: Collection[str] = ()
     enable: Collection[str] = ()
     topics: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -66,73 +102,85 @@ class Wanted:
 
 
 class Coming(NamedTuple):
-    """The next value, the monitors that the order itself switched, and the values that it gave."""
+    """The next value, the monitors that the order itself switched, and the values that it gave.
 
-    new: InForce
+    Monitors that are `drawn_in` are in shadow mode only because of others.
+    """
+
+    now: InForce
+    drawn_in: Collection[str]
+    dropped: Collection[DroppedValue]
     put: Mapping[str, Switch]
     given: Given
 
 
-class Cleared(NamedTuple):
-    """A value without words about what is not in it; `drawn_in` are in shadow mode only because of others."""
-
-    now: InForce
-    drawn_in: list[str]
-    dropped: list[DroppedValue]
-
-
-def loaded(now: InForce, wanted: Wanted, checked: CheckedSpecifications, *, signed: bool) -> Coming:
+def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed: bool) -> Coming:
     """Return the next revision. With `signed`, the site signs the texts."""
-    constants = constants_of(wanted, checked, signed=signed)
+    constants = constants_of(order, checked, signed=signed)
     present = {name: to for name, to in now.states.items() if name in checked.switches}
-    said = {**_absent(now, wanted.switches), **present, **now.switches.said}
+    said = {**_absent(now, order.switches), **present, **now.switches.said}
     new = InForce(
         now.number + 1,
-        wanted.sources.with_topics(wanted.sources.topics, checked.givens),
+        order.sources.with_topics(order.sources.topics, checked.givens),
         checked,
         now.switches.saying(said),
-        Givens({**_absent(now, wanted.given), **now.givens.said}).giving(constants),
+        Givens({**_absent(now, order.given), **now.givens.said}).giving(constants),
         now.acts,
+        now.returns,
+        None if order.within is None else now.number if now.back_to is None else now.back_to,
     )
     files = checked.monitors.items()
-    put: dict[str, Switch] = {name: SHADOW for name, file in files if file in wanted.shadow}
-    put |= {name: True for name, file in files if file in wanted.enable and new.states[name] is False}
+    put: dict[str, Switch] = {name: SHADOW for name, file in files if file in order.shadow}
+    put |= {name: True for name, file in files if file in order.enable and new.states[name] is False}
     new = replace(new, switches=new.switches.saying({**said, **put}))
     enabled = {name: True for name in checked.monitors if now.switches.enabled(name)}
     require_whole({**new.states, **enabled, **put}, checked)
-    return Coming(new, put, constants)
+    return cleared(new)._replace(put=put, given=constants)
 
 
-def switched(now: InForce, names: Collection[str], to: Switch) -> InForce:
+def switched(now: InForce, names: Collection[str], to: Switch, *, timed: bool = False) -> InForce:
+    """Return the value after a switch; one that is `timed` returns to the switch before all timed ones."""
     others = dict.fromkeys(names, to)
     require_whole({**now.states, **others}, now.checked)
-    return replace(now, switches=now.switches.saying({**now.switches.said, **others}), acts=now.acts + 1)
+    returns = {name: one for name, one in now.returns.items() if name not in others}
+    for name in others if timed else ():
+        back = now.returns[name].back if name in now.returns else now.states[name] or True
+        returns[name] = Return(back, to)
+    switches = now.switches.saying({**now.switches.said, **others})
+    return replace(now, switches=switches, acts=now.acts + 1, returns=returns)
+
+
+def confirmed(now: InForce) -> InForce:
+    returns = {name: one for name, one in now.returns.items() if one.of is not True}
+    return replace(now, returns=returns, back_to=None)
 
 
 def given(now: InForce, name: str, values: Mapping[str, GivenValue]) -> InForce:
     return replace(now, givens=now.givens.giving({name: values}), acts=now.acts + 1)
 
 
-def cleared(new: InForce) -> Cleared:
+def cleared(new: InForce) -> Coming:
     """Forget the words about monitors and values that these specifications do not have."""
     said = {name: to for name, to in new.switches.said.items() if name in new.checked.monitors}
     drawn_in = [name for name, to in new.states.items() if to == SHADOW and new.switches.own(name) != SHADOW]
     switches = new.switches.saying({**said, **dict.fromkeys(drawn_in, SHADOW)})
     dropped, givens = new.givens.dropped(new.checked), Givens(new.givens.in_force(new.checked))
-    return Cleared(replace(new, switches=switches, givens=givens), drawn_in, dropped)
+    returns = {name: one for name, one in new.returns.items() if new.states.get(name) == one.of}
+    now = replace(new, switches=switches, givens=givens, returns=returns)
+    return Coming(now, drawn_in, dropped, {}, {})
 
 
 def constants_of(
-    wanted: Wanted, checked: CheckedSpecifications, *, signed: bool
+    order: Order, checked: CheckedSpecifications, *, signed: bool
 ) -> dict[str, dict[str, GivenValue]]:
-    require_topics(wanted.topics, checked)
-    if wanted.topics and signed:
+    require_topics(order.topics, checked)
+    if order.topics and signed:
         raise SpecificationsRefusedError([_SIGNED_TOPICS])
-    unknown = [name for name in wanted.constants if name not in checked.monitors]
+    unknown = [name for name in order.constants if name not in checked.monitors]
     if unknown:
         raise SpecificationsRefusedError([unknown_monitors(unknown, checked)])
     return {
-        name: parsed(checked.givens.get(name, ()), name, values) for name, values in wanted.constants.items()
+        name: parsed(checked.givens.get(name, ()), name, values) for name, values in order.constants.items()
     }
 
 

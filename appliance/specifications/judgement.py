@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from appliance.specifications.in_force import InForce
+from appliance.specifications.in_force import Consent, InForce
 from appliance.specifications.live_topics import Published, TopicFindings, judge_holds, judge_topics
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
@@ -14,16 +14,6 @@ from appliance.specifications.specification_files import (
 )
 from appliance.specifications.specification_revisions import Check, CheckBeside
 from appliance.specifications.switches import SHADOW
-
-
-class Consent(NamedTuple):
-    """The operator's consent to cut topics whose publishers have another type, and to hold topics with traffic."""
-
-    force: bool = False
-    hold: bool = False
-
-
-NO_CONSENT = Consent()
 
 
 class Checks(NamedTuple):

@@ -136,10 +136,6 @@ class Revisions(ABC, Generic[R]):
             yield
 
     def _put_in_force(self, row: R, within: float | None = None) -> None:
-        self.store_revision(row, within)
-        self.in_force = row
-
-    def store_revision(self, row: R, within: float | None = None) -> None:
         """Store a revision, with the time limit to confirm it, in seconds, or without one."""
         back_to = next(iter(self.ends.names(self.unconfirmed)), str(self.revision))
         with self.store.database.together():  # control may die during the change
@@ -147,6 +143,7 @@ class Revisions(ABC, Generic[R]):
             if within is not None:
                 self.ends.set(self.unconfirmed, back_to, within)
             self._save(row)
+        self.in_force = row
 
     def end_limit(self) -> None:
         self._cancel_return()

@@ -596,7 +596,7 @@ end:
 }
 
 /* Monitors are loaded, replaced and removed, one change after the other.
-   = appliance/specifications/specifications_in_force.py SpecificationsInForce.change
+   = appliance/specifications/specification_manager.py SpecificationManager._changed
    = appliance/specifications/rollout.py Rollout._try */
 proctype Specifications() POSSIBLE {
 end:

@@ -45,7 +45,7 @@ from appliance.policy.policy import CurrentPolicy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.specifications.in_force import InForce
 from appliance.specifications.specification_manager import SpecificationManager
-from appliance.specifications.specifications_in_force import SpecificationsInForce
+from appliance.specifications.specification_revisions import NOTHING
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.ends import ends_of
@@ -65,8 +65,7 @@ def idle_core(state: Path) -> Core:
     policies.policy = CurrentPolicy()
     policies.policy.set(compile_policy(EMPTY, file="policy"))
     specifications = idle(SpecificationManager)
-    specifications.present = idle(SpecificationsInForce)
-    specifications.present.now = InForce()
+    specifications.now, specifications.in_force = InForce(), NOTHING
     trail.audit, relay.taps = idle(AuditLog), idle(TapRequests)
     relay.ranks = RankStates(lambda _order: False)
     return Core(

@@ -21,7 +21,7 @@ from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations, RosMaster, limits_of_answers
 from appliance.rpc.server import listen
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.specifications_in_force import ALLOCATION
+from appliance.specifications.specification_manager import ALLOCATION
 from roswire.standard import standard_definitions
 
 _REFUSALS = 2

@@ -72,7 +72,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         faults=row.faults,
         certificates=checked.certificates.get(name, []),
         shadow=monitors.switches.in_shadow(name),
-        off_until=monitors.returns.until(name),
+        off_until=monitors.until(name),
         would_drop=row.drops if row.shadow else 0,
         would_change=row.changes if row.shadow else 0,
         missed=row.missed,
@@ -80,7 +80,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         slice_limit=row.slice_limit,
         why_held=monitors.rollout.why_held.get(name, ""),
         given=monitors.givens.states(checked, name),
-        confirm_by=monitors.returns.confirm_by(name),
+        confirm_by=monitors.until(name, of=True),
         lasting=monitors.lasting(name),
     )
 

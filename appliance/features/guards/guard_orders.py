@@ -318,7 +318,7 @@ class GuardOrders:
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
         file, text = self._made(request)
         if self._monitors.sources.files.get(file) == text:
-            return self._monitors.present.replaced(self._monitors.revision, loaded=[file]).in_lines()
+            return self._monitors.replaced(self._monitors.revision, loaded=[file]).in_lines()
         order = admin.MonitorLoad(
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
             shadow=request.shadow, hold=request.hold,
@@ -347,7 +347,7 @@ class GuardOrders:
     async def upgrade(self, request: guard_requests.GuardUpgrade, who: str) -> Replacement:
         monitors, name = self._monitors, request.name
         if origin_of(self._guard(name)[1]) == "current":
-            return monitors.present.replaced(monitors.revision).in_lines()
+            return monitors.replaced(monitors.revision).in_lines()
         new = self._upgraded(name, request.topics)
         order = admin.MonitorLoad(
             {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
@@ -535,8 +535,8 @@ class GuardOrders:
             loads=loaded_values(text),
             stops=self._acts_of(name),
             why_held=monitors.rollout.why_held.get(name, ""),
-            confirm_by=monitors.returns.confirm_by(name),
-            off_until=monitors.returns.until(name),
+            confirm_by=monitors.until(name, of=True),
+            off_until=monitors.until(name),
             last_stop=self._last_stop(name),
             version=preset.version,
             origin=origin_of(text),

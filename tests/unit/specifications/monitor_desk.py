@@ -19,7 +19,7 @@ changed.
 import asyncio
 import shlex
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -64,11 +64,16 @@ TEXTS = {
 }  # fmt: skip
 
 
+@cache
+def _checked(sources: bytes, site_keys: tuple[str, ...], broken: tuple[str, ...]) -> CheckedSpecifications:
+    compiler = partial(contents_beside, broken=broken) if broken else contents
+    return check(msgspec.json.decode(sources, type=Sources), site_keys, compiler=compiler)
+
+
 async def here(
     sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
 ) -> CheckedSpecifications:
-    compiler = partial(contents_beside, broken=broken) if broken else contents
-    return await asyncio.to_thread(check, sources, site_keys, compiler=compiler)
+    return await asyncio.to_thread(_checked, msgspec.json.encode(sources), (*site_keys,), (*broken,))
 
 
 async def here_at_start(

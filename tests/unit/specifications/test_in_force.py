@@ -6,7 +6,16 @@ import pytest
 
 from appliance.channel.answers.monitor_answers import GivenState
 from appliance.specifications.givens import Givens
-from appliance.specifications.in_force import InForce, Wanted, cleared, given, loaded, switched
+from appliance.specifications.in_force import (
+    InForce,
+    Order,
+    Return,
+    cleared,
+    confirmed,
+    given,
+    loaded,
+    switched,
+)
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -34,7 +43,7 @@ def in_force(*names: str, enable: str = "all", **said: Any) -> InForce:
 
 NOW = in_force("a", "b", a=False)
 ORDERS: dict[str, Callable[[InForce], object]] = {
-    "load": lambda now: loaded(now, Wanted(sources("c"), shadow={"c.rv"}), checked("c"), signed=False),
+    "load": lambda now: loaded(now, Order(sources("c"), shadow={"c.rv"}), checked("c"), signed=False),
     "switch": lambda now: switched(now, ["b"], SHADOW),
     "set": lambda now: given(now, "a", {"speed": 0.5}),
     "clear": cleared,
@@ -49,36 +58,28 @@ def test_an_order_leaves_the_earlier_value_as_it_was(name: str) -> None:
 
 
 def test_a_load_keeps_all_switches_and_gives_its_files_theirs() -> None:
-    wanted = Wanted(sources("a", "b", "c"), shadow={"c.rv"}, constants={"b": {"speed": 0.5}})
-    new, put, values = loaded(NOW, wanted, checked("a", "b", "c"), signed=False)
+    order = Order(sources("a", "b", "c"), shadow={"c.rv"}, constants={"b": {"speed": 0.5}})
+    new, _drawn_in, _dropped, put, values = loaded(NOW, order, checked("a", "b", "c"), signed=False)
     assert (new.tag, new.states) == ("4.7", {"a": False, "b": True, "c": SHADOW})
     assert (put, values, new.givens.said) == ({"c": SHADOW}, {"b": {"speed": 0.5}}, {"b": {"speed": 0.5}})
 
 
 def test_the_last_words_of_a_revision_are_for_monitors_that_are_not_in_force() -> None:
-    wanted = Wanted(
+    order = Order(
         sources("a", "c"),
         switches={"a": SHADOW, "c": False},
         given={"a": {"speed": 0.1}, "c": {"speed": 0.2}},
     )
-    new, put, values = loaded(NOW, wanted, checked("a", "c"), signed=False)
+    new, _drawn_in, _dropped, put, values = loaded(NOW, order, checked("a", "c"), signed=False)
     assert new.states == {"a": False, "c": False}
     assert (put, values, new.givens.said) == ({}, {}, {"c": {"speed": 0.2}})
-
-
-@pytest.mark.parametrize(("enable", "state"), [("none", True), ("shadow", SHADOW)])
-def test_a_load_that_enables_ends_no_shadow_mode(enable: str, state: object) -> None:
-    now = in_force("a", enable=enable)
-    new, _put, _given = loaded(now, Wanted(sources("b"), enable={"b.rv"}), checked("b"), signed=False)
-    assert new.states == {"b": state}
 
 
 def test_a_monitor_in_force_is_not_drawn_into_shadow_mode() -> None:
     contents = checked("b", "c", sharing=(("b", "c"),))
     with pytest.raises(SpecificationsRefusedError, match="do not go together"):
-        loaded(NOW, Wanted(sources("b", "c"), shadow={"c.rv"}), contents, signed=False)
-    new, _put, _given = loaded(in_force(), Wanted(sources("b", "c"), shadow={"c.rv"}), contents, signed=False)
-    now, drawn_in, _dropped = cleared(new)
+        loaded(NOW, Order(sources("b", "c"), shadow={"c.rv"}), contents, signed=False)
+    now, drawn_in, *_ = loaded(in_force(), Order(sources("b", "c"), shadow={"c.rv"}), contents, signed=False)
     assert (now.states, now.switches.said, drawn_in) == (
         {"b": SHADOW, "c": SHADOW},
         {"c": SHADOW, "b": SHADOW},
@@ -93,17 +94,17 @@ def test_nothing_is_kept_about_what_is_not_in_force() -> None:
     new = InForce(
         4, sources("a"), checked("a"), Switches(said={"a": False, "b": False}), Givens({"b": {"speed": 0.1}})
     )
-    now, drawn_in, dropped = cleared(new)
+    now, drawn_in, dropped, *_ = cleared(new)
     assert (now.switches.said, now.givens.said, drawn_in, dropped) == ({"a": False}, {}, [], [])
 
 
 def test_a_site_that_signs_lets_no_load_replace_a_topic() -> None:
     topic = GivenState("t", "topic", "/x", "", "/x")
     contents = CheckedSpecifications(monitors={"a": "a.rv"}, givens={"a": (topic,)})
-    wanted = Wanted(sources("a"), topics={"a": {"t": "/y"}})
+    order = Order(sources("a"), topics={"a": {"t": "/y"}})
     with pytest.raises(SpecificationsRefusedError, match="the site signs"):
-        loaded(NOW, wanted, contents, signed=True)
-    assert loaded(NOW, wanted, contents, signed=False).new.number == 4
+        loaded(NOW, order, contents, signed=True)
+    assert loaded(NOW, order, contents, signed=False).now.number == 4
 
 
 def test_each_switch_and_value_has_a_tag_of_its_own() -> None:
@@ -113,3 +114,23 @@ def test_each_switch_and_value_has_a_tag_of_its_own() -> None:
         given(given(NOW, "a", {"speed": 0.1}), "a", {"speed": 1.0}).tag,
     ]
     assert tags == ["3.7", "3.8", "3.9"]
+
+
+def test_timed_switches_return_to_the_switch_before_all_of_them_until_another_order() -> None:
+    shadowed = switched(switched(NOW, ["b"], SHADOW), ["b"], True, timed=True)
+    assert (shadowed.promoted, shadowed.returns) == (["b"], {"b": Return(SHADOW, True)})
+    off = switched(shadowed, ["a", "b"], False, timed=True)
+    assert off.returns == {"a": Return(True), "b": Return(SHADOW)}
+    assert (switched(off, ["b"], False).returns, confirmed(off).returns) == ({"a": Return(True)}, off.returns)
+    assert confirmed(shadowed).returns == {}
+    coming = loaded(off, Order(sources("a")), checked("a"), signed=False)
+    assert coming.now.returns == {"a": Return(True)}
+
+
+def test_changes_without_a_confirmation_go_back_to_the_last_revision_before_them() -> None:
+    def following(now: InForce, within: float | None = None) -> InForce:
+        return loaded(now, Order(sources("a"), within=within), checked("a"), signed=False).now
+
+    waiting = following(following(NOW, 5.0), 5.0)
+    assert (waiting.number, waiting.back_to, switched(waiting, ["a"], True).back_to) == (5, 3, 3)
+    assert (following(waiting).back_to, confirmed(waiting).back_to) == (None, None)

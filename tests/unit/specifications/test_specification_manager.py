@@ -50,11 +50,11 @@ async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> N
         await monitors.shadow(admin.MonitorShadow(["a"], state is not True), "eve")
         tag = monitors.tag
         await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=seconds), "eve")
-        assert monitors.returns.until("a") is not None
+        assert monitors.until("a") is not None
         async with asyncio.timeout(30):
             while monitors.switches.states["a"] is False:
                 await asyncio.sleep(0.01)
-        assert (monitors.switches.states["a"], monitors.returns.until("a")) == (state, None)
+        assert (monitors.switches.states["a"], monitors.until("a")) == (state, None)
         assert monitors.tag != tag
     rows = [row for row in desk.trail.heard if row[0] in {"monitor disabled", "monitor enabled"}]
     assert [row[0] for row in rows] == [
@@ -72,38 +72,18 @@ async def test_a_load_that_enables_ends_no_shadow_mode(desk: Desk, setting: str,
     assert again.switches.states["b"] == state
 
 
-async def test_a_kill_between_two_writes_disables_no_monitor_forever(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monitors = await desk.monitors()
-    for writes in range(3):
-        await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
-        desk.kill()
-        with monkeypatch.context() as context:
-            context.setattr(desk.store.database, "keep", first(writes, desk.store.database.keep))
-            await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
-        monitors = await desk.monitors(restarted=True)
-        assert monitors.switches.enabled("a") or monitors.returns.until("a") is not None, writes
-        desk.kill()
-
-
-def first(count: int, write: Callable[[Any], None]) -> Callable[[Any], None]:
-    left = iter(range(count))
-    return lambda changes: write(changes) if next(left, None) is not None else None
-
-
 @pytest.mark.nightly
 async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -> None:
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     switched = await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=3600), "eve")
-    assert switched.until == pytest.approx(monitors.returns.until("b"), abs=1)
+    assert switched.until == pytest.approx(monitors.until("b"), abs=1)
     assert switched.until == pytest.approx(time.time() + 3600, abs=60)
     again = await desk.monitors()
-    assert again.returns.until("a") == pytest.approx(monitors.returns.until("a"), abs=5)
+    assert again.until("a") == pytest.approx(monitors.until("a"), abs=5)
     await again.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.05), "eve")  # shorter than before
     await again.remove(admin.MonitorRemove(["b"]), "eve")
-    assert again.returns.until("b") is None
+    assert again.until("b") is None
     desk.kill()
     later = await desk.monitors(restarted=True)
     async with asyncio.timeout(30):
@@ -112,7 +92,7 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
     await later.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
     endless = await later.switch(admin.MonitorSwitch(["a"], False), "eve")
     assert (endless.names, endless.until) == (["a"], None)
-    assert (later.switches.states["a"], later.returns.until("a")) == (False, None)
+    assert (later.switches.states["a"], later.until("a")) == (False, None)
 
 
 async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
@@ -150,27 +130,6 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
     gone = False
     await order(load)
     assert monitors.names() == ["a", "b"]
-
-
-async def test_a_refused_order_leaves_the_same_value_in_force(desk: Desk) -> None:
-    monitors = await desk.monitors()
-    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
-    await monitors.shadow(admin.MonitorShadow(["b"], True), "eve")
-    before, desk.findings = monitors.now, ["the relay says no"]
-    (desk.folder / "c.rv").write_text(C)
-    for order in (
-        monitors.load(admin.MonitorLoad({"c.rv": C}, shadow=True, confirm_within=60.0), "eve"),
-        monitors.reload(admin.MonitorReload(prune=True), "eve"),
-        monitors.remove(admin.MonitorRemove(["b"]), "eve"),
-        monitors.roll_back(admin.MonitorRollback(1), "eve"),
-        monitors.shadow(admin.MonitorShadow(["a"], True), "eve"),
-        monitors.shadow(admin.MonitorShadow(["b"], False, confirm_within=60.0), "eve"),
-        monitors.take_bundle(Sources({"c.rv": C}), "eve", "a bundle"),
-    ):
-        with pytest.raises(SpecificationsRefusedError, match="the relay says no"):
-            await order
-        assert monitors.now is before
-        assert (monitors.confirm_by, monitors.returns.unconfirmed()) == (None, [])
 
 
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
@@ -527,19 +486,19 @@ async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> No
         async with asyncio.timeout(30):
             while not now.switches.in_shadow("a"):
                 await asyncio.sleep(0.01)
-        assert now.returns.confirm_by("a") is None
+        assert now.until("a", of=True) is None
 
     with pytest.raises(SpecificationsRefusedError, match="in force already"):
         await monitors.shadow(promote(confirm_within=60), "eve")
     await monitors.shadow(admin.MonitorShadow(["a"], True), "eve")
     done = await monitors.shadow(promote(confirm_within=0.05), "eve")
-    assert done.confirm_by == monitors.returns.confirm_by("a") and monitors.returns.until("a") is None
+    assert done.confirm_by == monitors.until("a", of=True) and monitors.until("a") is None
     await shadowed(monitors)
     assert desk.trail.heard[-1][0] == "monitor in shadow mode"
     await monitors.shadow(promote(confirm_within=3600), "eve")
     desk.kill()
     again = await desk.monitors(restarted=True)
-    assert again.switches.enabled("a") and again.returns.confirm_by("a") is not None
+    assert again.switches.enabled("a") and again.until("a", of=True) is not None
     await again.shadow(promote(confirm_within=0.05), "eve")  # a shorter limit, and still back to shadow mode
     await shadowed(again)
     await again.shadow(promote(confirm_within=3600), "eve")
@@ -547,5 +506,5 @@ async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> No
     await shadowed(again)
     await again.shadow(promote(confirm_within=3600), "eve")
     assert (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed
-    assert again.switches.enabled("a") and again.returns.confirm_by("a") is None
+    assert again.switches.enabled("a") and again.until("a", of=True) is None
     assert not (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed

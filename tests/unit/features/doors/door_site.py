@@ -102,7 +102,7 @@ class DoorSite:
 
     def define(self, **definitions: str) -> None:
         """Bring specifications with these definitions into force."""
-        self.core.specifications.present.now = InForce(sources=Sources(definitions=definitions))
+        self.core.specifications.now = InForce(sources=Sources(definitions=definitions))
         self.processes.define()
 
     def load_policy(self, revision: int) -> None:
