@@ -213,7 +213,7 @@ class Rollout:
                     self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
                 await self._make(coming, _of(plan))
             raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
-        except SpecificationsRefusedError:
+        except BaseException:
             self._forget()
             for relay in range(self.allocation.relays):
                 self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)

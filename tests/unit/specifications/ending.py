@@ -1,4 +1,5 @@
 import contextlib
+from collections.abc import Sequence
 
 from appliance.channel.admin import MonitorSwitch
 from appliance.master.reconcile.reminders import RelayMoves
@@ -21,7 +22,7 @@ async def gun(*_order: object) -> CheckedSpecifications:
     return CheckedSpecifications(monitors={"gun": "gun.rv"}, topics=nothing, services=nothing)
 
 
-async def parts(_compiled: bytes, wanted: list[object]) -> list[bytes]:
+async def parts(_compiled: bytes, wanted: Sequence[object]) -> list[bytes]:
     return [b"" for _part in wanted]
 
 
