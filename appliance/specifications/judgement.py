@@ -1,7 +1,6 @@
 """Check the sources of an order, and judge the value that it would bring into force. Nothing is kept here."""
 
 from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple
 
 import msgspec
 
@@ -12,16 +11,8 @@ from appliance.specifications.specification_files import (
     Sources,
     SpecificationsRefusedError,
 )
-from appliance.specifications.specification_revisions import Check, CheckBeside
+from appliance.specifications.specification_revisions import CheckBeside
 from appliance.specifications.switches import SHADOW
-
-
-class Checks(NamedTuple):
-    """The checks of an order, of a start, and of a dry run."""
-
-    order: CheckBeside
-    at_start: Check
-    dry_run: CheckBeside
 
 
 class Judge:
@@ -32,46 +23,14 @@ class Judge:
 
     def __init__(
         self,
-        checks: Checks,
-        site_keys: Sequence[str],
         live: Callable[[], Published],
         *,
         held: Callable[[], Collection[str]],
         moved: Callable[[CheckedSpecifications], Collection[str]],
     ) -> None:
-        self.checks = checks
-        self._site_keys = site_keys
         self._live = live
         self._held = held
         self._moved = moved
-
-    async def strictly(self, sources: Sources) -> CheckedSpecifications:
-        return await self.checks.order(sources, self._site_keys, ())
-
-    async def as_at_start(self, sources: Sources, known: Sequence[str] | None) -> CheckedSpecifications:
-        return await self.checks.at_start(sources, self._site_keys, known)
-
-    async def beside_broken(
-        self, now: InForce, check: CheckBeside, sources: Sources, loaded: Collection[str] = ()
-    ) -> CheckedSpecifications:
-        """Let files that have done nothing since the start, because of an error, remain so unless they are `loaded`."""
-        present, following = now.sources.named(), sources.named()
-        errors = {
-            file: error
-            for file, error in broken(now).items()
-            if file not in loaded and following.get(file) == present.get(file)
-        }
-        try:
-            checked = await check(
-                sources, self._site_keys, [file for file in errors if file in sources.files]
-            )
-        except SpecificationsRefusedError as error:
-            raise SpecificationsRefusedError([*error.findings, *map(_idle, errors)]) from error
-        unusable = {file: error for file, error in errors.items() if file not in following}
-        left_out = unusable | checked.left_out
-        idle = left_out.keys() | {checked.monitors[name] for name in checked.unbuilt}
-        warnings = [_idle(file) for file in errors if file in idle]
-        return msgspec.structs.replace(checked, left_out=left_out, warnings=(*checked.warnings, *warnings))
 
     def judged(
         self,
@@ -106,6 +65,27 @@ class Judge:
             moved=self._moved(coming.checked),
             hold=hold,
         )
+
+
+async def beside_broken(
+    now: InForce, check: CheckBeside, site_keys: Sequence[str], sources: Sources, loaded: Collection[str] = ()
+) -> CheckedSpecifications:
+    """Let files that have done nothing since the start, because of an error, remain so unless they are `loaded`."""
+    present, following = now.sources.named(), sources.named()
+    errors = {
+        file: error
+        for file, error in broken(now).items()
+        if file not in loaded and following.get(file) == present.get(file)
+    }
+    try:
+        checked = await check(sources, site_keys, [file for file in errors if file in sources.files])
+    except SpecificationsRefusedError as error:
+        raise SpecificationsRefusedError([*error.findings, *map(_idle, errors)]) from error
+    unusable = {file: error for file, error in errors.items() if file not in following}
+    left_out = unusable | checked.left_out
+    idle = left_out.keys() | {checked.monitors[name] for name in checked.unbuilt}
+    warnings = [_idle(file) for file in errors if file in idle]
+    return msgspec.structs.replace(checked, left_out=left_out, warnings=(*checked.warnings, *warnings))
 
 
 def broken(now: InForce) -> dict[str, str]:

@@ -37,7 +37,7 @@ from appliance.specifications.allocation import Allocation
 from appliance.specifications.change_records import ChangeRecords, off_in
 from appliance.specifications.givens import Givens, parsed, split
 from appliance.specifications.in_force import Coming, Consent, InForce, Order, Return, unknown_monitors
-from appliance.specifications.judgement import Checks, Judge, broken, in_shadow
+from appliance.specifications.judgement import Judge, beside_broken, broken, in_shadow
 from appliance.specifications.live_topics import Published
 from appliance.specifications.monitor_values import MonitorValues
 from appliance.specifications.records import MonitorRecords
@@ -135,13 +135,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
         self.rollout = Rollout(allocation, trail, on_fault, relays, slices=slices, parts=parts)
-        self.judge = Judge(
-            Checks(check, check_at_start, try_out),
-            site_keys,
-            live,
-            held=lambda: self.rollout.held,
-            moved=self.rollout.moved_files,
-        )
+        self._check, self._check_at_start, self._try_out = check, check_at_start, try_out
+        self.judge = Judge(live, held=lambda: self.rollout.held, moved=self.rollout.moved_files)
         self._change_records = ChangeRecords(trail)
         self.records = MonitorRecords(
             trail,
@@ -176,7 +171,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         sources, checked, refused = await specifications_at_start(
             last,
             self._folder,
-            self.judge.checks.at_start,
+            self._check_at_start,
             self.site_keys,
             named=() if restarted else self.switches.named,
             kept=self.in_force if self.revision else None,
@@ -317,7 +312,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             asks = request.shadow or request.given or request.files.keys() & broken(self.now).keys()
             if self.in_force.who != DISK and order.sources == self.sources and not asks:
                 return self.replaced(self.revision, loaded=order.loaded)  # same texts: no new revision
-            return await self._change(order, self._beside(self.judge.checks.order, order.loaded))
+            return await self._change(order, self._beside(self._check, order.loaded))
 
     async def attempt(self, asked: admin.MonitorTry, who: str) -> Replaced:
         request = self._as_load(asked.order)
@@ -330,7 +325,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         before, order = self.now, self._loading(request, who)
         self._attempting.add(who)
         try:
-            check = self._beside(self.judge.checks.dry_run, order.loaded)
+            check = self._beside(self._try_out, order.loaded)
             coming, warnings = await self._judged(before, order, check)
         finally:
             self._attempting.discard(who)
@@ -351,7 +346,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )  # fmt: skip
 
     def _beside(self, check: CheckBeside, loaded: Collection[str] = ()) -> _Check:
-        return partial(self.judge.beside_broken, self.now, check, loaded=loaded)
+        return partial(beside_broken, self.now, check, self.site_keys, loaded=loaded)
+
+    async def _strictly(self, sources: Sources) -> CheckedSpecifications:
+        return await self._check(sources, self.site_keys, ())
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
         return await self.load(self._as_load(request), who)
@@ -396,7 +394,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 sources, who, reloaded_by(who), request.confirm_within, consent,
                 author=keeper, kept=kept, shadow=shadow,
             )  # fmt: skip
-            return await self._change(order, self.judge.strictly)
+            return await self._change(order, self._strictly)
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replaced:
         """Bring exactly these sources into force."""
@@ -404,15 +402,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
                 return self.replaced(self.revision)  # same texts: no new revision
-            return await self._change(
-                Order(sources, who, note, consent=Consent(hold=True)), self.judge.strictly
-            )
+            return await self._change(Order(sources, who, note, consent=Consent(hold=True)), self._strictly)
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
         sources = sources.with_topics(self.sources.topics)
         if sources == self.sources:
             return []
-        coming = replace(self.now, sources=sources, checked=await self.judge.strictly(sources))
+        coming = replace(self.now, sources=sources, checked=await self._strictly(sources))
         return self.judge.held(self.now, coming, in_shadow(coming), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
@@ -437,7 +433,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if within is None and self._is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
             order = Order(sources, who, note, within, author=keeper)
-            return await self._change(order, self._beside(self.judge.checks.order))
+            return await self._change(order, self._beside(self._check))
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
         """Bring a revision into force again: None is the previous revision, 0 no specifications.
@@ -447,8 +443,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self.changing(request.expected):
             row = NOTHING if request.revision == 0 else await self.wanted(request.revision)
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
-            as_before = partial(self.judge.as_at_start, known=last.warnings)
-            check = as_before if who == UNCONFIRMED else self.judge.strictly
+            check: _Check = (
+                (lambda sources: self._check_at_start(sources, self.site_keys, last.warnings))
+                if who == UNCONFIRMED
+                else self._strictly
+            )
             order = Order(sources_of(row), who, note, consent=_ALL, switches=last.switches, given=last.given)
             return await self._change(order, check)
 

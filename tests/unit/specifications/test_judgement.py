@@ -3,8 +3,8 @@ from collections.abc import Sequence
 import pytest
 
 from appliance.specifications.checking import check
-from appliance.specifications.in_force import InForce, switched
-from appliance.specifications.judgement import Checks, Consent, Judge, broken, in_shadow
+from appliance.specifications.in_force import Consent, InForce, switched
+from appliance.specifications.judgement import Judge, beside_broken, broken, in_shadow
 from appliance.specifications.live_topics import LiveType
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
@@ -31,33 +31,24 @@ async def refuse_bad(
     return CheckedSpecifications(monitors={"Good": "good.rv"}, left_out=dict.fromkeys(left_out, "an error"))
 
 
-async def as_at_start(
-    sources: Sources, keys: Sequence[str], _known: Sequence[str] | None
-) -> CheckedSpecifications:
-    return await refuse_bad(sources, keys)
-
-
 def judge_of(**live: LiveType) -> Judge:
     published = {f"/{topic}": {"/node": kind} for topic, kind in live.items()}
-    checks = Checks(refuse_bad, as_at_start, refuse_bad)
-    return Judge(checks, (), lambda: published, held=set[str], moved=lambda _coming: set[str]())
+    return Judge(lambda: published, held=set[str], moved=lambda _coming: set[str]())
 
 
 async def test_a_file_that_does_nothing_stays_idle_until_it_is_loaded() -> None:
-    judge = judge_of()
-    checked = await judge.beside_broken(NOW, judge.checks.order, SOURCES)
+    checked = await beside_broken(NOW, refuse_bad, (), SOURCES)
     assert checked.left_out == broken(NOW) == {"bad.rv": "an error"}
     assert [warning for warning in checked.warnings if "bad.rv:1:1: warning: it does nothing" in warning]
     with pytest.raises(SpecificationsRefusedError) as refused:
-        await judge.beside_broken(NOW, judge.checks.order, SOURCES, loaded={"bad.rv"})
+        await beside_broken(NOW, refuse_bad, (), SOURCES, loaded={"bad.rv"})
     assert refused.value.findings == ["bad.rv:1:1: error: it is bad"]
 
 
 async def test_a_changed_or_removed_file_is_no_longer_idle() -> None:
-    judge = judge_of()
     with pytest.raises(SpecificationsRefusedError):
-        await judge.beside_broken(NOW, judge.checks.order, SOURCES.with_files(Sources({"bad.rv": "worse"})))
-    checked = await judge.beside_broken(NOW, judge.checks.order, SOURCES.without({"bad.rv"}))
+        await beside_broken(NOW, refuse_bad, (), SOURCES.with_files(Sources({"bad.rv": "worse"})))
+    checked = await beside_broken(NOW, refuse_bad, (), SOURCES.without({"bad.rv"}))
     assert (checked.left_out, checked.warnings) == ({}, ())
 
 
