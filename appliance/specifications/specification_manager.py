@@ -2,7 +2,7 @@
 
 1. The appliance never writes to the folder of specifications. Changes are revisions in the store; revisions and
    switches survive a restart.
-2. What is in force is one immutable value. An order makes the next one (`in_force.py`), which is checked and judged
+2. The value in force is immutable. An order makes the next one (`in_force.py`), which is checked and judged
    (`judgement.py`), rolled out and stored. Then it takes the place of the present one.
 3. An error before that changes nothing: relays that have the next value get the present one again, and the store gets
    its rows and limits again. A value that was queued just before the store closes may remain stored.

@@ -1,6 +1,6 @@
 """An order that fails at any step leaves what was in force as it was: in memory, on relays, on the disk.
 
-A kill of control before the order is stored does so as well; one after that leaves the next value, as if it was told.
+So does a kill of control before the order is stored; a later one leaves the next value in force.
 """
 
 import asyncio
