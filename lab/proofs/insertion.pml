@@ -211,7 +211,7 @@ inline settle() {
     answered = in_force
 }
 
-/* = appliance/specifications/rollout.py Rollout._restate */
+/* = appliance/specifications/rollout.py Rollout.take */
 inline take_back_trial() {
     trying = 0;
     waiting = false;
