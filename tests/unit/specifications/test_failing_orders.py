@@ -20,6 +20,7 @@ from appliance.specifications.specification_files import Sources, Specifications
 from appliance.specifications.specification_manager import TIMED, SpecificationManager
 from appliance.store import writer_thread
 from appliance.store.changes import Change
+from appliance.store.ends import EndKind
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.engines import InlineDatabase
@@ -237,7 +238,8 @@ async def test_disabled_periods_end_even_on_a_full_disk(desk: Desk) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_an_order_during_the_end_of_a_disabled_period_stands(desk: Desk) -> None:
+@pytest.mark.parametrize("end", ["of a disabled period", "of the time to confirm"])
+async def test_an_order_that_is_carried_out_before_an_end_that_is_due_stands(desk: Desk, end: str) -> None:
     begun, goes_on = asyncio.Event(), asyncio.Event()
 
     async def slow(*order: Any) -> Any:
@@ -246,21 +248,28 @@ async def test_an_order_during_the_end_of_a_disabled_period_stands(desk: Desk) -
         return await here(*order)
 
     monitors = await desk.monitors()
+    if end == "of a disabled period":
+        await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.1), "eve")
+    else:
+        await monitors.load(admin.MonitorLoad({"b.rv": B}, confirm_within=0.1), "eve")
     desk.check = slow
-    await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.1), "eve")
-    load = asyncio.ensure_future(monitors.load(admin.MonitorLoad({"b.rv": B}), "eve"))
+    load = asyncio.ensure_future(monitors.load(admin.MonitorLoad({"c.rv": C}), "eve"))
     await begun.wait()
     for_good = asyncio.ensure_future(monitors.switch(admin.MonitorSwitch(["a"], False), "eve"))
     await asyncio.sleep(0)
     async with asyncio.timeout(30):
-        while not monitors.ends.passed(TIMED, "a"):
+        while not all(monitors.ends.passed(kind, name) for kind, name in due(monitors)):
             await asyncio.sleep(0.01)
     monitors.ends.look()
     await asyncio.sleep(0)
     goes_on.set()
     await asyncio.gather(load, for_good)
-    async with monitors.changing(None):  # after the return
-        assert (monitors.now.states["a"], monitors.now.returns) == (False, {})
+    async with monitors.changing(None):  # after what was due
+        assert (monitors.now.states["a"], monitors.now.returns, "c" in monitors.names()) == (False, {}, True)
+
+
+def due(monitors: SpecificationManager) -> list[tuple[EndKind, str]]:
+    return [(kind, name) for kind in (TIMED, monitors.unconfirmed) for name in monitors.ends.names(kind)]
 
 
 async def test_an_unconfirmed_change_ends_even_on_a_full_disk(desk: Desk) -> None:
