@@ -475,7 +475,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 text = f"{', '.join(shadowed)} is in shadow mode: rosrv monitor enforce brings it into force"
                 raise SpecificationsRefusedError([text])
             names = await self._switch(request.names, request.enabled, who, seconds)
-            return self._switched(names, until=self.until(names[0]) if names else None)
+            until = self.until(names[0]) if names else None
+            return Switched(names, self.revision, self.tag, until=until)
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
         """Return the monitors that changed. With `confirm_within`, they return to shadow mode unless confirmed."""
@@ -484,9 +485,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             names = await self._switch(
                 request.names, SHADOW if request.shadow else True, who, request.confirm_within
             )
-            return self._switched(
-                names, self.rollout.began(names), confirm_by=self.until(request.names[0], of=True)
-            )
+            began, confirm_by = self.rollout.began(names), self.until(request.names[0], of=True)
+            return Switched(names, self.revision, self.tag, began, confirm_by=confirm_by)
 
     def judge_shadow(self, request: admin.MonitorShadow) -> list[str]:
         self._all_known(request.names)
@@ -537,15 +537,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 await self.store.settled()
             except StoreError as error:
                 _log.error("switches that ended are not saved", monitors=[*due], reason=str(error))
-
-    def _switched(
-        self,
-        names: list[str],
-        began: Sequence[str] = (),
-        until: float | None = None,
-        confirm_by: float | None = None,
-    ) -> Switched:
-        return Switched(names, self.revision, self.tag, [*began], until, confirm_by)
 
     async def _switch(
         self,
@@ -602,7 +593,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 text = f"{', '.join(away)} not resumed: the relay process is not running; resume when it runs again"
                 raise SpecificationsRefusedError([text])
             await self.rollout.carried_out()
-            return self._switched(held)
+            return Switched(held, self.revision, self.tag)
 
     async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
         async with self.changing(request.expected):

@@ -84,6 +84,18 @@ async def here_at_start(
     return checked if known is None else msgspec.structs.replace(checked, warnings=tuple(known))
 
 
+class SlowCompiler:
+    """A compiler that says when it has `begun`, and waits until it `goes_on`."""
+
+    def __init__(self) -> None:
+        self.begun, self.goes_on = asyncio.Event(), asyncio.Event()
+
+    async def __call__(self, *order: Any) -> CheckedSpecifications:
+        self.begun.set()
+        await self.goes_on.wait()
+        return await here(*order)
+
+
 class Desk:
     def __init__(self, home: Path) -> None:
         self.home, self.folder = home, home / "monitors"

@@ -24,7 +24,7 @@ from appliance.store.ends import EndKind
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.engines import InlineDatabase
-from tests.unit.specifications.monitor_desk import B, C, Desk, here
+from tests.unit.specifications.monitor_desk import B, C, Desk, SlowCompiler
 
 pytestmark = pytest.mark.anyio
 
@@ -240,21 +240,14 @@ async def test_disabled_periods_end_even_on_a_full_disk(desk: Desk) -> None:
 
 @pytest.mark.parametrize("end", ["of a disabled period", "of the time to confirm"])
 async def test_an_order_that_is_carried_out_before_an_end_that_is_due_stands(desk: Desk, end: str) -> None:
-    begun, goes_on = asyncio.Event(), asyncio.Event()
-
-    async def slow(*order: Any) -> Any:
-        begun.set()
-        await goes_on.wait()
-        return await here(*order)
-
     monitors = await desk.monitors()
     if end == "of a disabled period":
         await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.1), "eve")
     else:
         await monitors.load(admin.MonitorLoad({"b.rv": B}, confirm_within=0.1), "eve")
-    desk.check = slow
+    desk.check = slow = SlowCompiler()
     load = asyncio.ensure_future(monitors.load(admin.MonitorLoad({"c.rv": C}), "eve"))
-    await begun.wait()
+    await slow.begun.wait()
     for_good = asyncio.ensure_future(monitors.switch(admin.MonitorSwitch(["a"], False), "eve"))
     await asyncio.sleep(0)
     async with asyncio.timeout(30):
@@ -262,7 +255,7 @@ async def test_an_order_that_is_carried_out_before_an_end_that_is_due_stands(des
             await asyncio.sleep(0.01)
     monitors.ends.look()
     await asyncio.sleep(0)
-    goes_on.set()
+    slow.goes_on.set()
     await asyncio.gather(load, for_good)
     async with monitors.changing(None):  # after what was due
         assert (monitors.now.states["a"], monitors.now.returns, "c" in monitors.names()) == (False, {}, True)

@@ -21,7 +21,7 @@ from appliance.specifications.specification_manager import (
 )
 from appliance.specifications.specification_revisions import text_of
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
-from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, here
+from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, SlowCompiler
 from tests.unit.transcripts import played, transcripts
 
 pytestmark = pytest.mark.anyio
@@ -96,17 +96,9 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
 
 
 async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
-    begun, goes_on, gone = asyncio.Event(), asyncio.Event(), False
-
-    async def slow(
-        sources: Sources, site_keys: Sequence[str], broken: Sequence[str]
-    ) -> CheckedSpecifications:
-        begun.set()
-        await goes_on.wait()
-        return await here(sources, site_keys, broken)
-
+    gone = False
     monitors = await desk.monitors()
-    desk.check = slow
+    desk.check = slow = SlowCompiler()
 
     async def order(*changes: Callable[[], Any]) -> None:
         with awaited(lambda: gone):
@@ -115,13 +107,13 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
 
     load = partial(monitors.load, admin.MonitorLoad({"b.rv": B}, shadow=True, confirm_within=60.0), "eve")
     first = asyncio.ensure_future(order(load))
-    await begun.wait()
+    await slow.begun.wait()
     switch = partial(monitors.switch, admin.MonitorSwitch(["a"], False), "eve")
     second = asyncio.ensure_future(order(switch))
     await asyncio.sleep(0)
     desk.sent.clear()
     tag, gone = monitors.tag, True
-    goes_on.set()
+    slow.goes_on.set()
     for withdrawn in (first, second):
         with pytest.raises(WithdrawnError):
             await withdrawn
@@ -133,24 +125,15 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
 
 
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
-    begun, goes_on = asyncio.Event(), asyncio.Event()
-
-    async def slow(
-        sources: Sources, site_keys: Sequence[str], broken: Sequence[str]
-    ) -> CheckedSpecifications:
-        begun.set()
-        await goes_on.wait()
-        return await here(sources, site_keys, broken)
-
-    desk.try_out = slow
+    desk.try_out = slow = SlowCompiler()
     monitors = await desk.monitors()
     shadowed = admin.MonitorTry(admin.MonitorLoad({"b.rv": B}))
     first = asyncio.ensure_future(monitors.attempt(shadowed, "eve"))
-    await begun.wait()
+    await slow.begun.wait()
     with pytest.raises(DryRunUnderWayError, match="your previous dry run is still running"):
         await monitors.attempt(shadowed, "eve")
     other = asyncio.ensure_future(monitors.attempt(shadowed, "adam"))
-    goes_on.set()
+    slow.goes_on.set()
     assert [(await one).added for one in (first, other)] == [["b.rv"]] * 2
     again = await monitors.attempt(admin.MonitorTry(admin.MonitorReplace("a", B)), "eve")
     assert (again.loaded, again.changed, again.monitors, monitors.names()) == (False, ["a.rv"], ["b"], ["a"])
