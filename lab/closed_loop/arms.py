@@ -5,7 +5,8 @@ Beside the assumptions of `world.py`:
 - The clocks of senders, guard and controller agree; where time is simulated, it runs at 0.3 to 1 of the real one.
 - A trajectory reaches the controller within 10 ms, and a report the guard within 20 ms; the controller runs every 10 ms
   or oftener, and the arm follows it exactly.
-- Trajectories come only through the guard. A goal may also be cancelled beside it, which stops the arm.
+- Trajectories come only through the guard. A goal may also be cancelled beside it, which stops the arm. Bytes that are
+  no report let the guard begin again, and with it a stop.
 - A joint may gain at most one `jump` on 1.1 `vMax`, over any time. A stop takes the controller's
   `stop_trajectory_duration`, and adds its way: five eighths of the velocity times the duration.
 """
@@ -105,10 +106,12 @@ class JointsWorld(World):
         """Where the joints were, as the nodes have reported."""
         self.extra = [0.0] * len(JOINTS)
         """How far each joint has come beyond 1.1 `vMax`, as far as it has not yet waited for it."""
-        self.rest: list[float] | None = [0.0] * len(JOINTS)
-        """How far each joint may still move since a stop."""
+        self.rest = [0.0] * len(JOINTS)
+        """How far each joint may still move since a stop, until its trajectory begins."""
+        self.begins = [math.inf] * len(JOINTS)
+        """When the trajectory of each joint begins: with an update of the controller, or later."""
         self.unknown = False
-        """Whether the last stop was beside the guard, which does not know of it: then its own begins again."""
+        """Whether this or the last stop is beside the guard, which does not know of it: then its own begins again."""
         self.ends = 0.0
         """When the last trajectory that was sent ends."""
         self.kept: list[Sent] = []
@@ -217,6 +220,7 @@ class JointsWorld(World):
                 names = ()
             case "cut":
                 self.heard[node] = NEVER
+                self.unknown = True  # the guard begins again, and with it a stop, as its page says
                 self.say("state", states(self.now, names, places)[:20], node, whole=False)
                 return
             case "":
@@ -280,7 +284,8 @@ class JointsWorld(World):
             self.report.honest["passed"] += passes
         self._judge(sent, passes=passes)
         if passed is not None:
-            driven = passes and (not sent.bad or self.switched_off)
+            # An arm cannot follow what is not a number, and the controller would never leave it.
+            driven = passes and (not sent.bad or (self.switched_off and sent.bad not in {"NaN", "infinite"}))
             self.receive(self.now, topic, passed, sent if driven else None)
             if passes and sent.points:
                 begin = self.time if sent.stamp is None else max(self.time, sent.stamp)
@@ -290,6 +295,7 @@ class JointsWorld(World):
     def cancel(self) -> None:
         """Stop the arm beside the guard, as a cancelled goal does."""
         self.trace("the goal is cancelled")
+        self.unknown = True
         self._stop()
         self.unknown = True
         self.ends = self.time
@@ -353,23 +359,24 @@ class JointsWorld(World):
     def _take(self, sent: Sent | None) -> None:
         if sent is None or not sent.points:
             self._stop()
-        elif self.controller.take(self.time, sent.names, sent.stamp, sent.points):
-            self.rest = None
-        else:
+            return
+        update = self.controller.updated(self.time) + self.controller.period
+        if not self.controller.take(self.time, sent.names, sent.stamp, sent.points):
             self.trace("the controller rejects it")
+            return
+        for joint in map(JOINTS.index, sent.names):
+            self.begins[joint] = min(self.begins[joint], max(update, sent.stamp or 0))
 
     def _stop(self) -> None:
-        if self.rest is None or self.unknown:
-            self.unknown = False
-            most = 0.625 * self.stopping
-            # It begins at the last update of the controller, or the state before.
-            times = self.time, self.controller.updated(self.time)
-            velocities = (
-                max(abs(self.controller.state(joint, time)[1]) for time in times)
-                for joint in range(len(JOINTS))
-            )
-            ways = [most * one + 2 * one * self.controller.period + _NEAR for one in velocities]
-            self.rest = [max(pair) for pair in zip(ways, self.rest or ways, strict=True)]
+        # It begins at the last update of the controller, or the state before.
+        times = self.time, self.controller.updated(self.time)
+        for joint, begin in enumerate(self.begins):
+            if self.unknown or begin <= self.time:
+                fastest = max(abs(self.controller.state(joint, time)[1]) for time in times)
+                way = fastest * (0.625 * self.stopping + 2 * self.controller.period) + _NEAR
+                self.rest[joint] = way if begin <= self.time else max(way, self.rest[joint])
+        self.begins = [math.inf] * len(JOINTS)
+        self.unknown = False
         self.controller.stop(self.time)
 
     @property
@@ -392,10 +399,10 @@ class JointsWorld(World):
                 continue
             at = begin
             for time in sorted(times.union(*(one.looks(begin, end) for one in way))):
-                self._watch_joint(joint, self.controller.state(joint, time)[0], time - at)
+                self._watch_joint(joint, self.controller.state(joint, time)[0], time, time - at)
                 at = time
 
-    def _watch_joint(self, joint: int, place: float, passed: float) -> None:
+    def _watch_joint(self, joint: int, place: float, time: float, passed: float) -> None:
         before, self.place[joint] = self.place[joint], place
         if self.unjudged:
             self.extra[joint] = 0.0
@@ -405,7 +412,7 @@ class JointsWorld(World):
         if not self.extra[joint] <= self.jump + _NEAR:
             gained = f"{JOINTS[joint]} has gained {self.extra[joint]:.3f} rad on 1.1 vMax"
             self.broken("L3", f"{gained}, and a jump is {self.jump}")
-        if self.rest is not None:
+        if time <= self.begins[joint]:
             self.rest[joint] -= moved
             if not self.rest[joint] >= -_NEAR:
                 self.broken("L3", f"{JOINTS[joint]} moves on after a stop by more than the way of a stop")

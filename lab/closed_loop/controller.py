@@ -154,7 +154,7 @@ class Controller:
         for place, name in enumerate(names):
             joint = self.joints.index(name)
             old = self.ways[joint]
-            kept = old[self._active(old, now) : self._active(old, start) + 1]
+            kept = old[self._active(old, now - self.period) : self._active(old, start) + 1]
             bridge = segment(start, self.state(joint, start), first, left[0].of(place))
             rest = [
                 segment(begin + one.at, one.of(place), begin + other.at, other.of(place))
