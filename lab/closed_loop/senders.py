@@ -139,7 +139,7 @@ def partial(w: "JointsWorld") -> Sends:
 
 
 def queued(w: "JointsWorld") -> Sends:
-    """Goals that begin when the one before has ended, sent while it moves."""
+    """Goals that begin once the one before is known to have ended, sent while it moves."""
     r = w.random
     while True:
         if w.still:
@@ -148,7 +148,10 @@ def queued(w: "JointsWorld") -> Sends:
             w.send(Sent(first, begin), honest=True)
             yield r.uniform(0.02, 0.3)
             then = w.route(0.5, 0.1, has=r.choice((0, 1, 2)), start=first[-1].positions)
-            w.send(Sent(then, begin + first[-1].at + r.choice((0.0, 0.05, 0.5))), honest=True)
+            w.send(
+                Sent(then, begin + first[-1].at + max(r.choice((0.21, 0.25, 0.5)), w.jump / w.fastest)),
+                honest=True,
+            )
         yield r.uniform(0.05, 0.3)
 
 
@@ -314,20 +317,23 @@ def unstopped(w: "JointsWorld") -> Sends:
             w.send(Sent(w.route(0.9, 0.1, has=r.choice((0, 1, 2)))))
             yield r.uniform(0.2, 0.8)
         for _wrong in range(r.randrange(2, 40)):
+            if r.random() < 0.2:  # the controller rejects it, or the other joints go on to stop
+                w.send(part(w.route(0.9, 0.1, has=0), (0,)))
             w.send(Sent([Point(0.5, (2 * w.most, 0.0, 0.0))], bad="far"))
             yield 0.02
         yield r.uniform(0.1, 0.5)
 
 
 def cancelled(w: "JointsWorld") -> float:
-    """A goal that begins where a cancelled one would have ended."""
-    ends = w.ends
+    """A goal that begins where a cancelled one would have ended, at that time or later."""
+    r = w.random
     start = [way[-1].state(math.inf)[0] for way in w.controller.ways]
-    if ends <= w.time:
+    if w.ends <= w.time:
         return 0.1
+    begin = w.ends + r.choice((0.0, 0.21, 0.4))
     w.cancel()
-    w.send(Sent(w.route(0.5, 0.1, has=w.random.choice((0, 1, 2)), start=start), ends))
-    return ends - w.time + 0.5
+    w.send(Sent(w.route(0.5, 0.1, has=r.choice((0, 1, 2)), start=start), begin))
+    return begin - w.time + 0.5
 
 
 def made(w: "JointsWorld", bad: str) -> Sent:
@@ -338,6 +344,8 @@ def made(w: "JointsWorld", bad: str) -> Sent:
 def wrong(w: "JointsWorld", bad: str = "") -> None:
     bad = bad or w.random.choice([*DAMAGE])
     w.send(Sent((), bad=bad) if bad == "empty" else made(w, bad))
+    if w.random.random() < 0.3:  # a goal that is wrong stops nothing
+        preempt(w)
 
 
 def damage(w: "JointsWorld") -> Sends:
@@ -380,9 +388,9 @@ def _first(points: list[Point], **change: object) -> Damaged:
     return JOINTS, [replace(points[0], **change), *points[1:]]  # type: ignore[arg-type]  # fields of a point
 
 
-def _far(world: "JointsWorld", points: list[Point]) -> Damaged:
+def _far(world: "JointsWorld", points: list[Point], side: int = 1) -> Damaged:
     """Return a way to a point beyond the limits, slow enough."""
-    last, out = points[-1], tuple(1.01 * world.most for _ in JOINTS[1:])
+    last, out = points[-1], tuple(side * 1.01 * world.most for _ in JOINTS[1:])
     at = last.at + 4 * world.most / world.fastest
     return JOINTS, [*points, Point(at, (last.positions[0], *out))]
 
@@ -399,6 +407,14 @@ def _fast(world: "JointsWorld", points: list[Point]) -> Damaged:
         *points,
         Point(last.at + 0.01, tuple(0.5 * one - 0.4 * world.most for one in last.positions)),
     ]
+
+
+def _quick(world: "JointsWorld", _points: list[Point]) -> Damaged:
+    """Return a point that a joint at rest reaches with a constant acceleration, and passes too fast."""
+    t = min(0.4, world.most / world.fastest)
+    ways = [math.copysign(1.01 * world.fastest, -one or 1) for one in world.place]
+    places = tuple(one + way * t / 2 for one, way in zip(world.place, ways, strict=True))
+    return JOINTS, [Point(t, places, tuple(ways))]
 
 
 def _bending(world: "JointsWorld", points: list[Point]) -> Damaged:
@@ -423,10 +439,11 @@ def _bending(world: "JointsWorld", points: list[Point]) -> Damaged:
 
 DAMAGE: Mapping[str, Callable[["JointsWorld", list[Point]], Damaged]] = {
     "far": _far,
+    "low": lambda world, points: _far(world, points, -1),
     "jump": _jumping,
     "fast": _fast,
     "curve": _bending,
-    "velocity": lambda world, points: _first(points, velocities=(1.01 * world.fastest, 0.0, 0.0)),
+    "velocity": _quick,
     "acceleration": lambda world, points: _first(points, accelerations=(0.0, -1.01 * world.growth, 0.0)),
     "NaN": lambda _world, points: (
         JOINTS,
@@ -435,11 +452,15 @@ DAMAGE: Mapping[str, Callable[["JointsWorld", list[Point]], Damaged]] = {
     "infinite": lambda _world, points: _first(points, positions=(math.inf, 0.0, 0.0)),
     "names": lambda _world, points: (JOINTS[:2], points),
     "unknown": lambda _world, points: ((*JOINTS[:2], "gripper"), points),
-    "twice": lambda _world, points: ((*JOINTS[:2], JOINTS[0]), points),
+    "twice": lambda _world, points: (
+        (*JOINTS[:2], JOINTS[0]),
+        [Point(one.at, (*one.positions[:2], one.positions[0])) for one in points],
+    ),
     "backwards": lambda _world, points: (JOINTS, [*points, points[-1]]),
     "minus": lambda _world, points: _first(points, at=-0.5),
     "short": lambda _world, points: _first(points, positions=points[0].positions[:2]),
     "long velocities": lambda _world, points: _first(points, velocities=(0.0,) * 4),
+    "long accelerations": lambda _world, points: _first(points, accelerations=(0.0,) * 4),
     "no names": lambda _world, points: ((), points),
 }
 """Wrong trajectories, made of a good one."""

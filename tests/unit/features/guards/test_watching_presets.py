@@ -448,6 +448,9 @@ def test_a_trajectory_needs_the_present_position_of_each_joint() -> None:
     assert passes(guard, 8)
     guard.tell("state", state(0, names=["gripper"]), 9, "/c")
     assert not passes(guard, 10)
+    guard = Guarded("joints", jump=9)
+    guard.tell("state", state(0.1, 0), 1)
+    assert passes(guard, 500) and not passes(guard, 502)  # however far it may jump
 
 
 RUN = (1.0, [0.6, 0.0], [0.9, 0.0])
@@ -467,8 +470,9 @@ def small_arm(stop_duration: float = 0) -> Guarded:
         ((), 0.0, 5.0, [(1, [0.5, 0])], ""),  # nothing is in force
         ((), 0.0, 5.0, [(1, [1.2, 0])], "has elbow at 1.200 rad"),
         ([RUN], 0.5, 0.3, [(1, [0.5, 0])], "begins in 0.300 s (limit 0.100 s), while elbow moves for 0.5"),
-        ([RUN], 0.5, 0.6, [(1, [0.5, 0])], ""),
-        ([RUN], 0.5, 0.6, [(0.1, [0.4, 0])], "from 0.600 rad to point 1 of /a at 0.400 rad in 0.7"),
+        ([RUN], 0.5, 0.69, [(1, [0.5, 0])], "while elbow moves for 0.500 s, and 0.200 s have to be between them"),
+        ([RUN], 0.5, 0.71, [(1, [0.5, 0])], ""),
+        ([RUN], 0.5, 0.71, [(0.1, [0.4, 0])], "from 0.600 rad to point 1 of /a at 0.400 rad in 0.8"),
         ([RUN], 0.5, 0.09, [(0.5, [0.6, 0])], ""),
         # The bridge of a moving joint overshoots the limit; one that stands reaches the same point.
         ([RUN], 0.98, 0.0, [(1, [0.6, 0], [0, 0])], "of elbow from 0.588 rad to point 1 of /a at 0.600 rad"),
@@ -513,6 +517,45 @@ def test_a_joint_moves_until_its_controller_has_stopped() -> None:
     ):  # fmt: skip
         guard.tell("state", state(0.6, 0), at)
         assert (guard.tell("command", command, at).result == "passed") == passes, at
+
+
+@pytest.mark.parametrize(
+    ("seen", "until", "fails"),
+    [(0.6, 1301, False), (0.624, 1301, False), (0.626, 1301, True), (0.3, 1301, True), (0.6, 1050, True),
+     (math.nan, 1301, True)],
+)  # fmt: skip
+def test_a_trajectory_waits_while_the_arm_is_reported_where_it_begins(
+    seen: float, until: int, *, fails: bool
+) -> None:
+    """A goal may be cancelled, and reports may end, while a trajectory waits in the controller."""
+    guard = small_arm()
+    guard.tell("state", state(0, 0), 1)
+    assert guard.tell("command", trajectory(JOINTS, RUN), 1).result == "passed"
+    waiting = trajectory(JOINTS, (0, [0.6, 0]), (1, [0, 0]), stamp=BEGIN / 1e9 + 1.301)
+    later = trajectory(JOINTS, (0, [0, 0]), (1, [0, 0]), stamp=BEGIN / 1e9 + 3)
+    guard.tell("state", state(0.3, 0), 500)
+    assert guard.tell("command", waiting, 500).result == "passed"
+    guard.got.clear()
+    for at in range(520, until, 20):
+        guard.tell("state", state(min(at / 1000 * 0.6, seen) if at < 1020 else seen, 0), at)
+    guard.advance(1290)
+    assert [1251 <= at <= 1271 for at, _stop in guard.got] == [True] * fails
+    refused = guard.tell("command", later, 1290)
+    assert fails or "and one waits for 0.011 s" in refused.log[0].text
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_empty_trajectory_within_a_stop_waits_for_its_end(*, again: bool) -> None:
+    goes, guard = trajectory(["elbow"], (1, [0.1])), small_arm(0.5)
+    far, none = trajectory(["elbow"], (1, [9.0])), trajectory([])
+    sent = [(1, goes), (100, far), (110, goes), (120, none), *([(130, goes)] if again else [])]
+    for at, command in sent:
+        guard.tell("state", state(0, 0), at)
+        outcome = guard.tell("command", command, at)
+        assert outcome.result == {far: "changed", none: "dropped"}.get(command, "passed")
+    guard.got.clear()
+    guard.advance(700)
+    assert [650 <= at <= 670 for at, _stop in guard.got] == ([] if again else [True])
 
 
 def test_a_stamp_of_a_simulated_clock_counts_as_now() -> None:
