@@ -1,18 +1,15 @@
-"""Naive models of the guards that know a place: a fence, the nearest thing, the joints of an arm."""
+"""Naive models of the guards that know a place: a fence, and the nearest thing."""
 
 import math
-import random
 
 import numpy as np
 
-from lab.closed_loop import controller
 from lab.closed_loop.messages import (
     ODOMETRY,
     Legs,
     position,
     scan,
 )
-from rosmop.tests.acting import STORE, message
 from tests.unit.features.guards.guarding import seeded
 from tests.unit.features.guards.tracing import (
     Source,
@@ -184,163 +181,3 @@ def separation(seed: int, events: int = 25) -> None:
                 assert passed >= min(speed, most) - 1e-3, trace.said(
                     f"{passed} m/s, and the room permits {most}"
                 )
-
-
-_POINT = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"]
-_DURATION = STORE.types["builtin_interfaces/msg/Duration"]
-Point = tuple[float, list[float], list[float], list[float]]
-
-
-def _trajectory(names: list[str], points: list[Point]) -> bytes:
-    made = [
-        _POINT(
-            positions=np.array(positions, float), velocities=np.array(velocities, float),
-            accelerations=np.array(accelerations, float), effort=np.array([]),
-            time_from_start=_DURATION(sec=math.floor(at), nanosec=round((at - math.floor(at)) * 1e9)),
-        )
-        for at, positions, velocities, accelerations in points
-    ]  # fmt: skip
-    return message("trajectory_msgs/JointTrajectory", joint_names=names, points=made)
-
-
-def _formed(point: Point, joints: int) -> bool:
-    _at, positions, velocities, accelerations = point
-    return len(positions) == joints and {len(velocities), len(accelerations)} <= {0, joints}
-
-
-def _keeps(points: list[Point], joints: int, most: float, v_max: float, a_max: float) -> bool:
-    """Whether each point has all joints within their limits, and the times increase from one that is not negative."""
-    before: Point | None = None
-    for point in points:
-        at, positions, velocities, accelerations = point
-        if len(positions) != joints or not all(abs(one) <= most for one in positions):
-            return False
-        if at < 0 or (before and at <= before[0]):
-            return False
-        if not all(abs(one) <= v_max for one in velocities) or not all(
-            abs(one) <= a_max for one in accelerations
-        ):
-            return False
-        if len(velocities) not in (0, joints) or len(accelerations) not in (0, joints):
-            return False
-        if before:
-            ways = [abs(one - other) for one, other in zip(positions, before[1], strict=True)]
-            if not all(way <= v_max * (at - before[0]) + 1e-12 for way in ways):
-                return False
-        before = point
-    return True
-
-
-def _bent(points: list[Point], most: float, v_max: float) -> tuple[float, float]:
-    """Return how much of the limits of position and of velocity the ways between points have, of samples."""
-    far, fast = controller.extremes([controller.Point(one[0], *map(tuple, one[1:])) for one in points], 200)
-    return far / most, fast / (1.1 * v_max)
-
-
-def _with_speeds(chance: random.Random, points: list[Point], v_max: float, *, grow: bool) -> list[Point]:
-    """Return the points, at longer intervals, with velocities, and perhaps with accelerations."""
-    slower, part = chance.choice((1.0, 1.0, 4.0)), chance.choice((0.1, 1.0))
-    return [
-        (
-            at * slower,
-            places,
-            [chance.uniform(-1, 1) * part * v_max for _ in places] if chance.random() < 0.9 else [],
-            [chance.uniform(-10, 10) * part for _ in places] if grow and chance.random() < 0.9 else [],
-        )
-        for at, places, _speeds, _growths in points
-    ]
-
-
-def joint_limits(seed: int, events: int = 25) -> None:  # noqa: PLR0912  one branch for each fault
-    """A trajectory passes as it is if it keeps every limit and begins where the joints are; otherwise it is a stop."""
-    chance = seeded(seed)
-    v_max, a_max, jump, silent = chance.choice((1.0, 3.2)), 50.0, chance.choice((0.05, 0.15)), 500
-    most = chance.choice((2.3, 6.2832))
-    trace = Trace(
-        "joints",
-        seed,
-        "trajectory_msgs/JointTrajectory",
-        vMax=v_max,
-        aMax=a_max,
-        jump=jump,
-        low=-most,
-        high=most,
-    )
-    joints = ["elbow", "wrist"]
-    known: list[float] = []
-    heard = -(10**9)
-    moves_until = 0.0  # milliseconds: until then the guard takes the arm for moving, and may be more careful
-    for _ in range(events):
-        trace.wait(pause(chance, silent, 100))
-        if chance.random() < 0.5:
-            known = [
-                chance.choice((-1.5, 0.1, 1.6)) for _ in joints
-            ]  # as far apart as no command moves a joint
-            heard = trace.now
-            trace.observe("state", message("sensor_msgs/JointState", name=joints, position=known), 3, known)
-            continue
-        at = chance.choice((0.0, 0.1, 0.5))
-        places = [one + chance.uniform(-1, 1) * jump * 0.9 for one in known or [0.0, 0.0]]
-        points: list[Point] = []
-        for _point in range(chance.choice((1, 2, 3))):
-            points.append((at, places, [], []))
-            at += chance.choice((0.1, 0.5))
-            places = [one + chance.uniform(-0.09, 0.09) * v_max for one in places]
-        names = list(joints)
-        fault = chance.random()
-        index = chance.randrange(len(points))
-        when, where, _speeds, _growths = points[index]
-        bad = chance.choice((math.nan, math.inf, 7.0, -7.0))
-        if fault < 0.08:
-            points[index] = (when, [bad, where[1]], [], [])
-        elif fault < 0.16:
-            points[index] = (when, where, [chance.choice((bad, v_max, -v_max, v_max * 1.01)), 0.0], [])
-        elif fault < 0.24:
-            points[index] = (when, where, [0.0, 0.0], [chance.choice((math.nan, a_max, -a_max * 1.01)), 0.0])
-        elif fault < 0.3:
-            points[index] = (when, where[:1], [], [])
-        elif fault < 0.36:
-            points[index] = (chance.choice((-0.1, when, 0.0)), where, [], [])
-        elif fault < 0.42:
-            names = chance.choice((["elbow", "elbow"], ["elbow", "knee"], ["elbow"], [], ["elbow", ""]))
-        elif fault < 0.5:
-            points[0] = (
-                points[0][0],
-                [points[0][1][0] + chance.choice((-1, 1)) * (2 * jump + v_max), where[1]],
-                [],
-                [],
-            )
-        elif fault < 0.55:
-            points = []
-        elif fault < 0.8:
-            points = _with_speeds(chance, points, v_max, grow=fault < 0.7)
-        data = _trajectory(names, points)
-        passed, sent = trace.guard.tell(trace.guard.topics["command"], data, trace.now, 1)
-        trace.log.append(f"{trace.now} {names} {points}: {passed == data}")
-        age = (trace.now - heard) / 1000
-        # Without a stamp the controller leaves out a first point at 0 s, which only has to be well formed.
-        left = points[1:] if points and points[0][0] == 0 and _formed(points[0], len(joints)) else points
-        good = (
-            names == joints
-            and trace.now - heard <= silent
-            and bool(left)
-            and left[0][0] > 0
-            and _keeps(left, len(joints), most, v_max, a_max)
-        )
-        if good and left:
-            bent = max(_bent(left, most, v_max))
-            if 0.99 < bent < 1.01:
-                continue  # too near to a limit for samples
-            ways = [abs(one - other) for one, other in zip(left[0][1], known, strict=True)]
-            reach = jump + v_max * (left[0][0] - age)
-            good = bent <= 1 and all(way <= reach + 1e-9 for way in ways)
-        if not points:
-            assert passed == data, trace.said("an empty trajectory must pass")
-            continue
-        if good and passed != data and trace.now < moves_until:
-            continue
-        if passed == data:
-            moves_until = trace.now + 1000 * points[-1][0]
-        assert (passed == data) == good, trace.said(f"good is {good}, and passed {passed == data}")
-        assert good or passed is None or passed != data, trace.said("a wrong trajectory passed")
-        del sent

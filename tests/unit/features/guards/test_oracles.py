@@ -13,7 +13,7 @@ ORACLES: tuple[Callable[[int], None], ...] = (
     oracles.watchdog, oracles.enabling_device, oracles.stop_button, oracles.two_hands, oracles.operating_mode,
     limit_oracles.speed_by_norm, limit_oracles.acceleration, limit_oracles.jerk, limit_oracles.finite_values,
     limit_oracles.message_rate, evidence_oracles.sensor, evidence_oracles.cross_check, evidence_oracles.arming,
-    place_oracles.fence, place_oracles.separation, place_oracles.joint_limits,
+    place_oracles.fence, place_oracles.separation,
 )  # fmt: skip
 
 
