@@ -10,6 +10,7 @@
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Graph
@@ -20,24 +21,20 @@ from appliance.channel.link import Link
 from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.assembly.current import Provided
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.policies import Policies
-from appliance.control.assembly.registrar import Registrar
-from appliance.control.assembly.services import (
-    CallHolder,
-    HeldCalls,
-    OwnServiceAnswer,
-    OwnServiceTable,
-    PolicyServices,
-)
+from appliance.control.assembly.services import CallHolder, HeldCalls, Provided
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import Sessions
+from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.registry import Registry
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, CallHold, Request
@@ -46,6 +43,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from roswire.xmlrpc import Value
 
 LONGEST = 64 << 20
 """The largest message of a process in bytes, unless its link has a smaller limit."""
@@ -117,12 +115,12 @@ class Links:
 class PolicyFacts:
     """The policy in force. `charged_to(host)` returns the name that is charged for a host's acts."""
 
-    def __init__(
-        self, revisions: Policies, services: PolicyServices, charged_to: Callable[[str], str]
-    ) -> None:
+    def __init__(self, revisions: Policies, charged_to: Callable[[str], str]) -> None:
         self.revisions = revisions
         """Loads policies, and rolls back."""
-        self._services = services
+        self._provided: list[Callable[[PolicyContext], PolicyContext]] = []
+        self.listeners: list[Callable[[], None]] = []
+        self.first: list[Callable[[], None]] = []
         self.charged_to = charged_to
         self.in_words = revisions.in_words
 
@@ -138,28 +136,52 @@ class PolicyFacts:
 
         After a change of hosts, call `hosts_changed`, and `decide_again` after others.
         """
-        self._services.facts.append(facts)
+        self._provided.append(facts)
 
     def hosts(self) -> Mapping[str, Address]:
         """Return the hosts that features provide."""
-        return self._services.added_to(PolicyContext()).hosts
+        return self.added_to(PolicyContext()).hosts
+
+    def added_to(self, known: PolicyContext) -> PolicyContext:
+        return reduce(lambda known, facts: facts(known), self._provided, known)
 
     def on_change(self, listener: Callable[[], None]) -> None:
         """End everything that the new policy does not allow, even if the next policy allows it again.
 
         A policy also changes with its hosts: a door that is removed and added again has the same name and address.
         """
-        self._services.listeners.append(listener)
+        self.listeners.append(listener)
 
     def on_first(self, begun: Callable[[], None]) -> None:
         """Call `begun` when this process has its first policy, before stored registrations are restored."""
-        self._services.first.append(begun)
+        self.first.append(begun)
 
     def hosts_changed(self) -> int:
         return self.revisions.hosts_changed()
 
     def decide_again(self) -> int:
         return self.revisions.decide_again()
+
+
+@dataclass(frozen=True, slots=True)
+class Registrar:
+    """Registers nodes at RVMaster as if they had registered themselves.
+
+    `call(host, local, method, parameters)` makes a call of the Master API as if a node of this host had made it at
+    the appliance's address `local`. It is decided, charged and recorded in the same way.
+    """
+
+    registry: Registry
+    graph: RosGraph
+    subscribers: Subscribers
+    parameters: ParameterCalls
+    flush: Callable[[], None]
+    call: Callable[[Address, str, str, tuple[Value, ...]], Awaitable[Value]]
+    ready: Callable[[], Awaitable[object]]
+    """Waits until the ROS master has all registrations."""
+    silence: Callable[[], None]
+    """Sends nothing more to nodes, until `speak`."""
+    speak: Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -234,15 +256,22 @@ class RelayOrders:
         return self._relay.presence == "connected"
 
 
+OwnServiceAnswer = Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
+
+
 class OwnServices:
     """The services on the appliance's own node."""
 
-    def __init__(self, table: OwnServiceTable) -> None:
-        self._table = table
+    def __init__(self) -> None:
+        self._answers: dict[str, OwnServiceAnswer] = {}
 
     def provide(self, name: str, answer: OwnServiceAnswer) -> None:
         """Answer the calls of the services whose names end with `/` and this name."""
-        self._table.answers[name] = answer
+        self._answers[name] = answer
+
+    async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
+        (answer,) = (answer for name, answer in self._answers.items() if call.service.endswith(f"/{name}"))
+        return await answer(call)
 
 
 WebSocketHandler = Callable[[str, str, str, int], tuple[int, str]]

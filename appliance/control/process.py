@@ -28,20 +28,15 @@ from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.assembly.active_role import STATE_ERRORS, ActiveRole
-from appliance.control.assembly.assembly import Parts, assemble
-from appliance.control.assembly.current import Current
-from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Foundation, make_foundation
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.robot import master_address
+from appliance.control.control import INNER, OWN, RVMASTER, Control
 from appliance.control.errors import PolicyRefusedError
-from appliance.control.feature_parts import FeatureParts
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.operator_assembly import Operators, make_operators, make_queries
 from appliance.control.operators.admin_socket import AdminServer
-from appliance.control.start_gate import StartGate, StartingControl
+from appliance.control.start_gate import StartGate
 from appliance.features.table import start_gate
 from appliance.hosts.host_table import HostRefusedError
-from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Kind
 from appliance.master.reconcile.sinks import restore_nodes
@@ -86,10 +81,8 @@ def record_removal(trail: AuditTrail, message: messages.RulesRestored) -> None:
 class SupervisorMessages:
     """Passes the supervisor's links and reports to the parts of control."""
 
-    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
-        self._base = base
-        self._parts = parts
-        self._operators = operators
+    def __init__(self, control: Control) -> None:
+        self._control = control
         self._tasks: set[asyncio.Task[None]] = set()
         self._one_reload = asyncio.Lock()
         self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
@@ -100,29 +93,29 @@ class SupervisorMessages:
                 self._link(role, index, socket.socket(fileno=descriptors[0]))
             case messages.ProcessesChanged(processes):
                 self._note_failing(processes)
-                self._parts.reconciler.wake()
+                self._control.reconciler.wake()
             case messages.ProcessDied():
-                record_death(self._base.trail, message)
+                record_death(self._control.trail, message)
             case messages.PolicyReloadRequested():
                 self._spawn(self._reload())
             case messages.EndAnnounced():
                 self._spawn(self._agree_to_end())
             case messages.Announced():
-                self._operators.tokens.first_token_shown()
+                self._control.tokens.first_token_shown()
             case messages.ClockRead(synchronised):
-                self._operators.clock.synchronisation_reported(synchronised)
+                self._control.clock.synchronisation_reported(synchronised)
             case messages.MachineAddresses(addresses):
                 _log.info("addresses of the robot's machine", addresses=addresses)
-                self._parts.endpoints.addresses.forget_routes()
-                self._base.policies.hosts_changed()
+                self._control.addresses.forget_routes()
+                self._control.policies.hosts_changed()
             case messages.RulesRestored():
-                record_removal(self._base.trail, message)
-                for work in self._base.lifeline.surroundings.after_removal:
+                record_removal(self._control.trail, message)
+                for work in self._control.lifeline.surroundings.after_removal:
                     work()
             case messages.ProbeFailed(reason):
-                self._base.listener_limits.probed(reason)
+                self._control.listener_limits.probed(reason)
             case messages.ProbePassed():
-                self._base.listener_limits.probed("")
+                self._control.listener_limits.probed("")
             case _:
                 _log.error(
                     "the supervisor sent a message that is not for control", message=type(message).__name__
@@ -135,15 +128,15 @@ class SupervisorMessages:
 
     async def _agree_to_end(self) -> None:
         try:
-            await self._base.lifeline.finish()
+            await self._control.lifeline.finish()
         finally:
-            self._base.lifeline.say(messages.EndAgreed())
+            self._control.lifeline.say(messages.EndAgreed())
 
     def _note_failing(self, processes: list[ProcessInfo]) -> None:
         failing = {process.role: process for process in processes if process.failing}
         for role in failing.keys() - self._failing:
             process = failing[role]
-            self._base.trail.happened(
+            self._control.trail.happened(
                 "process failing",
                 f"{role}: {process.failing}",
                 resource=role,
@@ -157,16 +150,16 @@ class SupervisorMessages:
             case "relay":
                 self._relay_link(index, Channel(sock, messages.RelayLink, limit=_RELAY_BACKLOG))
             case "signer":
-                self._base.signing.attach(Channel(sock, messages.SignerLink))
+                self._control.signing.attach(Channel(sock, messages.SignerLink))
             case "api":
-                self._operators.rest.attach(self._base.lifeline.api_channel(sock.detach()))
+                self._control.rest.attach(self._control.lifeline.api_channel(sock.detach()))
             case "charon":
-                self._base.hosts.tunnels.attach(Channel(sock, messages.TunnelLink))
+                self._control.hosts.tunnels.attach(Channel(sock, messages.TunnelLink))
             case _:
                 self._feature_link(role, index, sock)
 
     def _feature_link(self, role: str, index: int, sock: socket.socket) -> None:
-        attached = self._operators.links.of(role, index)
+        attached = self._control.core.links.of(role, index)
         if attached is None:
             _log.error("a link leads to a process unknown to control", role=role)
             sock.close()
@@ -175,19 +168,19 @@ class SupervisorMessages:
         link.attach(Channel(sock, accepted, longest=longest))
 
     def _relay_link(self, index: int, channel: Channel) -> None:
-        ends, subscribers = self._parts.endpoints, self._parts.endpoints.subscribers
-        ends.relay.attach(index, channel)
+        relay, subscribers = self._control.relay, self._control.subscribers
+        relay.attach(index, channel)
 
         def carried(topic: str) -> bool:
-            return ends.relay.allocation.of(TOPIC, topic) == index
+            return relay.allocation.of(TOPIC, topic) == index
 
-        if self._base.role.took_over:
+        if self._control.role.took_over:
             # Every connection ended, and roscpp may have given up: subscribers drop all publishers first.
-            for kind, topic, _holders in list(self._parts.core.registry.resources()):
+            for kind, topic, _holders in list(self._control.registry.resources()):
                 if kind is Kind.SUBSCRIPTION and carried(topic):
                     subscribers.renew_all(topic)
         subscribers.remind_all(carried)
-        self._parts.reminders.begin()
+        self._control.reminders.begin()
 
     async def _reload(self) -> None:
         async with self._one_reload:
@@ -200,7 +193,7 @@ class SupervisorMessages:
             except StoreError as error:
                 _log.error("the policy is in force and not stored", reason=str(error))
             try:
-                await self._base.hosts.enrolment.read_again(DISK)
+                await self._control.hosts.enrolment.read_again(DISK)
             except HostRefusedError as error:
                 _log.error("hosts.yaml was rejected", reason=str(error))
             except StoreError as error:
@@ -209,7 +202,7 @@ class SupervisorMessages:
     async def _reload_policy(self) -> None:
         while True:
             try:
-                await self._base.policies.reload(PolicyReload(), DISK)
+                await self._control.policies.reload(PolicyReload(), DISK)
             except RevisionChangedError:  # another revision came into force in the meantime
                 continue
             return
@@ -262,16 +255,13 @@ def main(lifeline_fd: int, config_path: Path) -> None:
 
 
 async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
-    stopping, tunnels = asyncio.Event(), Current[Tunnels]()
+    stopping = asyncio.Event()
     gate: StartGate = start_gate() or StartGate()
     compiler = SpecificationCompiler(
         lambda: lifeline.say(messages.CompilerWanted()), CompiledStore(settings.state / "control/compiled")
     )
     lifeline = ControlLifeline(
-        lifeline_fd,
-        stopping,
-        lambda answer: tunnels().answered(answer) if tunnels else None,
-        {"compiler": (compiler.attach, messages.CompilerLink), **gate.links},
+        lifeline_fd, stopping, {"compiler": (compiler.attach, messages.CompilerLink), **gate.links}
     )
     lifeline.attach()
     try:
@@ -279,7 +269,7 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
         role = await gate.role(config, settings, lifeline, compiler, stopping)
         if role is None or stopping.is_set():
             return
-        control = await _start(settings, lifeline, compiler, tunnels, role, gate=gate)
+        control = await _start(settings, lifeline, compiler, role, gate=gate)
     except (*STATE_ERRORS, NoPortError) as error:
         lifeline.say(messages.Failed(str(error)))
         await stopping.wait()
@@ -292,129 +282,129 @@ async def _start(
     settings: Settings,
     lifeline: ControlLifeline,
     compiler: SpecificationCompiler,
-    tunnels: Current[Tunnels],
     role: ActiveRole,
     *,
     gate: StartGate,
-) -> "_Control":
+) -> "_Service":
     if settings.monitors is not None:
         compiler.call_early()  # the compiler starts while the policy is read
     restarted = RVMASTER in lifeline.sockets
-    base = await make_foundation(settings, lifeline, compiler, tunnels, role)
-    parts = assemble(base)
-    features = FeatureParts()
-    queries = make_queries(base, parts, features)
-    await features.begin(queries.core)
-    state_began = queries.state_age.begin()
-    base.policies.start(restarted=restarted or role.paired)
-    parts.endpoints.places.policy_changed(base.policies.current.ports)
-    base.policy_services.began()
-    await parts.monitors.start(restarted=restarted, taken_over=role.paired)
-    state_began(parts.monitors)
-    features.add(await gate.begin(_starting(base, parts)))
-    control = _Control(base, parts, features, make_operators(base, queries, features))
-    core, ends = parts.core, parts.endpoints
-    await restore_nodes(base.sockets, base.store, core.graph, ends.faces, parts.serve)
+    control = Control(settings, lifeline, compiler, role)
+    await control.begin()
+    state_began = control.state_age.begin()
+    control.policies.start(restarted=restarted or role.paired)
+    control.places.policy_changed(control.policies.current.ports)
+    for begun in control.policy_facts.first:
+        begun()
+    await control.monitors.start(restarted=restarted, taken_over=role.paired)
+    state_began(control.monitors)
+    control.features.add(await gate.begin(control))
+    control.take_orders()
+    await restore_nodes(control.sockets, control.store, control.graph, control.faces, control.serve_node)
     # The policy's file may have changed while the appliance was down, or control may have died during a change.
-    ends.enforcement.policy_changed(base.policies.current)
-    await control.serve()
-    await parts.reconciler.ready.wait()
-    await control.announce(restarted=restarted)
-    return control
+    control.enforcement.policy_changed(control.policies.current)
+    service = _Service(control)
+    await service.begin()
+    await control.reconciler.ready.wait()
+    await service.announce(restarted=restarted)
+    return service
 
 
-class _Control:
-    """All parts of control, from the first served call to the end."""
+class _Service:
+    """The service of control, from the first served call to the end."""
 
-    def __init__(self, base: Foundation, parts: Parts, features: FeatureParts, operators: Operators) -> None:
-        self._base = base
-        self._parts = parts
-        self._features = features
-        self._operators = operators
-        self._messages = SupervisorMessages(base, parts, operators)
+    def __init__(self, control: Control) -> None:
+        self._control = control
+        self._messages = SupervisorMessages(control)
         self._tasks: list[asyncio.Task[None]] = []
         self._admin: object = None
 
-    async def serve(self) -> None:
-        base, parts, operators = self._base, self._parts, self._operators
-        listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
-        calls, own = parts.pipeline.handler(parts.table), parts.pipeline.handler(parts.table, own=True)
+    async def begin(self) -> None:
+        control, listener_limits, sockets = (
+            self._control,
+            self._control.listener_limits,
+            self._control.sockets,
+        )
+        calls, own = (control.pipeline.handler(control.table, own=own) for own in (False, True))
         listen = listener_limits.server
         watched = listener_limits.answering.watched(calls)
         await listener_limits.open(listen(sockets[RVMASTER].dup(), watched))
         await listener_limits.open(listen(sockets[OWN].dup(), own, guarded=False))
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
-        await listener_limits.open(listen(sockets[INNER].dup(), inner.handle, guarded=False, keep=False))
-        if base.lifeline.announced:
-            operators.tokens.first_token_shown()
+        await listener_limits.open(
+            listen(sockets[INNER].dup(), control.inner.handle, guarded=False, keep=False)
+        )
+        if control.lifeline.announced:
+            control.tokens.first_token_shown()
         if _ADMIN in sockets:
             # Keep a reference, otherwise the garbage collector closes the server.
-            self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
-        if base.role.api is not None:
-            operators.rest.attach(base.role.api)
-            base.hosts.enrolment.served_by(base.role.pin)  # the api has stated it already
-        base.lifeline.hear(self._messages.heard)
+            self._admin = await AdminServer(control.administration).start(sockets[_ADMIN].dup())
+        if control.role.api is not None:
+            control.rest.attach(control.role.api)
+            control.hosts.enrolment.served_by(control.role.pin)  # the api has stated it already
+        control.lifeline.hear(self._messages.heard)
         work: dict[str, Callable[[], Awaitable[None]]] = {
-            "the reconciliation with the ROS master": parts.reconciler.run,
-            "the checks of nodes": parts.endpoints.liveness.run,
-            "the reminders of subscribers": parts.reminders.run,
+            "the reconciliation with the ROS master": control.reconciler.run,
+            "the checks of nodes": control.liveness.run,
+            "the reminders of subscribers": control.reminders.run,
             "the ends of connections": listener_limits.connection_table.sweep,
             "the ends of own connections": listener_limits.own_connection_table.sweep,
             "the return of memory": return_spare_memory,
-            "the check of the clock": operators.clock.watch,
-            "the ends of tokens, blocks and other things": base.ends.run,
-            "the check of protection that is off": operators.switched_off.watch,
+            "the check of the clock": control.clock.watch,
+            "the ends of tokens, blocks and other things": control.ends.run,
+            "the check of protection that is off": control.switched_off.watch,
             "the storage of parameters": self._save_parameters,
-            "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),
-            **self._features.work(),
+            "the publications of monitors": partial(control.publisher.run, control.reconciler.ready),
+            **control.features.work(),
         }
         loop = asyncio.get_running_loop()
         self._tasks += [loop.create_task(run_always(what, one)) for what, one in work.items()]
 
     async def announce(self, *, restarted: bool) -> None:
-        base, settings = self._base, self._base.settings
-        token = await self._operators.tokens.first() if settings.api_address is not None else None
+        control, settings = self._control, self._control.settings
+        token = await control.tokens.first() if settings.api_address is not None else None
         host = settings.listen_address[0]
         own = master_address(settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
-        uri = node_uri(base.role.address or own, base.port(RVMASTER))
-        base.lifeline.surroundings.master = uri.rstrip("/")
+        uri = node_uri(control.role.address or own, control.port(RVMASTER))
+        control.lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
             name = {"robot": settings.name} if settings.name else {}
             more = {**name, "version": __version__, "configuration": settings.fingerprints()}
-            more |= {"settings": settings.recorded(), "off": self._parts.monitors.off}
-            base.trail.happened("appliance started", f"nodes may connect at {uri}", more=more)
+            more |= {"settings": settings.recorded(), "off": control.monitors.off}
+            control.trail.happened("appliance started", f"nodes may connect at {uri}", more=more)
         else:
             text = "control started again after an unexpected end: no host holds a group of [Authority]"
-            base.trail.happened("process started", text, resource="control")
+            control.trail.happened("process started", text, resource="control")
         detail = {
             "master": uri.rstrip("/"),
-            "revision": base.policies.revision,
-            "rosout_master": node_uri("127.0.0.1", base.port(OWN)).rstrip("/"),
-            "inner_port": base.port(INNER),
+            "revision": control.policies.revision,
+            "rosout_master": node_uri("127.0.0.1", control.port(OWN)).rstrip("/"),
+            "inner_port": control.port(INNER),
             "token": token,
-            "own_port": base.port(OWN),
-            "warnings": [str(warning) for warning in base.policies.current.warnings[:_WARNINGS]],
+            "own_port": control.port(OWN),
+            "warnings": [str(warning) for warning in control.policies.current.warnings[:_WARNINGS]],
         }
-        base.lifeline.say(messages.Ready(detail))
+        control.lifeline.say(messages.Ready(detail))
 
     async def end(self) -> None:
-        base, parts, ends = self._base, self._parts, self._parts.endpoints
-        base.listener_limits.close()
-        ends.faces.close_all()
-        parts.reminders.close()
-        ends.subscribers.delivery.close()
-        ends.rosmaster.close()
-        base.role.close()
+        control = self._control
+        control.listener_limits.close()
+        control.faces.close_all()
+        control.reminders.close()
+        control.subscribers.delivery.close()
+        control.rosmaster.close()
+        control.role.close()
         await _end_others(_TASKS_SECONDS)  # requests may still write state while they end
-        base.trail.happened("appliance stopped", "control ended in an orderly way")
-        base.store.save_parameters(parts.core.parameters.tree)
-        base.store.close(_CLOSE_SECONDS)
-        unwritten = base.audit.close(_CLOSE_SECONDS)
+        control.trail.happened("appliance stopped", "control ended in an orderly way")
+        control.store.save_parameters(control.parameters.tree)
+        control.store.close(_CLOSE_SECONDS)
+        unwritten = control.audit.close(_CLOSE_SECONDS)
         if unwritten is not None:
             _log.error("the last records of the audit log are not written", reason=unwritten)
 
     async def _save_parameters(self) -> None:
-        dirty, store, mirror = self._base.parameters_dirty, self._base.store, self._parts.core.parameters
+        control = self._control
+        dirty, store, mirror = control.parameters_dirty, control.store, control.parameters
         while True:
             await dirty.wait()
             dirty.clear()
@@ -430,20 +420,3 @@ async def _end_others(seconds: float) -> None:
         task.cancel()
     if others:
         await asyncio.wait(others, timeout=seconds)
-
-
-def _starting(base: Foundation, parts: Parts) -> StartingControl:
-    return StartingControl(
-        settings=base.settings,
-        role=base.role,
-        store=base.store,
-        trail=base.trail,
-        audit=base.audit,
-        signed=base.signing.signed,
-        monitors=parts.monitors,
-        parameters=parts.core.parameters,
-        ready=parts.reconciler.ready,
-        relays=lambda: parts.endpoints.relay.presence,
-        probe=lambda: base.lifeline.surroundings.probe,
-        overdue=base.listener_limits.answering.overdue,
-    )

@@ -18,8 +18,8 @@ from appliance.audit.log import log_database
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.log_writer import ChainWriter
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.foundation import open_listener
-from appliance.control.assembly.host_authority import make_host_table
+from appliance.control.assembly.hosts import make_host_table
+from appliance.control.assembly.listener_limits import open_listener
 from appliance.control.assembly.policies import kept_policy
 from appliance.control.assembly.policy_gate import policy_at_start
 from appliance.control.assembly.robot import robot_addresses

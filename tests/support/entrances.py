@@ -203,7 +203,7 @@ ROLES = {
 """The entrances of each process."""
 
 LISTENERS = {
-    "appliance/control/assembly/foundation.py": "RVMaster, node API",
+    "appliance/control/assembly/listener_limits.py": "RVMaster, node API",
     "appliance/control/operators/admin_socket.py": "admin socket",
     "appliance/control/process.py": "admin socket",
     "appliance/features/doors/door_processes.py": "door's port",

@@ -7,13 +7,10 @@ from appliance.channel.answers.graph_answers import Graph
 from appliance.channel.answers.status import Status
 from appliance.configuration.config_sources import read
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.assembly.current import Provided
-from appliance.control.assembly.host_authority import HostAuthority, make_host_table
 from appliance.control.assembly.host_blocks import BlockTable
-from appliance.control.assembly.hosts import SiteHosts
+from appliance.control.assembly.hosts import HostAuthority, SiteHosts, make_host_table
 from appliance.control.assembly.policies import Policies
-from appliance.control.assembly.registrar import Registrar
-from appliance.control.assembly.services import CallHolder, OwnServiceTable, PolicyServices
+from appliance.control.assembly.services import CallHolder, Provided
 from appliance.control.core import (
     Alarms,
     Bearers,
@@ -22,6 +19,7 @@ from appliance.control.core import (
     Links,
     OwnServices,
     PolicyFacts,
+    Registrar,
     RelayOrders,
     ResourceUses,
     RestServices,
@@ -75,7 +73,7 @@ def idle_core(state: Path) -> Core:
         store=store,
         ends=ends,
         links=Links(idle(ControlLifeline), lambda _sequence: None),
-        policy=PolicyFacts(policies, PolicyServices(), str),
+        policy=PolicyFacts(policies, str),
         specifications=specifications,
         hosts=SiteHosts(
             BlockTable(store, ends),
@@ -98,7 +96,7 @@ def idle_core(state: Path) -> Core:
         ),
         relay=RelayOrders(relay, CallHolder(), lambda: None),
         rest=RestServices(),
-        own_services=OwnServices(OwnServiceTable()),
+        own_services=OwnServices(),
         bearers=Bearers(list, lambda: None, Provided()),
         limits=ResourceUses(tuple),
         alarms=Alarms(lambda: idle(Status), idle(HandledAlarms)),

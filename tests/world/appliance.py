@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from appliance.channel import messages
 from appliance.configuration.settings import Audit, LivenessSection, Settings
-from appliance.control.assembly.assembly import Parts
+from appliance.control.control import Control
 from appliance.control.process import _run as run_control
 from appliance.features.standby.membership import LINK_FILE, Membership, save_membership
 from appliance.features.standby.pairing import LeaseWatch
@@ -144,7 +144,7 @@ class Appliance:
         (self.state / "control").mkdir(parents=True)
         self._lifeline: LinkEnd | None = None
         self._lease_lifeline: LinkEnd | None = None
-        self.parts: Parts | None = None  # of the present control
+        self.parts: Control | None = None  # of the present control
         self.settings = Settings(
             policy=self.policy,
             state=self.state,
@@ -276,7 +276,7 @@ class Appliance:
             mine.send(messages.SocketRestored(name), (sock,))
         mine.send(messages.SocketsRestored(len(self.sockets), self._announced))
         config = self.state / "config.json"
-        self.control.assembled = self._assembled
+        self.control.made = self._made
         task = self.control.start(run_control(self.settings, its, config))  # type: ignore[arg-type]  # a link in memory
         task.add_done_callback(self.world.done)
         self._link_relay()
@@ -285,7 +285,7 @@ class Appliance:
             self._lease_lifeline.send(messages.LinkOpened("control", 0), (leases,))
             mine.send(messages.LinkOpened("lease", 0), (controls,))
 
-    def _assembled(self, parts: Parts) -> None:
+    def _made(self, parts: Control) -> None:
         self.parts = parts
 
     def _link_relay(self) -> None:

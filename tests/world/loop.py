@@ -64,7 +64,7 @@ class Process:
     ends: list[Callable[[], None]] = field(default_factory=list)
     ready: deque[asyncio.Handle] = field(default_factory=deque)
     doom: tuple[int, Callable[[], None]] | None = None  # what happens after this number of its callbacks
-    assembled: Callable[[Any], None] = lambda _parts: None  # called with the parts of a control
+    made: Callable[[Any], None] = lambda _control: None  # called with the parts of a control
 
     def __post_init__(self) -> None:
         token = _process.set(self)

@@ -16,9 +16,8 @@ from appliance.audit.log import log_database, log_writer
 from appliance.audit.log.log import AuditLog
 from appliance.base import clock
 from appliance.channel import child_process
-from appliance.control import process
-from appliance.control import process as control_process
-from appliance.control.assembly import assembly, endpoints, foundation, listener_limits, open_audit
+from appliance.control import control, process
+from appliance.control.assembly import listener_limits
 from appliance.control.links import supervisor_link
 from appliance.features.standby import passive, replica, replication
 from appliance.features.standby import process as lease_process
@@ -85,10 +84,10 @@ class _AdminServer:
     def close(self) -> None: ...
 
 
-def _assemble(base: Any) -> Any:
-    parts = assembly.assemble(base)
-    present_process().assembled(parts)
-    return parts
+def _make_control(*given: Any) -> Any:
+    made = control.Control(*given)
+    present_process().made(made)
+    return made
 
 
 @contextlib.contextmanager
@@ -143,20 +142,20 @@ def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]
     replaced: list[tuple[Any, str, Any]] = [
         (secrets, "_sysrand", random),
         (rosmaster, "uuid", SimpleNamespace(uuid1=lambda: "run")),
-        (foundation, "StateStore", partial(StateStore, kind=disk.WorldDatabase)),
-        (open_audit, "AuditLog", partial(AuditLog, drive=disk.EngineSteps)),
+        (control, "StateStore", partial(StateStore, kind=disk.WorldDatabase)),
+        (control, "AuditLog", partial(AuditLog, drive=disk.EngineSteps)),
         (changes, "os", files),
         (log_writer, "os", files),
         (writer_thread, "sqlite3", databases),
         (log_database, "sqlite3", databases),
         (XmlRpcClient, "_exchange", exchange),
         (listener_limits, "HttpServer", partial(_Server, network)),
-        (endpoints, "listen", listen),
-        (foundation, "listen", listen),
-        (control_process, "AdminServer", _AdminServer),
+        (control, "listen", listen),
+        (listener_limits, "listen", listen),
+        (process, "AdminServer", _AdminServer),
         (passive, "AdminServer", _AdminServer),
-        (control_process, "assemble", _assemble),
-        (control_process, "return_spare_memory", _forever),
+        (process, "Control", _make_control),
+        (process, "return_spare_memory", _forever),
         (supervisor_link, "os", SimpleNamespace(close=_handle)),
         (child_process, "os", SimpleNamespace(close=_handle)),
         (supervisor_link, "socket", sockets),

@@ -28,7 +28,7 @@ import structlog
 
 from appliance.audit.proof.verification import verify
 from appliance.channel import admin, messages
-from appliance.control.assembly.assembly import Parts
+from appliance.control.control import Control
 from appliance.master.graph.registry import Kind, Life
 from roswire.parameter_tree import standing_at
 from tests.world import seams
@@ -278,7 +278,7 @@ class World:
 
     def interrupted(self, connection: Connection) -> None:
         parts = self.appliance.parts
-        publisher = parts and parts.core.registry.by_key(connection.key)
+        publisher = parts and parts.registry.by_key(connection.key)
         if not publisher or publisher.life is not Life.LIVE or connection.kind != "topic":
             return
         host, topic = str(publisher.host), connection.resource
@@ -530,12 +530,12 @@ class World:
         self._check_connected(parts)
         self._check_parameters(parts)
 
-    def _check_master(self, parts: Parts) -> None:
+    def _check_master(self, parts: Control) -> None:
         words = {Kind.PUBLICATION: "Publisher", Kind.SUBSCRIPTION: "Subscriber", Kind.SERVICE: "Service"}
-        faces, rosmaster = parts.endpoints.faces, self.appliance.rosmaster
+        faces, rosmaster = parts.faces, self.appliance.rosmaster
         wanted = {
             (words[one.kind], one.resource, node.name, faces.inner_uri(node))
-            for node, one in parts.core.registry.in_order()
+            for node, one in parts.registry.in_order()
             if one.kind in words
         }
         there = {
@@ -547,14 +547,14 @@ class World:
         if there != wanted:
             raise BrokenPromiseError(f"rosmaster has {there - wanted} and lacks {wanted - there}")
 
-    def _check_connected(self, parts: Parts) -> None:
+    def _check_connected(self, parts: Control) -> None:
         holders = {
             incarnation.key: node
-            for incarnation in parts.core.registry.live()
+            for incarnation in parts.registry.live()
             for node in self.nodes
             if node.alive and (node.name, node.api) == (incarnation.name, incarnation.api_text)
         }
-        ports = {node.relay_port: node.key for node in parts.core.registry.all()}
+        ports = {node.relay_port: node.key for node in parts.registry.all()}
         for node in holders.values():
             if not node.superseded:  # else another node has its name
                 for topic, subscription in node.subscribes.items():
@@ -583,10 +583,10 @@ class World:
         if heard != wanted or told != wanted:
             raise BrokenPromiseError(f"{node} hears {heard} on {topic}, knows {told}, and may have {wanted}")
 
-    def _check_parameters(self, parts: Parts) -> None:
+    def _check_parameters(self, parts: Control) -> None:
         rosmaster = self.appliance.rosmaster
         for key, values in self.parameters.items():
-            value, _above = standing_at(parts.core.parameters.tree, key)
+            value, _above = standing_at(parts.parameters.tree, key)
             there, _above = standing_at(rosmaster.parameters, key)
             if value not in values or there != value:
                 raise BrokenPromiseError(

@@ -1,1 +1,1 @@
-"""Make the parts of control, in order."""
+"""Parts of control that stand below its links and operators."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from appliance.base.age_clock import AgeClock
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.control.assembly.host_authority import HostAuthority, make_host_authority
+from appliance.control.assembly.hosts import HostAuthority, make_host_authority
 from appliance.control.errors import PolicyRefusedError, StateError
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels

@@ -27,9 +27,19 @@ from appliance.rpc.connection_table import ConnectionTable
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal
+from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal, listen
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import XmlRpcLimits, build_fault
+
+
+def open_listener(host: str, port: int) -> socket.socket:
+    try:
+        return listen(host, port)
+    except OSError as error:
+        raise OSError(
+            f"{host}:{port} cannot be listened on: {error.strerror}; "
+            "is a ROS master running there? Stop it, or choose another --listen"
+        ) from error
 
 
 class Answering:

@@ -2,34 +2,28 @@
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from functools import reduce
+from typing import Generic, TypeVar
 
 from appliance.channel import messages
-from appliance.control.assembly.current import Provided
-from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import CallHold, Request
 
-OwnServiceAnswer = Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
+T = TypeVar("T")
 
 
-class PolicyServices:
-    """The facts that features add to each policy in force."""
+class Provided(Generic[T]):
+    """A service that at most one feature provides."""
 
     def __init__(self) -> None:
-        self.facts: list[Callable[[PolicyContext], PolicyContext]] = []
-        self.listeners: list[Callable[[], None]] = []
-        self.first: list[Callable[[], None]] = []
+        self._service: T | None = None
 
-    def added_to(self, known: PolicyContext) -> PolicyContext:
-        return reduce(lambda known, facts: facts(known), self.facts, known)
+    def provide(self, service: T) -> None:
+        """Raises `RuntimeError` if another feature provides the service."""
+        if self._service is not None:
+            raise RuntimeError("two features provide the same service of control")
+        self._service = service
 
-    def changed(self) -> None:
-        for listener in self.listeners:
-            listener()
-
-    def began(self) -> None:
-        for begun in self.first:
-            begun()
+    def __call__(self) -> T | None:
+        return self._service
 
 
 @dataclass(frozen=True)
@@ -62,14 +56,3 @@ class CallHolder:
         if held is None:
             return messages.HeldRequestDecided(wanted.number, _NOT_HELD)
         return await held.request(wanted)
-
-
-class OwnServiceTable:
-    """The services on the appliance's own node, by the ends of their names."""
-
-    def __init__(self) -> None:
-        self.answers: dict[str, OwnServiceAnswer] = {}
-
-    async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
-        (answer,) = (answer for name, answer in self.answers.items() if call.service.endswith(f"/{name}"))
-        return await answer(call)

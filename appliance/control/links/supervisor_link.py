@@ -135,11 +135,10 @@ class ControlLifeline:
         self,
         descriptor: int,
         stopping: asyncio.Event,
-        enclosed: Enclosed,
         links: Mapping[str, tuple[Callable[[Channel], None], object]],
     ) -> None:
         self._stopping = stopping
-        self._enclosed = enclosed
+        self._enclosed: Enclosed = lambda _answer: None  # before tunnels are wanted
         self._links = links
         self.activated = asyncio.Event()
         self.epoch: int | None = None
@@ -162,9 +161,8 @@ class ControlLifeline:
         for said in early.values():
             heard(*said)
 
-    def hear_tunnels(self, enclosed: Enclosed) -> Enclosed:
-        before, self._enclosed = self._enclosed, enclosed
-        return before
+    def hear_tunnels(self, enclosed: Enclosed) -> None:
+        self._enclosed = enclosed
 
     def before_end(self, work: Callable[[], Awaitable[None]]) -> None:
         self._before_end.append(work)

@@ -37,7 +37,6 @@ from appliance.channel.answers.status import (
     SwitchedOff,
 )
 from appliance.configuration.inventory import inventory as product_inventory
-from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
 from appliance.control.assembly.policies import Policies
@@ -46,11 +45,13 @@ from appliance.features.views import states_in
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic, Traffic
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.rosmaster import RosMaster
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Category
 from appliance.policy.sections import DECIDERS
 from appliance.specifications.allocation import SERVICE, TOPIC
 from appliance.specifications.records import KINDS
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.telemetry.audit_trail import AuditTrail, Meter
 
 # Describe the graph for operators: nodes, topics, services, connections, traffic.
@@ -155,20 +156,24 @@ _DECISIONS = tuple(
 
 
 def measures_of(
-    parts: Parts, meter: Meter, status: Status, hosts: list[Host], queued_deliveries: int
+    registry: Registry,
+    carried: RelayTraffic,
+    monitors: SpecificationManager,
+    meter: Meter,
+    status: Status,
+    *,
+    hosts: list[Host],
+    queued_deliveries: int,
 ) -> Measures:
     """Return the measurements; all but `MOST_RESOURCES` topics and services are summed in `OTHERS`.
 
     For histograms, the limit is `MOST_DELAYED`.
     """
-    lives = Counter(incarnation.life for incarnation in parts.core.registry.all() if not incarnation.own)
-    kinds = Counter(
-        registration.kind.value for node, registration in parts.core.registry.in_order() if not node.own
-    )
-    records = parts.monitors.records
-    carried = parts.core.carried
+    lives = Counter(incarnation.life for incarnation in registry.all() if not incarnation.own)
+    kinds = Counter(registration.kind.value for node, registration in registry.in_order() if not node.own)
+    records = monitors.records
     relayed, delayed = carried_of(carried)
-    done = from_zero(records.counts, ((kind, name) for name in parts.monitors.names() for kind in KINDS))
+    done = from_zero(records.counts, ((kind, name) for name in monitors.names() for kind in KINDS))
     return Measures(
         status=status,
         hosts=hosts,
@@ -183,7 +188,7 @@ def measures_of(
         monitors=[(*labels, count) for labels, count in done.items()],
         slices={
             name: (row.slices, row.slice_limit)
-            for name, row in parts.monitors.rollout.rows.items()
+            for name, row in monitors.rollout.rows.items()
             if row.slice_limit
         },
         drop_at=_at(records.at, "drop"),
@@ -235,11 +240,15 @@ _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 class Queries:
     """The answers to queries. `live()` returns the rights that a change of the policy may end."""
 
-    parts: Parts
+    registry: Registry
+    relay: RelayControl
+    rosmaster: RosMaster
+    specifications: SpecificationManager
     trail: AuditTrail
     policies: Policies
     hosts: SiteHosts
     surroundings: Surroundings
+    rv_state: Callable[[], list[object]]
     features: Callable[[], dict[str, Any]]
     audit: Callable[[dict[str, Any]], AuditState]
     clock: Callable[[], ClockState]
@@ -269,18 +278,20 @@ class Queries:
         return msgspec.structs.replace(found, in_use=used)
 
     async def graph(self, _request: admin.GraphWanted) -> Graph:
-        return graph_of(self.parts.core.registry, self.parts.endpoints.relay)
+        return graph_of(self.registry, self.relay)
 
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
-        return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
+        return monitors_of(self.specifications, self.rv_state(), texts=request.texts)
 
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
         return measures_of(
-            self.parts,
+            self.registry,
+            self.relay.carried,
+            self.specifications,
             self.trail.meter,
             self.present(),
-            self.hosts.enrolment.rows(),
-            self.queued_deliveries(),
+            hosts=self.hosts.enrolment.rows(),
+            queued_deliveries=self.queued_deliveries(),
         )
 
     async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
@@ -290,8 +301,7 @@ class Queries:
         return self.handled(self._status())
 
     def _status(self) -> Status:
-        parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay
-        meter, states = self.trail.meter, self.features()
+        registry, relay, meter, states = self.registry, self.relay, self.trail.meter, self.features()
         # The appliance's own nodes are not counted; the graph leaves them out also.
         lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
         named = {
@@ -306,14 +316,14 @@ class Queries:
             master=self.surroundings.master,
             processes=self.surroundings.processes,
             isolation=self.surroundings.firewall.isolation,
-            relaying="all" if parts.endpoints.relay.relay_all else "monitored",
-            mediation="full" if parts.endpoints.relay.stand_ins else "monitored",
+            relaying="all" if relay.relay_all else "monitored",
+            mediation="full" if relay.stand_ins else "monitored",
             firewall=self.surroundings.firewall.report,
             probe=self.surroundings.probe,
             policy=self._policy(),
             ipsec=self.hosts.enrolment.status(),
-            monitors=monitors_status(parts.monitors),
-            rosmaster="reachable" if parts.endpoints.rosmaster.whole else "being rebuilt",
+            monitors=monitors_status(self.specifications),
+            rosmaster="reachable" if self.rosmaster.whole else "being rebuilt",
             relay=relay.presence,
             nodes=lives.count(Life.LIVE),
             shadows=lives.count(Life.SHADOW),

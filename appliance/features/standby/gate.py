@@ -5,10 +5,11 @@ from pathlib import Path
 
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
+from appliance.control.control import Control
 from appliance.control.core import ControlPart
 from appliance.control.errors import StateError
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.start_gate import StartGate, StartingControl
+from appliance.control.start_gate import StartGate
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.lease_link import LeaseLink
 from appliance.features.standby.membership import LINK_FILE, MembershipError, load_membership
@@ -42,7 +43,7 @@ class StandbyGate(StartGate):
         pair = await until_activated(membership, settings, lifeline, self._lease, compiler, stopping=stopping)
         return None if pair is None else PairedRole(pair, settings)
 
-    async def begin(self, control: StartingControl) -> ControlPart:
+    async def begin(self, control: Control) -> ControlPart:
         return await begin(control)
 
 

@@ -12,7 +12,7 @@ from appliance.channel.link import Link
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.assembly.host_authority import HostAuthority
+from appliance.control.assembly.hosts import HostAuthority
 from appliance.features.standby.replication import Pair, Replication, host_endpoint
 from appliance.features.standby.replication_frames import Introduction
 from appliance.hosts.appliances import CERTIFICATE_DAYS, Appliances, RevokedCertificates

@@ -324,7 +324,7 @@ class PassiveControl:
         )
         stating = begin("the tokens of REST", self._rest.run)
         self._lifeline.hear(self._heard)
-        active = self._lifeline.hear_tunnels(self.tunnels.answered)
+        self._lifeline.hear_tunnels(self.tunnels.answered)
         self._lifeline.say(messages.Ready({"stands_by": True}))
         comparing = begin("the comparison with the other appliance", self._compare)
         tasks += [
@@ -338,7 +338,6 @@ class PassiveControl:
         finally:
             server.close()
             self._lifeline.pause()
-            self._lifeline.hear_tunnels(active)
             self.api = self._rest.release()
             self.tunnels.pin = self._rest.pin
             for task in (*tasks, stating):

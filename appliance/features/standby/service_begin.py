@@ -19,9 +19,9 @@ from appliance.base import clock
 from appliance.channel.messages import StateOwner
 from appliance.channel.status_summary import no_relay
 from appliance.configuration.settings import Settings
+from appliance.control.control import Control
 from appliance.control.core import ControlPart
 from appliance.control.operators.request_method import RequestMethod
-from appliance.control.start_gate import StartingControl
 from appliance.control.start_rehearsal import lacking_room
 from appliance.features.standby import lease_link
 from appliance.features.standby import requests as standby_requests
@@ -222,7 +222,7 @@ _SEAL_SECONDS = 0.5  # the robot waits
 _log = structlog.get_logger()
 
 
-async def begin(control: StartingControl) -> ControlPart:
+async def begin(control: Control) -> ControlPart:
     role, store = control.role, control.store
     if not isinstance(role, PairedRole):
         return _part(StandbyOrders(SingleAppliance(), control.trail))
@@ -250,15 +250,15 @@ async def begin(control: StartingControl) -> ControlPart:
             _log.warning("the log is not sealed before the switchover: the signer does not answer")
 
     async def report_service() -> None:
-        await control.ready.wait()
+        await control.reconciler.ready.wait()
         monitors = control.monitors
         report = ServiceReport(
             control.settings,
             control.audit,
             lambda: holds_if_lost(monitors.checked.states, monitors.switches.enabled),
-            relays=control.relays,
-            probe=control.probe,
-            overdue=control.overdue,
+            relays=lambda: control.relay.presence,
+            probe=lambda: control.lifeline.surroundings.probe,
+            overdue=control.listener_limits.answering.overdue,
         )
         await pair.lease.report_service(report.now)
 
@@ -287,10 +287,10 @@ def _part(orders: StandbyOrders) -> ControlPart:
     )
 
 
-async def _begin_epoch(control: StartingControl, pair: Pair) -> TakeoverRecorder:
+async def _begin_epoch(control: Control, pair: Pair) -> TakeoverRecorder:
     name, other = pair.membership.name, pair.membership.other
     recorder = TakeoverRecorder(
-        control.trail, control.audit, control.store, control.signed, name=name, other=other
+        control.trail, control.audit, control.store, control.signing.signed, name=name, other=other
     )
     await recorder.took_over(pair.epoch)
     control.monitors.rollout.inherit(*inherited_state(pair, control.store))

@@ -60,7 +60,8 @@ def answers() -> list[TunnelsEnclosed]:
 @pytest.fixture
 async def ends(answers: list[TunnelsEnclosed]) -> AsyncIterator[tuple[ControlLifeline, Supervisor]]:
     ours, theirs = socket.socketpair()
-    lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), answers.append, {})
+    lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), {})
+    lifeline.hear_tunnels(answers.append)
     supervisor = Supervisor(ours)
     lifeline.attach()
     yield lifeline, supervisor
