@@ -31,7 +31,6 @@ from appliance.supervisor.errors import PortInUseError, StartError
 from appliance.supervisor.heartbeat_wiring import HeartbeatWiring
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
 from appliance.supervisor.lapse_answers import answer_for_control
-from appliance.supervisor.machine_work import MachineWork
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
@@ -39,7 +38,6 @@ from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.roles import memories
 from appliance.supervisor.sandbox.private_view import (
-    PrivateView,
     program_folders,
     require_view,
     view_of,
@@ -309,29 +307,55 @@ def _run(
         raise_file_limit(_FILES)
         hold = HoldAround(settings, used=pairing is None and manager.is_present, link=isolation.link)
         hold.put()
+
+        def say_ready(said: ControlReady) -> None:
+            ready(said, settings)
+            if not isolation.awaits_graph():
+                isolation.lapse = hold.served()
+            manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
+
+        def say_standing_by() -> None:
+            waits()
+            if pairing is not None:
+                manager.ready(pairing.ready)
+
         admin = state.open_admin_socket()
         with closing(admin):
             listeners = _listeners(settings, isolation, manager, admin, hold)
             if listeners is None:
                 return
             try:
-                _supervise(
-                    settings,
+                manager.starting("starts its processes")
+                supervisor = partial(
+                    Supervisor,
                     roles,
-                    state,
-                    isolation,
-                    ready,
+                    Facts(
+                        state=state.path,
+                        config=state.config,
+                        rosmaster_port=settings.rosmaster_port,
+                        rosout_ports=ports.own_node if settings.isolation != "none" else None,
+                        control_reads=tuple(
+                            filter(None, (settings.policy, settings.monitors, settings.hosts))
+                        ),
+                        sections=settings.sections,
+                        ca_passphrase_file=settings.ipsec.ca_passphrase_file,
+                        view=view,
+                        raised=raised,
+                    ),
                     admin=admin,
-                    hold=hold,
+                    ready=say_ready,
+                    relays=settings.relays,
+                    isolation=isolation,
                     listeners=listeners,
+                    memories=memories(settings.sections, settings.relays),
+                    memory=MonitorMemory(state.path, settings.relays),
+                    heartbeat=HeartbeatWiring(settings.relays, settings.relay.heartbeat_line),
+                    stands_by=say_standing_by,
+                    gate=pairing.gate if pairing is not None else ServiceGate,
                     work=work,
-                    view=view,
-                    manager=manager,
-                    rosout_ports=ports.own_node,
-                    pairing=pairing,
-                    waits=waits,
-                    raised=raised,
+                    gives_back=hold.put_before_restart,
                 )
+                asyncio.run(_supervise(supervisor, isolation, hold, manager))
             finally:
                 hold.put()
                 isolation.remove()
@@ -429,70 +453,14 @@ async def _keep(hold: HoldAround, supervisor: Supervisor, isolation: NoIsolation
     isolation.lapse = await hold.until(lambda: supervisor.is_ready and not isolation.awaits_graph())
 
 
-def _supervise(
-    settings: Settings,
-    roles: tuple[Role, ...],
-    state: StateDirectory,
-    isolation: NoIsolation,
-    ready: Callable[[ControlReady, Settings], None],
-    *,
-    admin: socket.socket,
-    hold: HoldAround,
-    listeners: dict[str, socket.socket],
-    work: MachineWork | None,
-    view: PrivateView | None,
-    manager: ServiceManager,
-    rosout_ports: range,
-    pairing: Pairing | None,
-    waits: Callable[[], None],
-    raised: int,
+async def _supervise(
+    make: Callable[[], Supervisor], isolation: NoIsolation, hold: HoldAround, manager: ServiceManager
 ) -> None:
-    manager.starting("starts its processes")
-
-    def say_ready(said: ControlReady) -> None:
-        ready(said, settings)
-        if not isolation.awaits_graph():
-            isolation.lapse = hold.served()
-        manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
-
-    def say_standing_by() -> None:
-        waits()
-        if pairing is not None:
-            manager.ready(pairing.ready)
-
-    async def supervise() -> None:
-        supervisor = Supervisor(
-            roles,
-            Facts(
-                state=state.path,
-                config=state.config,
-                rosmaster_port=settings.rosmaster_port,
-                rosout_ports=rosout_ports if settings.isolation != "none" else None,
-                control_reads=tuple(filter(None, (settings.policy, settings.monitors, settings.hosts))),
-                sections=settings.sections,
-                ca_passphrase_file=settings.ipsec.ca_passphrase_file,
-                view=view,
-                raised=raised,
-            ),
-            admin=admin,
-            ready=say_ready,
-            relays=settings.relays,
-            isolation=isolation,
-            listeners=listeners,
-            memories=memories(settings.sections, settings.relays),
-            memory=MonitorMemory(state.path, settings.relays),
-            heartbeat=HeartbeatWiring(settings.relays, settings.relay.heartbeat_line),
-            stands_by=say_standing_by,
-            gate=pairing.gate if pairing is not None else ServiceGate,
-            work=work,
-            gives_back=hold.put_before_restart,
-        )
-        async with manager.watched():
-            keeping = asyncio.create_task(_keep(hold, supervisor, isolation))
-            try:
-                await supervisor.run()
-            finally:
-                keeping.cancel()
-                manager.stopping()
-
-    asyncio.run(supervise())
+    supervisor = make()
+    async with manager.watched():
+        keeping = asyncio.create_task(_keep(hold, supervisor, isolation))
+        try:
+            await supervisor.run()
+        finally:
+            keeping.cancel()
+            manager.stopping()
