@@ -1,4 +1,4 @@
-"""Connect registry, graph, revocation, liveness and reconcile loop as control connects them.
+"""The parts of RVMaster, which control itself connects.
 
 Models of everything else record their calls, and give the answers that a test sets.
 """
@@ -6,41 +6,41 @@ Models of everything else record their calls, and give the answers that a test s
 import asyncio
 import ipaddress
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from functools import partial
+from typing import Any, NamedTuple, Self, cast
+from unittest.mock import patch
 
 from appliance.audit.log.record import AuditRecord
 from appliance.channel import messages
-from appliance.configuration import settings
-from appliance.master.calls.parameter_calls import ParameterRights
-from appliance.master.calls.registration import Arrivals
+from appliance.configuration.settings import LivenessSection, Settings
+from appliance.control import control
+from appliance.control.assembly.active_role import ActiveRole
+from appliance.control.assembly.listener_limits import ListenerLimits
+from appliance.control.assembly.services import HeldCalls
+from appliance.control.control import INNER, RVMASTER, Control
+from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.master.endpoints.delivery import Delivery, NodeCall
-from appliance.master.endpoints.node_ports import AdvertisedAddresses
-from appliance.master.endpoints.relay_control import OwnAnswer, OwnCall, RelayControl
-from appliance.master.endpoints.traffic import RelayTraffic
-from appliance.master.graph.graph import Grants, RosGraph
+from appliance.master.endpoints.relay_control import OwnCall
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry, new_key
-from appliance.master.graph.revocation import Revocation
-from appliance.master.reconcile.liveness import Liveness, Watchlist
-from appliance.master.reconcile.reconciler import Reconciler
-from appliance.master.reconcile.sinks import Enforcement, ProxyEndpoints, Sinks, StoredGraph
-from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import Answer, MasterRegistrations, RosMaster, Wanted
-from appliance.policy.model import Address, Decision
+from appliance.master.reconcile.sinks import StoredGraph
+from appliance.master.rosmaster import Answer, RosMaster, Wanted
+from appliance.policy.model import Address, CallHold, Decision, Request
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.quotas.pool import QuotaClass
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import XmlRpcClient
-from appliance.specifications.allocation import Allocation
 from appliance.specifications.specification_files import CheckedSpecifications
 from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import Database
 from roswire.parameter_tree import standing_at
 from roswire.uris import NodeUri, parse_node_uri
-from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
+from roswire.xmlrpc import Value, build_call, parse_response
 from tests.support.core import FakeTrail
-from tests.support.master_api import MasterApi
+from tests.support.idle import idle
 from tests.support.memory_channel import HeldChannel
-from tests.support.memory_ports import face, memory_ports
-from tests.support.parameters import mirror, put
+from tests.support.memory_ports import face, listening, memory_ports
+from tests.support.parameters import mirror, put, registered
 from tests.support.scripted_nodes import ScriptedNodes
 
 HOST = ipaddress.ip_address("10.0.0.5")
@@ -298,138 +298,68 @@ class HiddenMaster(XmlRpcClient):
         return list(self.tables[kind].get(resource, {}))
 
 
-async def no_own_call(asked: OwnCall) -> OwnAnswer:
+def _held(request: Request) -> CallHold:
+    return CallHold(f"held: {request.resource}", waits=True)
+
+
+async def no_own_call(asked: OwnCall) -> Any:
     raise AssertionError(f"a relay asks {asked}")
 
 
-class ControlParts:
+class ControlParts(Control):
     """The connected parts. `reload(text)` puts another policy in force, and `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0, store: StateStore | None = None) -> None:
         self._not_ours = asyncio.all_tasks()  # the test's own
-        self.current = compile_policy(OPEN, file="policy")
         self.seen: list[Seen] = []
         self.full = False  # whether the relay reads nothing
+        self.shut_out = False  # whether the robot's firewalls may refuse connections
         note = self.seen.append
-        self.registry = Registry()
-        self.grants = Grants(self.registry.mark, set)
-        self.records, self.watchlist = Records(note), Watchlist()
+        self.settings = Settings(isolation="none", liveness=LivenessSection(silent=silent), relays=1)
+        self.lifeline = idle(ControlLifeline)
+        self.role = idle(ActiveRole, in_doubt=lambda: self.shut_out)
+        self.policy, self.registry, self.quota_class = CurrentPolicy(), Registry(), cast(Any, registered)
+        self.current = compile_policy(OPEN, file="policy")
+        self.trail = self.records = Records(note)
+        self.listener_limits = idle(ListenerLimits, server=self._face, time=ProcessorTime(lambda host: host))
+        self.sockets = {RVMASTER: listening("10.0.0.1", 11311), INNER: listening("127.0.0.1", _INNER_PORT)}
         self.hidden, self.nodes = HiddenMaster(note), ScriptedNodes(self.registry)
         self.deliveries = Deliveries(note)
         self.delivery: Delivery = self.deliveries
         self.specifications = NoSpecifications()
         self.go = asyncio.Event()  # arriving nodes wait for it
         self.go.set()
-        self.places = memory_ports(lambda: self.current)
-        self.faces = ProxyEndpoints(self.registry, self.places, _INNER_PORT, self._face)
-        self.surround()
-        self.addresses, self.parameters = AdvertisedAddresses((), None, "10.0.0.1"), mirror()
-        rights = self._connect_relay()
-        self._connect_master(store)
-        self._connect_liveness(silent)
-        self._connect_calls(rights)
-
-    def _connect_relay(self) -> ParameterRights:
-        rights = ParameterRights(lambda: self.current, self.records)
-        self.graph = RosGraph(self.registry, self.grants, self.records)
-        self.carried = RelayTraffic(self.records, self.registry, 1, self.watchlist.cut_off)
-        self.relay = RelayControl(
-            self.registry,
-            self.grants,
-            lambda port: port,
-            self.nodes,
-            self.carried,
-            allocation=Allocation(1),
-            policy=lambda: self.current,
-            monitors=lambda: self.specifications,
-            broken=lambda _node: None,
-            own_topics={},
-            own_call=no_own_call,
-        )
-        self.subscribers = Subscribers(
-            self.registry,
-            self.grants,
-            self.relay,
-            self.delivery,
-            lambda: self.parameters.tree,
-            may_read_value=rights.may_read_value,
-            may_know_value=rights.may_know_value,
-        )
-        self.revocation = Revocation(
-            self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
-        )
-        return rights
-
-    def _connect_master(self, store: StateStore | None) -> None:
-        self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
+        self.store = store or idle(StateStore, database=idle(Database))
+        doubles: dict[str, Any] = {
+            "Delivery": lambda *_, **__: self.delivery,
+            "NodeApiClient": lambda *_, **__: self.nodes,
+            "NodePorts": lambda *_, **__: memory_ports(self.policy),
+            "ParameterCharges": lambda *_: None,
+            "ParameterMirror": lambda *_, **__: mirror(),
+            "RosMaster": partial(RosMaster, hold=1.0),
+            **({"StoredGraph": lambda *_: idle(StoredGraph)} if store is None else {}),
+        }
+        with patch.multiple(control, **doubles):
+            self._make_graph()
+            self.surround()
+            self._make_endpoints()
         self.rosmaster.calls = self.hidden
-        self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
-        self.sinks = Sinks(
-            self.registry,
-            (
-                *([StoredGraph(self.grants, store)] if store is not None else []),
-                self.subscribers,
-                self.entries,
-                self.relay,
-                self.faces,
-            ),
-        )
-        self.enforcement = Enforcement(self.revocation, self.sinks.flush, self.relay, self.places)
+        self.relay.descriptor = lambda port: port  # those of `node` have no socket
+        self.calls.held.provide(HeldCalls(_held, no_own_call))
+        self._make_calls()
         self.start_relay()
-        self.reconciler = Reconciler(
-            self.rosmaster,
-            self.entries,
-            self.registry,
-            self.subscribers,
-            self.parameters,
-            self.records,
-            own_parameters=dict,
-        )
+        self.serve = self.pipeline.handler(self.table)
 
-    def _connect_liveness(self, silent: float) -> None:
-        self.shut_out = False  # whether the robot's firewalls may refuse connections
-        self.liveness = Liveness(
-            self.registry,
-            self.graph,
-            self.revocation,
-            self.subscribers,
-            self.watchlist,
-            nodes=self.nodes,
-            settings=settings.LivenessSection(silent=silent),
-            quota_class=lambda _host: QuotaClass.REGISTERED,
-            refusals=2,
-            shut_out=lambda: self.shut_out,
-            connects=self.carried.connects,
-        )
+    def _make_monitors(self) -> Any:
+        return self.specifications
 
-    def _connect_calls(self, rights: ParameterRights) -> None:
-        self._api = MasterApi(
-            policy=lambda: self.current,
-            registry=self.registry,
-            graph=self.graph,
-            subscribers=self.subscribers,
-            flush=self.sinks.flush,
-            rosmaster=self.rosmaster,
-            mirror=self.parameters,
-            trail=self.records,
-            rights=rights,
-            arrivals=Arrivals(
-                self.registry,
-                self.graph,
-                self.sinks.flush,
-                self.liveness,
-                self.places,
-                self.faces,
-                self.addresses,
-                serve=lambda node: self._api.handler(target=node),
-            ),
-            relay=self.relay,
-            addresses=self.addresses,
-            liveness=self.liveness,
-            nodes=self.nodes,
-            redecide_for=self.enforcement.redecide_for,
-        )
-        self.serve = self._api.handler()
+    @property
+    def current(self) -> Policy:
+        return self.policy()
+
+    @current.setter
+    def current(self, policy: Policy) -> None:
+        self.policy.set(policy)
 
     def surround(self) -> None: ...
 
@@ -467,7 +397,9 @@ class ControlParts:
     ) -> Value:
         """Make a call: of RVMaster, of the node `target`, or by the appliance's own node (`own`)."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
-        serve = self._api.handler(own=own, target=target) if own or target is not None else self.serve
+        serve = self.serve if target is None else self.serve_node(target)
+        if own:
+            serve = self.pipeline.handler(self.table, own=True)
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "4001") -> None:

@@ -5,26 +5,38 @@ import random
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from appliance.master.calls import pipeline
-from appliance.master.calls.parameter_calls import ParameterRights
+from appliance.master.calls.call_execution import Execution
+from appliance.master.calls.call_table import master_table
+from appliance.master.calls.gate import CallGate, HostLimits
+from appliance.master.calls.lookups import LookupCalls
+from appliance.master.calls.monitor_calls import MonitorCalls
+from appliance.master.calls.multicall import Multicall
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterRights
+from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.master.rosmaster import RosMaster
 from appliance.policy.model import Decision
+from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
+from appliance.rpc.fair_queue import LargeWrites, bulk_turns
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
-from roswire.xmlrpc import Value, build_call, parse_response
+from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
 from tests.support.control_parts import Records
 from tests.support.examples import examples
 from tests.support.idle import idle
 from tests.support.incarnations import incarnation
-from tests.support.master_api import MasterApi
-from tests.support.parameters import mirror, put
+from tests.support.parameters import mirror, put, registered
 
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
@@ -76,19 +88,47 @@ class Site:
         self.go.set()
         self.faults: set[str] = set()  # keys that the ROS master answers with a fault
         self.dies_at = ""  # the key whose request kills the ROS master
-        self.serve = MasterApi(
-            policy=lambda: self.policy,
-            registry=self.registry,
-            graph=idle(RosGraph),
-            subscribers=idle(Subscribers),
-            flush=lambda: None,
-            rosmaster=self,
-            mirror=self.parameters,
+        self.serve = self._pipeline().handler(self.table)
+
+    def _pipeline(self) -> Pipeline:
+        def policy() -> Policy:
+            return self.policy
+
+        registry, graph = self.registry, idle(RosGraph)
+        nothing: Any = None
+        rights = ParameterRights(policy, self.trail)
+        calls = ParameterCalls(
+            cast(RosMaster, self), self.parameters, idle(Subscribers).parameter_set, rights, OFFLOAD
+        )
+        self.table = master_table(
+            RegistrationCalls(registry, graph, nothing, nothing, calls, idle(Subscribers)),
+            LookupCalls(registry, graph, nothing, nothing, port=11311, stop=lambda _reason: None),
+            calls,
+            MonitorCalls(nothing, registry, nothing, real_port=11312, port=11311),
+        )
+        execution = Execution(
+            gate=CallGate(policy, registry, HostLimits()),
+            policy=policy,
             trail=self.trail,
-            rights=ParameterRights(lambda: self.policy, self.trail),
-            addresses=self,
+            registry=registry,
+            flush=lambda: None,
+            liveness=nothing,
+            parameters=calls,
+            redecide_for=nothing,
+            hold_call=nothing,
+            large=OFFLOAD,
+            large_writes=LargeWrites(OFFLOAD, registered),
+        )
+        return Pipeline(
+            execution,
+            Multicall(execution, calls, self.trail, offload=OFFLOAD),
+            addresses=cast(AdvertisedAddresses, self),
+            trail=self.trail,
+            limits=XmlRpcLimits(),
             offload=OFFLOAD,
-        ).handler()
+            bulk=bulk_turns(registered),
+            processor=ProcessorTime(lambda host: host),
+        )
 
     async def learn(self, _peer: Peer) -> None: ...
 
