@@ -570,6 +570,7 @@ def with_id(name: str, before: int, behind: int) -> bytes:
     return bytes(before) + len(name).to_bytes(4, "little") + name.encode() + bytes(behind)
 
 
+@pytest.mark.complete
 def test_a_goal_without_a_result_is_cancelled() -> None:
     guard = Guarded("answer", limit="2s")
     goals = [
@@ -583,6 +584,7 @@ def test_a_goal_without_a_result_is_cancelled() -> None:
     assert [(at, fields("actionlib_msgs/GoalID", data).id) for at, data in guard.got] == [(2001, "a")]
 
 
+@pytest.mark.complete
 def test_a_topic_is_withheld_until_all_switches_are_off_and_speak() -> None:
     types, hosts = {"command": "std_msgs/String", "by": "std_msgs/Bool"}, ("10.0.0.7/32", "10.8.0.0/16")
     guard = Guarded("withhold", types, hosts="10.0.0.7 10.8.0.0/16", silent=1)
