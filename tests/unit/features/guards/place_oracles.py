@@ -82,6 +82,7 @@ def fence(seed: int, events: int = 50) -> None:  # noqa: PLR0912  one branch for
         got = trace.command(legs)
         assert got is not None, trace.said("a fence drops nothing")
         if norm(legs[:3]) == 0:
+            assert got == legs, trace.said("a turn on the spot must pass")
             continue
         speed = norm(got[:3])
         assert speed <= norm(legs[:3]) + 1e-9, trace.said("the fence makes it faster")

@@ -1,19 +1,15 @@
 import math
 from itertools import product
-from typing import Any
 
 import pytest
 
-from lab.closed_loop.messages import ACKERMANN, steering
 from rosmop.tests.acting import message
-from rosmop.tests.examples import examples, sample
+from rosmop.tests.examples import sample
 from tests.unit.features.guards.guarding import (
     Guarded,
     legs_of,
-    seeded,
     twist,
 )
-from tests.unit.features.guards.limit_oracles import struct_of
 
 STILL = twist()
 
@@ -55,29 +51,6 @@ def test_a_node_that_returns_before_the_tick_has_been_silent(gap: int) -> None:
     assert any(data == STILL for _at, data in guard.got) == (gap > 300)
 
 
-def test_a_limit_of_zero_stops() -> None:
-    guard = Guarded("speed", vMax=0, wMax=0)
-    assert guard.drive(twist(*[9.0] * 6), 100) == (0,) * 6
-
-
-@pytest.mark.parametrize("most", [0.3, 0.7, 1.1, 2.0])
-def test_a_steered_base_at_its_limit_does_not_count_as_braking(most: float) -> None:
-    """The limit is another number in the 32 bits of the message."""
-    guard = Guarded("speed", {"command": ACKERMANN}, vMax=most)
-    for count in range(1, 60):
-        speed = most if count % 2 else 9.0
-        passed = guard.tell("command", steering(0, speed, 50, 500), count * 100).buffer
-        _angle, _rate, got, acceleration, jerk = struct_of(bytes(passed))
-        assert got <= most * (1 + 1e-6) and acceleration <= 1 and jerk <= 10
-    guard.tell("command", steering(0, most / 2, 50, 500), 6000)
-    assert struct_of(guard.got[-1][1])[3:] == (50, 500), "a base that brakes has all of its deceleration"
-
-
-def test_a_burst_passes_whole() -> None:
-    guard = Guarded("rate", interval=0.1, burst=3)
-    assert [guard.drive(twist(0.5), 1) != () for _command in range(4)] == [True, True, True, False]
-
-
 # Fence
 
 
@@ -89,68 +62,6 @@ def odometry(x: float, y: float, yaw: float) -> bytes:
         pose__pose__orientation__z=math.sin(yaw / 2),
         pose__pose__orientation__w=math.cos(yaw / 2),
     )
-
-
-def depth(x: float, y: float) -> float:
-    """Return the distance in metres to the edge of the 4 m square, negative outside."""
-    if max(abs(x), abs(y)) <= 2:
-        return 2 - max(abs(x), abs(y))
-    return -math.hypot(max(abs(x) - 2, 0), max(abs(y) - 2, 0))
-
-
-class Base:
-    """A base that accelerates at once, and brakes with `braking` after `reaction` seconds. Steps are 10 ms.
-
-    From 1.42 m/s it stops within the way of 0.8 s, the `ahead` of the fences here.
-    """
-
-    def __init__(self, guard: Guarded, x: float, y: float, turned: float, reaction: float = 0.2) -> None:
-        self.guard, self.x, self.y, self.turned = guard, x, y, turned
-        self.braking, self.reaction = 1.2, round(reaction * 1000)
-        self.vx = self.vy = 0.0
-        self.read = 0
-        self.wanted: list[tuple[int, tuple[float, ...]]] = [(-1000, (0.0,) * 6)]
-
-    def step(self, at: int) -> None:
-        self.guard.advance(at)
-        got = self.guard.got
-        self.wanted += [(when, legs_of(data)) for when, data in got[self.read :]]
-        self.read = len(got)
-        now = self.wanted[-1][1]
-        heard = [legs for when, legs in self.wanted if when <= at - self.reaction][-1]
-        x, y = now[:2] if math.hypot(*now[:2]) > math.hypot(self.vx, self.vy) else heard[:2]
-        part = min(1.0, self.braking * 0.01 / (math.hypot(x - self.vx, y - self.vy) or 1.0))
-        if math.hypot(x, y) > math.hypot(self.vx, self.vy):
-            part = 1.0
-        self.vx += (x - self.vx) * part
-        self.vy += (y - self.vy) * part
-        self.x += (self.vx * math.cos(self.turned) - self.vy * math.sin(self.turned)) / 100
-        self.y += (self.vx * math.sin(self.turned) + self.vy * math.cos(self.turned)) / 100
-        self.turned += now[5] / 100
-
-
-def simulated(guard: Guarded, random: Any, begin: tuple[float, float, float], every: int = 50) -> list[float]:
-    base, depths, at = Base(guard, *begin), list[float](), 0
-    last = random.choice((8, 1000))
-    for step in range(800):
-        at += 10
-        if at % every == 0 and step < last * 50:
-            guard.tell("by", odometry(base.x, base.y, base.turned), at)
-        if step % 7 == 0 and random.random() < 0.3:
-            legs = [random.choice((0.0, 0.3, 1.0, -1.0, math.nan, math.inf)) for _ in range(2)]
-            guard.drive(twist(legs[0], legs[1], 0, 0, 0, random.choice((0.0, 0.0, 0.2, 1.0, -2.0))), at)
-        base.step(at)
-        depths.append(depth(base.x, base.y))
-    return depths
-
-
-def test_a_base_stays_inside_a_fence() -> None:
-    random = seeded(4)
-    for _trace in range(examples(120)):
-        guard = Guarded("fence", ahead=0.8, silent=random.choice((0.5, 1)), margin=random.choice((0, 0.2)))
-        begin = random.uniform(-1.7, 1.7), random.uniform(-1.7, 1.7), random.uniform(-4, 4)
-        depths = simulated(guard, random, begin, random.choice((20, 50, 200, 500, 1000)))
-        assert min(depths) >= 0 and not any(map(math.isnan, depths))
 
 
 @pytest.mark.parametrize("thick", [0.01, 0.1])
@@ -187,32 +98,6 @@ def test_a_motion_from_the_margin_leads_across_no_part_outside(inward: float) ->
         assert v * (0.15 + 0.5) * math.cos(turned) < before, (here, before, turned)
 
 
-def test_a_base_outside_a_fence_only_comes_back() -> None:
-    random = seeded(5)
-    for _trace in range(examples(120)):
-        side = random.choice(((3.0, 0.5), (-3.0, 1.0), (0.0, 3.0), (1.5, -3.0), (3.0, 3.0)))
-        depths = simulated(Guarded("fence", ahead=0.8), random, (*side, random.uniform(-4, 4)))
-        assert min(depths) > depth(*side) - 0.1
-        guard = Guarded("fence")
-        inward = math.atan2(-side[1], -side[0])
-        guard.tell("by", odometry(*side, inward), 1)
-        assert guard.drive(twist(0.4), 2)[0] == 0.3 and guard.drive(twist(-0.4), 3)[0] == 0
-        assert guard.drive(twist(0, 0, 0, 0, 0, 1.0), 4)[5] == 1.0
-
-
-def test_without_a_position_only_turns_pass() -> None:
-    guard = Guarded("fence")
-    assert guard.drive(twist(0.1), 1)[0] == 0
-    guard.tell("by", odometry(0, 0, 0), 2)
-    assert guard.drive(twist(0.1), 502)[0] == 0.1
-    guard.got.clear()
-    guard.advance(600)
-    assert [legs_of(data) for _at, data in guard.got] == [(0,) * 6]
-    assert guard.drive(twist(0.1), 601)[0] == 0
-    guard.tell("by", odometry(math.nan, 0, 0), 601)
-    assert guard.drive(twist(0.1), 602)[0] == 0 and guard.drive(twist(0, 0, 0, 0, 0, 1.0), 603)[5] == 1
-
-
 @pytest.mark.parametrize(
     "polygon", ["-2,-2 -2,2 2,2 2,-2", "-2,-2 0,-2 2,-2 2,2 -2,2", "-2,-2 -2,-2 2,-2 2,2 -2,2"]
 )
@@ -221,18 +106,6 @@ def test_a_fence_may_be_clockwise_and_have_corners_on_an_edge(polygon: str) -> N
     for at, (x, passes) in enumerate(((0, True), (1.8, False), (-1.9, True), (3, False)), 1):
         guard.tell("by", odometry(x, 0, 0), at)
         assert (guard.drive(twist(0.3), at)[0] == 0.3) == passes
-
-
-@pytest.mark.parametrize("orientation", [(0, 0, 0, 0), (0, 0, 0.01, 0), (0, 0, 0, math.inf)])
-def test_without_a_direction_only_turns_pass(orientation: tuple[float, ...]) -> None:
-    """A driver that knows no direction sends zeros, which do not mean the direction of the x axis."""
-    parts = {f"pose__pose__orientation__{axis}": part for axis, part in zip("xyzw", orientation, strict=True)}
-    pose = message("nav_msgs/Odometry", **parts)
-    guard, world = Guarded("fence"), Guarded("fence", worldFrame=True)
-    for one in (guard, world):
-        one.tell("by", pose, 1)
-    assert guard.drive(twist(0.1), 2)[0] == 0 and guard.drive(twist(0, 0, 0, 0, 0, 1.0), 3)[5] == 1
-    assert world.drive(twist(0.1), 2)[0] == 0.1
 
 
 def test_a_fence_by_satellites_is_in_metres_from_its_origin() -> None:
@@ -278,38 +151,6 @@ def seen(guard: Guarded, ranges: list[float], at: int = 1, times: int = 20) -> i
     return at - 100
 
 
-def needed(
-    speed: float, look: float, *, person: float = 1.6, margin: float = 0.3, reaction: float = 0.2
-) -> float:
-    delay = reaction + 0.02 + look
-    return speed * delay + speed**2 / 2 + person * (delay + speed) + margin
-
-
-@pytest.mark.parametrize("direction", [0.0, 1.0, math.pi / 2, math.pi, -2.5])
-@pytest.mark.parametrize("metres", [0.3, 1.0, 2.0, 3.5])
-def test_a_velocity_is_scaled_by_the_distance_in_its_direction(direction: float, metres: float) -> None:
-    guard = Guarded("separation")
-    at = seen(guard, wall(metres, direction))
-    guard.drive(
-        twist(0.01 * math.cos(direction), 0.01 * math.sin(direction)), at
-    )  # the next scan has its direction
-    guard.drive(STILL_LEGS, at)
-    at = seen(guard, wall(metres, direction), at + 100, 40)
-    for speed in (0.05, 0.5, 9.0):
-        at += 1
-        legs = guard.drive(twist(speed * math.cos(direction), speed * math.sin(direction)), at)
-        got = math.hypot(*legs[:2])
-        assert got <= speed + 1e-12
-        assert got == 0 or math.atan2(legs[1], legs[0]) == pytest.approx(direction)
-        assert got < 1e-9 or needed(got, 0.1) <= metres
-        assert got == pytest.approx(speed) or needed(got, 0.15) >= metres * 0.97
-        away = guard.drive(twist(-speed * math.cos(direction), -speed * math.sin(direction)), at)
-        straight = abs(math.remainder(direction, math.pi / 2)) < 0.1
-        assert not straight or math.hypot(*away[:2]) == pytest.approx(min(speed, 2.73), rel=0.01)
-        guard.drive(STILL_LEGS, at)
-        at = seen(guard, wall(metres, direction), at + 100, 40)
-
-
 STILL_LEGS = twist()
 
 
@@ -344,15 +185,6 @@ def test_the_old_way_counts_until_a_fast_base_has_turned() -> None:
         at = seen(guard, post, at + 100, 1)
         got = guard.drive(legs, at)
     assert math.hypot(*got[:2]) == pytest.approx(1.5)
-
-
-def test_a_corridor_of_one_and_a_half_metres_can_be_driven() -> None:
-    guard = Guarded("separation")
-    corridor = [min(a, b) for a, b in zip(wall(0.75, math.pi / 2), wall(0.75, -math.pi / 2), strict=True)]
-    at = seen(guard, corridor)
-    assert guard.drive(twist(0.8), at)[0] == 0.8
-    assert guard.drive(twist(0.5, 0, 0, 0, 0, 0.2), at)[0] == 0.5
-    assert guard.drive(twist(0.0, 0.5), at)[1] < 0.1
 
 
 @pytest.mark.parametrize("blank", [math.nan, 0.0, -math.inf, 0.05, 11.0, -1.0])
@@ -411,63 +243,6 @@ def test_a_sector_is_ahead_whatever_the_first_angle_is(start: float) -> None:
         guard.drive(twist(), 4)
         guard.tell("by", scan(behind, start), 4000)
         assert guard.drive(twist(front), 4001)[0] == front
-
-
-def test_a_silent_scanner_stops() -> None:
-    guard = Guarded("separation")
-    at = seen(guard, [math.inf] * 72)
-    assert guard.drive(twist(0.1), at + 400)[0] == 0.1
-    guard.advance(at + 521)
-    assert legs_of(guard.got[-1][1])[0] == 0
-
-
-def room(x: float, y: float, turned: float, things: list[tuple[float, float]]) -> list[float]:
-    """Return what 90 rays see in a room of 6 by 6 m with round things of 0.3 m."""
-    found = []
-    for place in range(90):
-        angle = turned - math.pi + place * math.pi / 45
-        dx, dy = math.cos(angle), math.sin(angle)
-        hits = [
-            (side - at) / d for at, d in ((x, dx), (y, dy)) for side in (-3, 3) if d and (side - at) / d > 0
-        ]
-        for tx, ty in things:
-            along = (tx - x) * dx + (ty - y) * dy
-            across2 = (tx - x) ** 2 + (ty - y) ** 2 - along**2
-            if along > 0 and across2 < 0.09:
-                hits.append(along - math.sqrt(0.09 - across2))
-        found.append(min(hits))
-    return found
-
-
-def test_a_base_meets_nothing_in_its_way() -> None:
-    """The base, which is round with a radius of 0.25 m, drives blindly at 2 m/s; scans are late, and end."""
-    random, (seconds_long, met) = seeded(13), (8, 0)
-    for _world in range(examples(60)):
-        guard = Guarded("separation", reaction=0.25, person=0)
-        base = Base(guard, 0, 0, random.uniform(-3, 3))
-        things = [(random.uniform(-2.5, 2.5), random.uniform(-2.5, 2.5)) for _ in range(3)]
-        things = [one for one in things if math.hypot(*one) > 1.0]
-        every, ends = random.choice((50, 100, 200)), random.choice((2000, 8000))
-        legs = (0.0,) * 3
-        for at in range(10, seconds_long * 1000, 10):
-            if at % every == 0 and at < ends:
-                guard.tell("by", scan(room(base.x, base.y, base.turned, things), step=math.pi / 45), at)
-            if at % 500 == 10:
-                legs = (
-                    random.choice((2.0, 1.0, -1.0)),
-                    random.choice((0.0, 0.0, 1.0)),
-                    random.choice((0.0, 0.2, 1.0, -1.5)),
-                )
-            if at % 50 == 0:
-                guard.drive(twist(legs[0], legs[1], 0, 0, 0, legs[2]), at)
-            base.step(at)
-            space = min(
-                3 - abs(base.x),
-                3 - abs(base.y),
-                *(math.hypot(base.x - x, base.y - y) - 0.3 for x, y in things),
-            )
-            met += space < 0.25 and math.hypot(base.vx, base.vy) > 0.02
-    assert met == 0
 
 
 @pytest.mark.parametrize("legs", [(0.0, 0.0, -1.5), (0.01, 0.0, -1.5), (1e-300, 0.0, 1.5), (0.5, 0.2, 1.0)])

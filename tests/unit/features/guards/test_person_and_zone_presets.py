@@ -43,62 +43,6 @@ def stops(guard: Guarded) -> list[int]:
     return [at for at, data in guard.got if legs_of(data) == ZEROS]
 
 
-def held(at: int = 0) -> Guarded:
-    guard = Guarded("enable")
-    guard.tell("by", switch(False), at, "/b")
-    guard.tell("by", switch(True), at + 10, "/b")
-    assert not moves(guard, STILL, at + 20)
-    assert moves(guard, SLOW, at + 30)
-    return guard
-
-
-def test_nothing_moves_without_an_enabling_device() -> None:
-    guard = Guarded("enable")
-    assert not moves(guard, SLOW, 10)
-    guard.tell("by", switch(True), 20, "/b")  # tied down since the start
-    assert not moves(guard, STILL, 30)
-    assert not moves(guard, SLOW, 40)
-
-
-def test_a_device_that_is_let_go_stops_the_base_at_once() -> None:
-    guard = held()
-    guard.tell("by", switch(False), 40, "/b")
-    assert stops(guard)[-1] == 40
-    assert not moves(guard, SLOW, 50)
-
-
-def test_a_device_that_falls_silent_stops_the_base_and_has_to_be_pressed_again() -> None:
-    guard = held()
-    guard.advance(340)
-    assert 310 <= stops(guard)[-1] <= 340
-    guard.tell("by", switch(True), 350, "/b")
-    assert not moves(guard, STILL, 360)
-    assert not moves(guard, SLOW, 370)
-
-
-def test_pressing_again_starts_nothing() -> None:
-    guard = held()
-    guard.tell("by", switch(False), 40, "/b")
-    guard.tell("by", switch(True), 50, "/b")
-    assert not moves(guard, SLOW, 60)
-    assert not moves(guard, SLOW, 65, "/c")
-    moves(guard, STILL, 70)
-    assert moves(guard, SLOW, 80)
-    assert not moves(guard, SLOW, 85, "/c"), "another node has not commanded zero"
-
-
-def test_all_devices_have_to_be_held() -> None:
-    guard = held()
-    guard.tell("by", switch(False), 40, "/c")
-    assert not moves(guard, SLOW, 50)
-    guard.tell("by", switch(True), 60, "/c")
-    guard.tell("by", switch(True), 60, "/b")
-    moves(guard, STILL, 70)
-    assert moves(guard, SLOW, 80)
-    guard.tell("by", switch(True), 300, "/b")
-    assert not moves(guard, SLOW, 380), "/c is silent, and /b does not hide it"
-
-
 @pytest.mark.parametrize(("pressed", "other"), [((0, 1), (1, 0)), ((0, 1), ()), ((0, 1), (0, 2))])
 def test_a_button_of_a_joystick_is_a_device(pressed: tuple[int, ...], other: tuple[int, ...]) -> None:
     guard = Guarded("enable", {"by": "sensor_msgs/Joy"}, button=1)
@@ -110,18 +54,6 @@ def test_a_button_of_a_joystick_is_a_device(pressed: tuple[int, ...], other: tup
     assert not moves(guard, SLOW, 50)
 
 
-def test_the_mode_is_manual_until_all_say_automatic() -> None:
-    guard = Guarded("mode")
-    assert math.hypot(*guard.drive(twist(0.9, 1.2), 10)[:2]) == pytest.approx(0.25)
-    guard.tell("by", switch(False), 20, "/b")
-    assert guard.drive(FAST, 30)[0] == 0.25, "a change of the mode starts no faster motion"
-    assert guard.drive(SLOW, 40)[0] == 0.2
-    assert guard.drive(FAST, 50)[0] == 1
-    guard.tell("by", switch(True), 60, "/c")
-    assert stops(guard) == [60]
-    assert guard.drive(FAST, 70)[0] == 0.25
-
-
 def test_a_silent_mode_is_manual_and_stops_a_fast_base() -> None:
     guard = Guarded("mode")
     guard.tell("by", switch(False), 0, "/b")
@@ -130,78 +62,6 @@ def test_a_silent_mode_is_manual_and_stops_a_fast_base() -> None:
     guard.advance(1100)
     assert len(stops(guard)) == 1
     assert 1000 < stops(guard)[0] <= 1030
-
-
-@pytest.mark.parametrize("fast", [math.nan, math.inf, -math.inf, 1e300])
-def test_a_command_without_a_size_passes_in_no_mode(fast: float) -> None:
-    guard = Guarded("mode")
-    assert max(map(abs, guard.drive(twist(fast), 0))) <= 0.25
-    guard.tell("by", switch(False), 10, "/b")
-    guard.drive(SLOW, 20)
-    got = guard.drive(twist(fast), 30)
-    assert got[0] == 0, "its square is infinite"
-
-
-def stood(preset: str, **values: Any) -> Guarded:
-    guard = Guarded(preset, **values)
-    guard.tell("by", odometry(), 0, "/b")
-    assert not moves(guard, STILL, 10)
-    assert moves(guard, SLOW, 20)
-    return guard
-
-
-@pytest.mark.parametrize(
-    "data", [odometry(0.7), odometry(0.1, 1.3), odometry(math.nan), odometry(0.0, math.inf)]
-)
-def test_a_base_that_is_measured_too_fast_stops_until_it_stands_and_zero_is_commanded(data: bytes) -> None:
-    guard = stood("overspeed")
-    guard.tell("by", data, 30, "/b")
-    assert stops(guard)[-1] == 30
-    assert not moves(guard, SLOW, 40)
-    assert not moves(guard, STILL, 50)
-    assert not moves(guard, SLOW, 60), "it has not stood"
-    guard.tell("by", odometry(), 70, "/b")
-    assert not moves(guard, SLOW, 80), "no zero was commanded since"
-    moves(guard, STILL, 90)
-    assert moves(guard, SLOW, 100)
-
-
-@pytest.mark.parametrize("preset", ["overspeed", "standstill"])
-def test_a_motion_needs_a_measurement_of_one_source(preset: str) -> None:
-    guard = Guarded(preset)
-    assert not moves(guard, STILL, 0)
-    assert not moves(guard, SLOW, 10)
-    guard = stood(preset)
-    guard.tell("by", odometry(), 100, "/c")
-    guard.advance(130)
-    moves(guard, STILL, 140)
-    guard.advance(1100)
-    guard.tell("by", odometry(), 1110, "/b")
-    moves(guard, STILL, 1120)
-    assert moves(guard, SLOW, 1130)
-
-
-def test_a_silent_measurement_of_the_velocity_stops_a_moving_base() -> None:
-    guard = stood("overspeed")
-    guard.advance(600)
-    assert 500 < stops(guard)[-1] <= 540
-    assert not moves(guard, SLOW, 610)
-
-
-def test_a_base_that_moves_without_a_command_is_stopped_again_and_again() -> None:
-    guard = stood("standstill")
-    moves(guard, STILL, 100)
-    for at in range(150, 1100, 50):
-        guard.tell("by", odometry(0.3), at, "/b")
-    assert stops(guard)[-1] == 100, "it may settle for a second"
-    for at in range(1100, 1600, 50):
-        guard.tell("by", odometry(0.3), at, "/b")
-    assert len([at for at in stops(guard) if at > 1100]) >= 4
-    assert not moves(guard, SLOW, 1610)
-    guard.tell("by", odometry(0.0), 1620, "/b")
-    assert not moves(guard, SLOW, 1630)
-    moves(guard, STILL, 1640)
-    assert moves(guard, SLOW, 1650)
 
 
 def test_a_parked_base_without_odometry_gets_no_stream_of_stops() -> None:
@@ -227,53 +87,6 @@ def clear_zone(**values: Any) -> Guarded:
     assert not moves(guard, STILL, 610)
     assert moves(guard, FAST, 620)
     return guard
-
-
-def test_a_thing_in_the_zone_stops_the_base_until_it_is_clear_and_zero_is_commanded() -> None:
-    guard = clear_zone()
-    guard.tell("by", scan(NEAR), 700, "/b")
-    assert stopped_soon(guard, 700)
-    assert not moves(guard, FAST, 730)
-    for at in range(800, 1500, 100):
-        guard.tell("by", scan(FREE), at, "/b")
-    assert not moves(guard, FAST, 1410)
-    moves(guard, STILL, 1420)
-    assert moves(guard, FAST, 1430)
-
-
-@pytest.mark.parametrize(
-    "ranges",
-    [
-        [math.nan] * 31,
-        [0.0] * 31,
-        [0.05] * 31,
-        [-1.0] * 31,
-        [*FREE[:10], *[math.nan] * 5, *FREE[15:]],
-        [],
-        FREE[:16],
-    ],
-)
-def test_a_scan_that_does_not_see_the_zone_stops(ranges: list[float]) -> None:
-    guard = clear_zone()
-    guard.tell("by", scan(ranges), 700, "/b")
-    assert stopped_soon(guard, 700)
-    assert not moves(guard, FAST, 730)
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        scan(FREE, far=0.0),
-        scan(FREE, far=0.5),
-        scan([math.inf] * len(FREE), far=math.inf),
-        scan(FREE, start=math.nan),
-        scan(FREE, step=0.0),
-    ],
-)
-def test_a_scan_with_a_wrong_head_stops(data: bytes) -> None:
-    guard = clear_zone()
-    guard.tell("by", data, 700, "/b")
-    assert stopped_soon(guard, 700)
 
 
 def test_a_few_rays_and_things_beside_the_zone_do_not_count() -> None:
@@ -348,13 +161,6 @@ def test_a_zone_that_no_ray_covers_is_not_free(x: int, side: int) -> None:
         guard.tell("by", scan([math.inf] * rays, start=start, step=step), 100, "/b")
         moves(guard, STILL, 100)
         assert moves(guard, FAST, 100) == passes, (start, step, rays)
-
-
-def test_a_silent_scanner_stops() -> None:
-    guard = clear_zone()
-    guard.advance(1000)
-    assert 900 < stops(guard)[-1] <= 940
-    assert not moves(guard, FAST, 1010)
 
 
 def test_a_slow_zone_limits_by_norm_and_frees_without_a_zero() -> None:

@@ -122,9 +122,9 @@ REASONS: dict[tuple[str, str, str, str], str] = {
         "*",
         "another host",
     ): "a node's name is unique at a master, so another host is another node: same cell",
-    ("deadman", "command", "*", "another node"): "`test_a_deadman_stops_for_each_node_that_falls_silent`",
+    ("deadman", "command", "*", "another node"): "`watchdog` of `oracles.py`",
     ("*", "command", "*", "another node"): "a command counts for what it says, whichever node sends it",
-    ("deadman", "command", "*", "old"): "`test_a_deadman_stops_within_its_time_and_a_tick`",
+    ("deadman", "command", "*", "old"): "`watchdog` of `oracles.py`",
     ("*", "command", "*", "old"): "the age of commands is the law of `deadman`",
     ("*", "command", "*", "absent"): "without a command a base does not move",
     (
@@ -184,7 +184,7 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ("estop", "reset", "*", "old"): "a reset is an act, not a state; what it frees waits for a zero",
     ("estop", "reset", "*", "unreadable"): "what is no message resets nothing: the guard holds",
     ("estop", "reset", "*", "another node"): "`two_hands` of `oracles.py`",
-    ("estop", "reset", "*", "after a reset"): "`test_after_a_reset_each_node_stands_before_it_moves`",
+    ("estop", "reset", "*", "after a reset"): "`stop_button` of `oracles.py`",
 }
 """Why a cell is not judged here. `*` stands for any; the first key that fits counts."""
 

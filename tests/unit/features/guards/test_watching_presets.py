@@ -8,7 +8,6 @@ import pytest
 from appliance.features.guards.presets import PRESETS, Guard, loaded_values, text_of
 from appliance.features.guards.robot_graph import GOAL
 from rosmop.tests.acting import STORE, fields, message
-from rosmop.types.roles import ANY_TYPE
 from tests.unit.features.guards.guarding import BEGIN, NODES, Guarded, legs_of, twist
 
 GO = twist(0.5)
@@ -38,60 +37,6 @@ def reset(guard: Guarded, at: int, node: str = "/a") -> None:
     for on, when in ((False, at), (True, at + 100)):
         guard.tell("stop", button(False), when)
         guard.tell("reset", button(on), when, node)
-
-
-def test_after_a_reset_each_node_stands_before_it_moves() -> None:
-    """A running autopilot does not move a base that a person has only just freed."""
-    guard = Guarded("estop")
-    go(guard, 1)
-    guard.tell("stop", button(True), 50)
-    reset(guard, 100)
-    assert not runs(guard, 210)
-    guard.drive(twist(), 220, "/b")
-    assert not runs(guard, 230) and guard.drive(GO, 235, "/b")[0] == 0.5
-    guard.drive(twist(), 240)
-    assert runs(guard, 250)
-
-
-def test_no_button_hides_another() -> None:
-    """A pressed button whose node is gone stays pressed, and a silent one is not hidden by one that sends."""
-    guard = Guarded("estop", silent=0)
-    go(guard, 1)
-    guard.tell("stop", button(True), 50, "/b")
-    reset(guard, 100)
-    guard.drive(twist(), 300)
-    assert not runs(guard, 310)
-    guard.monitors.give({"guard": {"forget": 1, "silent": 0}})
-    guard.advance(500)
-    assert not runs(guard, 510)
-    reset(guard, 600)
-    guard.drive(twist(), 800)
-    assert runs(guard, 810)
-    guard = Guarded("estop")
-    for node in ("/a", "/b"):
-        guard.tell("stop", button(False), 1, node)
-    guard.drive(twist(), 2)
-    for at in range(100, 1000, 100):
-        guard.tell("stop", button(False), at)
-    assert runs(guard, 1001) and not runs(guard, 1101)
-
-
-@pytest.mark.parametrize(("preset", "topic"), [("estop", "stop"), ("enable", "by"), ("mode", "by")])
-def test_a_base_waits_for_the_given_number_of_publishers(preset: str, topic: str) -> None:
-    """A button whose node never ran is not hidden by another one. More than the given number may speak."""
-
-    def fast(guard: Guarded, at: int) -> bool:
-        guard.drive(twist(), at)
-        return guard.drive(twist(0.5), at + 1)[0] == 0.5
-
-    for publishers, heard in ((0, 1), (1, 1), (2, 1), (2, 2), (2, 3), (8, 7), (8, 8)):
-        guard = Guarded(preset, publishers=publishers)
-        for node in NODES[1 : heard + 1]:
-            guard.tell(topic, button(False), 1, node)
-            guard.tell(topic, button(preset == "enable"), 2, node)
-        assert fast(guard, 3) == (heard >= publishers), (publishers, heard)
-    guard.monitors.give({"guard": {"publishers": 0}})
-    assert fast(guard, 10)
 
 
 def test_a_ninth_button_stops() -> None:
@@ -140,30 +85,6 @@ def test_a_scan_that_is_too_large_to_judge_stops_the_base(preset: str) -> None:
 
 
 ODOM = "nav_msgs/Odometry"
-BLIND = {
-    "fence": tuple(
-        message(ODOM, pose__pose__position__x=x, pose__pose__orientation__w=1.0) for x in (0.0, math.nan)
-    ),
-    "arm": tuple(message("sensor_msgs/BatteryState", percentage=charge) for charge in (1.0, math.nan)),
-    "sensor": tuple(message("sensor_msgs/LaserScan", **FREE | {"ranges": [r] * 72}) for r in (9.0, math.nan)),
-    "separation": tuple(
-        message("sensor_msgs/LaserScan", **FREE | {"ranges": [r] * 72}) for r in (9.0, math.nan)
-    ),
-}
-
-
-@pytest.mark.parametrize("preset", BLIND)
-@pytest.mark.parametrize("fault", ["NaN", "cut short"])
-def test_a_faulty_sensor_never_releases_the_base(preset: str, fault: str) -> None:
-    guard, (good, bad) = Guarded(preset), BLIND[preset]
-    guard.tell("by", good, 1)
-    assert runs(guard, 2)
-    if fault == "NaN":
-        guard.tell("by", bad, 3)
-        assert not runs(guard, 4)
-    else:
-        guard.tell("by", good[:20], 3, faults=True)
-        assert not runs(guard, 15_000)
 
 
 def test_many_values_are_compared_by_their_sum() -> None:
@@ -171,38 +92,6 @@ def test_many_values_are_compared_by_their_sum() -> None:
     for at, (first, moves) in enumerate(((1.0, True), (1.0, True), (1.0, False), (2.0, True)), 1):
         guard.tell("by", scan([first] + [3.0] * 5000), at)
         assert runs(guard, at) == moves
-
-
-def test_a_moving_base_is_stopped_when_its_sensor_falls_silent() -> None:
-    guard = Guarded("sensor")
-    guard.tell("by", scan([1.0]), 5)
-    assert runs(guard, 10)
-    guard.advance(1000)
-    assert stops(guard) == [520]
-
-
-SENSED: dict[str, dict[str, Any]] = {
-    "sensor_msgs/Range": {"range": 1.0, "max_range": 2.0},
-    "sensor_msgs/NavSatFix": {"latitude": 40.0},
-    "sensor_msgs/Imu": {"angular_velocity__x": 0.1},
-    "nav_msgs/Odometry": {"pose__pose__position__x": 1.0},
-    "sensor_msgs/JointState": {"position": [0.5], "name": ["elbow"]},
-}
-
-
-@pytest.mark.parametrize("kind", SENSED)
-def test_other_sensors_are_watched_likewise(kind: str) -> None:
-    assert set(SENSED) == {*PRESETS["sensor"].topics["by"]} - {
-        "sensor_msgs/LaserScan",
-        ANY_TYPE,
-    }
-    guard = Guarded("sensor", {"by": kind}, frozen=2)
-    for at, moves in ((1, True), (2, True), (3, False)):
-        guard.tell("by", message(kind, **SENSED[kind]), at)
-        assert runs(guard, at) == moves
-    name, value = next(iter(SENSED[kind].items()))
-    guard.tell("by", message(kind, **{name: [math.nan] if isinstance(value, list) else math.nan}), 4)
-    assert not runs(guard, 4) or kind in {"sensor_msgs/NavSatFix", "sensor_msgs/Imu", "nav_msgs/Odometry"}
 
 
 @pytest.mark.parametrize("kind", ["sensor_msgs/Joy", "std_msgs/Header"])
@@ -214,15 +103,6 @@ def test_only_the_silence_of_any_other_type_is_judged(kind: str) -> None:
         assert runs(guard, at + 1)
     guard.advance(3000)
     assert stops(guard) == [1420]
-
-
-def test_a_second_source_that_sends_nan_stops_at_once() -> None:
-    guard = Guarded("agree", samples=1)
-    for given in ("other", "by"):
-        guard.tell(given, message("nav_msgs/Odometry"), 1)
-    assert runs(guard, 2)
-    guard.tell("other", message("nav_msgs/Odometry", twist__twist__linear__x=math.nan), 3)
-    assert not runs(guard, 4)
 
 
 def trajectory(names: list[str], *points: tuple[Any, ...], stamp: float = 0) -> bytes:
