@@ -236,7 +236,6 @@ def _state(rows: Sequence[GuardRow]) -> Iterator[str]:
         yield f"- {row.name}: {_proof(row)}"
         if row.times is not None:
             yield f"- {row.name}: {times_in_words(row.times)}"
-    yield ""
 
 
 def _proof(row: GuardRow) -> str:
