@@ -43,7 +43,7 @@ _GATHER_SECONDS = 0.2  # time to gather changes that are not awaited: they are s
 
 _RETRY_SECONDS = 0.5
 _CATCH_UP_SECONDS = 1.0
-_SETTLE_SECONDS = 2 * _RETRY_SECONDS  # a disk that fails for longer is told, with the reason
+_SETTLE_SECONDS = 2 * _RETRY_SECONDS  # a disk that fails for longer is reported, with the reason
 _ROOM = 4 << 20  # bytes; SQLite's write-ahead log grows to this size, and few texts are longer
 
 _LEFT = "changes in the file state.ahead are applied at the next start; other changes are lost"
