@@ -18,7 +18,7 @@ from tests.support.determinism import WATCH, may_depend_on_chance
 from tests.support.long_files import LONG, is_left_out, waits
 from tests.support.virtual_clock import VirtualClock
 
-_MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
+_MAX_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
 _TIME = pytest.StashKey[contextlib.ExitStack]()
 _WALL = 1_893_456_000.0  # seconds since the epoch: the same date for each run, after that of the files
 _REAL_CLOCK = clock.source()
@@ -75,8 +75,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark tests with real nodes as nightly, limit the cases marked `real`, and begin with those of tests/long.txt."""
     real = [item for item in items if item.get_closest_marker("real")]
-    if len(real) > _MOST_REAL:
-        raise pytest.UsageError(f"{len(real)} cases are marked `real`; the gate runs at most {_MOST_REAL}")
+    if len(real) > _MAX_REAL:
+        raise pytest.UsageError(f"{len(real)} cases are marked `real`; the gate runs at most {_MAX_REAL}")
     for item in items:
         if item.nodeid.startswith(_NIGHTLY) and not item.get_closest_marker("real"):
             item.add_marker(pytest.mark.nightly)

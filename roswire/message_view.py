@@ -14,11 +14,11 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import PRIMITIVES
 
-MOST_ELEMENTS = 16
-MOST_CHARACTERS = 200
+MAX_ELEMENTS = 16
+MAX_CHARACTERS = 200
 MOST_BYTES = 32
-MOST_FIELDS = 200
-_MOST_STEPS = 2_000
+MAX_FIELDS = 200
+_MAX_STEPS = 2_000
 CUT = "…"
 
 _LENGTH = struct.Struct("<I")
@@ -34,8 +34,8 @@ class _Reader:
         self._definitions = definitions
         self._data = data
         self.position = 0
-        self._left = MOST_FIELDS  # the number of values that may still be shown
-        self._steps = _MOST_STEPS  # the number of values that may still be read, whether shown or not
+        self._left = MAX_FIELDS  # the number of values that may still be shown
+        self._steps = _MAX_STEPS  # the number of values that may still be read, whether shown or not
         self._sizes: dict[str, int | None] = {}
 
     def message(self, name: str) -> dict[str, object]:
@@ -48,7 +48,7 @@ class _Reader:
                 )
             except (_EndError, _CutError) as end:
                 fields[field.name] = end.value if isinstance(end, _CutError) else CUT
-                fields |= {after.name: CUT for after in islice(following, MOST_FIELDS)}
+                fields |= {after.name: CUT for after in islice(following, MAX_FIELDS)}
                 if unnamed := sum(1 for _ in following):
                     fields[CUT] = _more(unnamed)
                 raise _CutError(fields) from None
@@ -59,16 +59,16 @@ class _Reader:
         if kind in {"uint8", "char"}:
             return read_bytes(self._take(count))
         values: list[object] = []
-        for _ in range(min(count, MOST_ELEMENTS)):
+        for _ in range(min(count, MAX_ELEMENTS)):
             try:
                 values.append(self._value(kind))
             except (_EndError, _CutError) as end:
                 raise _CutError([*values, end.value if isinstance(end, _CutError) else CUT]) from None
-        if count <= MOST_ELEMENTS:
+        if count <= MAX_ELEMENTS:
             return values
-        values.append(_more(count - MOST_ELEMENTS))
+        values.append(_more(count - MAX_ELEMENTS))
         try:
-            self._pass_over(kind, count - MOST_ELEMENTS)
+            self._pass_over(kind, count - MAX_ELEMENTS)
         except (_EndError, _CutError):
             raise _CutError(values) from None
         return values
@@ -78,7 +78,7 @@ class _Reader:
         if size is not None:
             self._take(size * count)
             return
-        left, self._left = self._left, _MOST_STEPS
+        left, self._left = self._left, _MAX_STEPS
         for _ in range(count):
             self._value(kind)
         self._left = left
@@ -106,8 +106,8 @@ class _Reader:
             raise _EndError
         if kind == "string":
             raw = self._take(_LENGTH.unpack(self._take(4))[0])
-            text = raw[:MOST_CHARACTERS].decode("utf-8", "backslashreplace")
-            return text + _more(len(raw) - MOST_CHARACTERS)
+            text = raw[:MAX_CHARACTERS].decode("utf-8", "backslashreplace")
+            return text + _more(len(raw) - MAX_CHARACTERS)
         if kind not in PRIMITIVES:
             return self.message(kind)
         code, size = PRIMITIVES[kind]

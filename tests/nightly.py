@@ -46,7 +46,7 @@ _END_SECONDS = 60.0  # for an interrupted run to write its report
 _REMEDY = """Run `make lane NAME=…`, then `.venv/bin/python -m tests.nightly --record`, and commit tests/green.json.
 To release nevertheless, give the reason: make release DESPITE="…"
 """
-_MOST_AGAIN = 10  # more failures are not by chance
+_MAX_AGAIN = 10  # more failures are not by chance
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def run_tests(
     failed = [test for test, outcome, _seconds in outcomes if outcome == "failed"]
     alone = [*pytest, *(["-n", "1"] if lane.workers else []), f"--timeout={lane.timeout}"]
     flaky: list[str] = []
-    for number, test in enumerate(failed if len(failed) <= _MOST_AGAIN else (), 1):
+    for number, test in enumerate(failed if len(failed) <= _MAX_AGAIN else (), 1):
         again, left = log.with_suffix(f".again-{number}.log"), deadline - time.monotonic()
         if left > 0 and run_limited([*alone, test], again, left, environment) == 0:
             flaky.append(test)

@@ -9,7 +9,7 @@ from appliance.supervisor.roles import ROLES
 
 AUDIT_LOG = "control/audit.db"
 LARGEST = 1 << 30  # bytes of a file that is not a database
-MOST_FILES = 10_000  # a usual backup has about twenty
+MAX_FILES = 10_000  # a usual backup has about twenty
 _LONGEST_NAME = 100  # bytes that fit into a tar header without an extension
 _DATABASES = "control/"  # the only part with databases
 # Files that exist only while the appliance runs, or that the next start makes again.

@@ -28,7 +28,7 @@ from appliance.backup.contents import (
     AUDIT_LOG,
     KEPT_PARTS,
     LARGEST,
-    MOST_FILES,
+    MAX_FILES,
     BackupError,
     is_database,
     is_passing,
@@ -165,10 +165,10 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
         if (state / part).exists()  # a role that never ran here has no part
         for name in _names(state, part)
     ]
-    if len(names) > MOST_FILES:
+    if len(names) > MAX_FILES:
         parts = Counter(name.partition("/")[0] for name in names)
         raise BackupError(
-            f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: find out their"
+            f"{state} has more than {MAX_FILES} files, most of them in {parts.most_common(1)[0][0]}: find out their"
             " origin, and remove them"
         )
     for name in names:

@@ -15,7 +15,7 @@ from appliance.base import clock
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,253}")
 _FILE = Path("/etc/hosts")
 _LONGEST_FILE = 1 << 20  # bytes
-_MOST_ASKED = 500
+_MAX_ASKED = 500
 _AT_ONCE = 16
 _NAME_SECONDS, _WHOLE_SECONDS = 2.0, 3.0
 
@@ -57,7 +57,7 @@ def addresses_of(names: Iterable[str], start: Starter = subprocess.Popen) -> dic
     others = [name for name in wanted if not found[name]]
     others.sort(key=lambda name: name.lower().partition(".")[0] != own)
     with ThreadPoolExecutor(_AT_ONCE, "resolver") as threads:
-        found.update(zip(others, threads.map(ask, others[:_MOST_ASKED]), strict=False))
+        found.update(zip(others, threads.map(ask, others[:_MAX_ASKED]), strict=False))
     return found
 
 

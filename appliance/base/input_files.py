@@ -17,7 +17,7 @@ from appliance.base.owner_access import open_named
 LONGEST = 64 << 20
 """The largest file that is read, in bytes."""
 
-_MOST_HOSTS = 1 << 20  # bytes of /etc/hosts
+_MAX_HOSTS = 1 << 20  # bytes of /etc/hosts
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {
     stat.S_IFIFO: "a named pipe",
@@ -116,7 +116,7 @@ def names_of_hosts(file: Path = Path("/etc/hosts")) -> dict[str, str]:
     """Return the first name of each address in a file like /etc/hosts; nothing if it cannot be read."""
     try:
         with file.open("rb") as lines:
-            text = lines.read(_MOST_HOSTS).decode("ascii", "replace")
+            text = lines.read(_MAX_HOSTS).decode("ascii", "replace")
     except OSError:
         return {}
     names: dict[str, str] = {}

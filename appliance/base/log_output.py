@@ -1,7 +1,7 @@
 """Write the log of a process: a log that cannot be written neither fails nor delays the work that it reports.
 
 1. `write` and `flush` raise nothing and wait for no reader, once `keep_from_blocking` has the descriptor.
-2. Lines that cannot be written wait in memory, in their order. Beyond `MOST_WAITING` bytes, lines are only counted.
+2. Lines that cannot be written wait in memory, in their order. Beyond `MAX_WAITING` bytes, lines are only counted.
 3. The waiting lines are tried again with each new line and twice a second. After them, a line has the number of lost
    lines.
 """
@@ -19,7 +19,7 @@ from typing import TextIO, cast
 from appliance.base.clock import utc_now
 from appliance.base.engine_thread import Drive, EngineThread
 
-MOST_WAITING = 256 << 10
+MAX_WAITING = 256 << 10
 _AGAIN_SECONDS = 0.5
 
 
@@ -58,7 +58,7 @@ class LogOutput(io.TextIOBase):
     def write(self, text: str) -> int:
         data = text.encode(self.encoding, self.errors)
         with self._lock:
-            if self._waiting and (self._lost or self._size + len(data) > MOST_WAITING):
+            if self._waiting and (self._lost or self._size + len(data) > MAX_WAITING):
                 self._lost_since = self._lost_since or utc_now().isoformat(timespec="seconds")
                 self._lost += data.count(b"\n")
             elif data:

@@ -63,9 +63,9 @@ A = TypeVar("A")
 _NAME = "/rosrv_standing"
 _LINK = "veth-rosrv"
 _LOOK_SECONDS = 0.2
-_MOST_OF_LOOK = 20  # messages
+_MAX_OF_LOOK = 20  # messages
 _COUNTED_SECONDS = 1.5  # after which the appliance's numbers have what passed
-_MOST = 16  # topics of each kind
+_MAX = 16  # topics of each kind
 WITHIN = 120.0
 """The seconds that a verb waits unless the operator says otherwise."""
 WhenStanding = Annotated[
@@ -230,9 +230,9 @@ Hearing = Callable[[StandingJudge, Mapping[str, str]], AbstractAsyncContextManag
 
 async def _wait(graph: MasterGraph, topics: MotionTopics, longest: float, hearing: Hearing) -> str:
     for found in (topics.commands, topics.odometry):
-        if len(found) > _MOST:
+        if len(found) > _MAX:
             raise NotStandingError(
-                f"{counted(len(found), 'topic')} of a base are more than can be heard ({_MOST})"
+                f"{counted(len(found), 'topic')} of a base are more than can be heard ({_MAX})"
             )
     judge, until = StandingJudge(topics), clock.now() + longest
     types = {topic: graph.types[topic] for topic in sorted({*topics.commands, *topics.odometry})}
@@ -296,7 +296,7 @@ def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
         def follow(topic: str, kind: str) -> None:
             try:
                 while not over.is_set():
-                    order = {"verb": "topic look", "topic": topic, "messages": _MOST_OF_LOOK, "seconds": 1.0}
+                    order = {"verb": "topic look", "topic": topic, "messages": _MAX_OF_LOOK, "seconds": 1.0}
                     seen = msgspec.convert(
                         _asked(appliance, msgspec.convert(order, look)), _Seen, from_attributes=True
                     )

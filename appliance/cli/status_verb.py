@@ -37,8 +37,8 @@ from rosmop.tool.tables import table_of
 
 _NOTICES = ("hosts-blocked", "not-carried")
 _PORT_STATES = ("closed", "open", "unknown")
-_MOST_NAMED = 8
-_MOST_TROUBLES = 5
+_MAX_NAMED = 8
+_MAX_TROUBLES = 5
 _COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
@@ -141,9 +141,9 @@ class StatusScreen:
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         grave = sum(alarm.severity == "alarm" for alarm in self.troubles)  # they come first
-        for place, trouble in enumerate(shortened([alarm.text for alarm in self.troubles], _MOST_TROUBLES)):
+        for place, trouble in enumerate(shortened([alarm.text for alarm in self.troubles], _MAX_TROUBLES)):
             yield Text(f"! {in_local_zone(trouble)}", style=_RED if place < grave else _YELLOW)
-        for line in map(in_local_zone, shortened(self.attention, _MOST_TROUBLES)):
+        for line in map(in_local_zone, shortened(self.attention, _MAX_TROUBLES)):
             yield Text(f"attention: {line}", style=_YELLOW)
         yield _grid(self.body, self.host_in_words)
         yield processes_table(self.body.processes, options.max_width)
@@ -236,7 +236,7 @@ def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
     if not known:
         return "no other machine runs nodes"
     words = [
-        f"{state}: {', '.join(map(host_in_words, names[:_MOST_NAMED]))}"
+        f"{state}: {', '.join(map(host_in_words, names[:_MAX_NAMED]))}"
         for state, names in by_state.items()
         if names
     ]

@@ -26,7 +26,7 @@ Watch = Annotated[
 ]
 _SECONDS = 2.0
 _INTERRUPTED, _AWAY = 130, 2
-_MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment
+_MAX_DENIED = 3  # answers in a row: a restarted api knows no token for a moment
 
 
 def seconds_between(every: str | None, verb: str, *, watch: bool) -> float:
@@ -63,7 +63,7 @@ class _Looks:
             view = self._look()
         except AccessDeniedError as error:
             self._denied += 1
-            if not 0 < self._denied < _MOST_DENIED:
+            if not 0 < self._denied < _MAX_DENIED:
                 raise
             view = self._away(error)
         except NotRunningError as error:

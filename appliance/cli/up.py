@@ -26,7 +26,7 @@ from appliance.supervisor.run import run_appliance
 from appliance.supervisor.service_gate import Pairing
 from appliance.supervisor.supervisor import ControlReady
 
-_MOST_WARNINGS = 10
+_MAX_WARNINGS = 10
 
 _ISOLATIONS = {
     "netns": "in a network namespace of this host",
@@ -212,10 +212,10 @@ def _event(said: ControlReady, settings: Settings) -> str:
 
 def _hints(said: ControlReady, settings: Settings) -> list[str]:
     """Return the lines after the announcement; the first token is then in a file. Raises `StartError`."""
-    lines = [*said.warnings[:_MOST_WARNINGS]]
-    if len(said.warnings) > _MOST_WARNINGS:
+    lines = [*said.warnings[:_MAX_WARNINGS]]
+    if len(said.warnings) > _MAX_WARNINGS:
         lines.append(
-            f"and {len(said.warnings) - _MOST_WARNINGS} more warnings: rosrv policy check {settings.policy}"
+            f"and {len(said.warnings) - _MAX_WARNINGS} more warnings: rosrv policy check {settings.policy}"
         )
     if settings.isolation == "netns":
         port = settings.listen_address[1]

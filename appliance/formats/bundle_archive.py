@@ -23,7 +23,7 @@ import msgspec
 LONGEST = 6 << 20
 """The most bytes of an archive."""
 
-_MOST_FILES = 2500
+_MAX_FILES = 2500
 _LONGEST_HOSTS = 1 << 20
 POLICY, CASES, HOSTS = "policy.ini", "policy.ini.tests.yaml", "hosts.yaml"
 _WORD = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
@@ -74,8 +74,8 @@ def unpack(archive: bytes) -> BundleContents:
             for member in tar:
                 if not member.isreg() or not is_bundle_file(member.name) or member.name in files:
                     raise BundleArchiveError(f"{member.name[:200]!r} is not a file of a bundle")
-                if len(files) >= _MOST_FILES:
-                    raise BundleArchiveError(f"the archive has more than {_MOST_FILES} files")
+                if len(files) >= _MAX_FILES:
+                    raise BundleArchiveError(f"the archive has more than {_MAX_FILES} files")
                 opened = tar.extractfile(member)
                 files[member.name] = opened.read() if opened is not None else b""
     except (tarfile.TarError, OSError, ValueError, OverflowError) as error:
@@ -91,8 +91,8 @@ def contents_of(files: Mapping[str, bytes]) -> BundleContents:
     unknown = [name for name in files if not is_bundle_file(name)]
     if unknown:
         raise BundleArchiveError(f"{unknown[0][:200]!r} is not a file of a bundle: remove it")
-    if len(files) > _MOST_FILES:
-        raise BundleArchiveError(f"a bundle has at most {_MOST_FILES} files, not {len(files)}")
+    if len(files) > _MAX_FILES:
+        raise BundleArchiveError(f"a bundle has at most {_MAX_FILES} files, not {len(files)}")
     for name in (POLICY, HOSTS):
         if name not in files:
             raise BundleArchiveError(f"{name} is missing: a bundle states the policy and the hosts")

@@ -56,7 +56,7 @@ COLUMNS = (
     "sequence", "id", "time", "version", "event", "severity", "decision", "host", "caller_id", "category", "resource",
     "rule", "rule_key", "rule_file", "rule_line", "revision", "reason", "duration_us",
 )  # fmt: skip
-MOST = 16 << 20  # bytes of a member that is read in one piece, or of a line
+MAX = 16 << 20  # bytes of a member that is read in one piece, or of a line
 # The members of a ZIP file may unpack to UNPACKED bytes plus PER_BYTE for each byte of the file. Records have hashes,
 # which cannot be compressed: even with the longest texts they shrink to no less than 1/256.
 UNPACKED, PER_BYTE = 1 << 30, 256
@@ -122,7 +122,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
     file = archive.fp
     assert file is not None  # noqa: S101  it is open
     file.seek(archive.start_dir)
-    directory, at, begin, members = file.read(MOST), 0, 0, archive.infolist()
+    directory, at, begin, members = file.read(MAX), 0, 0, archive.infolist()
     free: set[object] = {FREE}  # the fields that each packer chooses
     for info in members:
         name, where, packed, size = info.filename, info.header_offset, info.compress_size, info.file_size
@@ -238,7 +238,7 @@ class Verifier:
 
     def read_key(self, key: Path | None) -> str:
         with regular(key) if key else self.open("audit.pub") as file:
-            self.key.write_bytes(file.read(MOST))
+            self.key.write_bytes(file.read(MAX))
         order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(self.key)]
         return subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
 
@@ -255,9 +255,9 @@ class Verifier:
 
     def read(self, name: str) -> bytes:
         with self.open(name) as file:
-            data = bytes(file.read(MOST + 1))
-        if len(data) > MOST:
-            raise ValueError(f"{name} has more than {MOST} bytes")
+            data = bytes(file.read(MAX + 1))
+        if len(data) > MAX:
+            raise ValueError(f"{name} has more than {MAX} bytes")
         return data
 
     def look_beside(self) -> None:
@@ -357,7 +357,7 @@ class Verifier:
     def records(self, name: str, runs: Runs | None = None) -> Iterator[dict[str, Any]]:
         walk = Excerpt()
         with self.open(name) as lines:
-            for line in iter(lambda: lines.readline(MOST), b""):
+            for line in iter(lambda: lines.readline(MAX), b""):
                 record = json.loads(line)
                 chain, sequence = record["chain"], record["sequence"]
                 written = json.dumps(record, separators=(",", ":")).encode() + b"\n"
@@ -426,7 +426,7 @@ class Verifier:
 
 def kept_copies(path: Path) -> dict[int, dict[str, Any]]:
     with regular(path) as file:
-        lines = iter(lambda: file.readline(MOST), b"")
+        lines = iter(lambda: file.readline(MAX), b"")
         return {copy["number"]: copy for copy in map(json.loads, lines)}
 
 

@@ -19,7 +19,7 @@ _TAMPERING = (
 )
 _SPAN = ("what", "state", "from (UTC)", "to (UTC)", "by", "ended by", "reason")
 _ROW = ("time (UTC)", "event", "what", "before", "after", "who", "reason", "record")
-_MOST_NAMED = 6
+_MAX_NAMED = 6
 _LONGEST_UNBROKEN = 24
 InWords = Callable[[str], str]
 
@@ -305,8 +305,8 @@ def _states(spans: Sequence[LastingState], in_words: InWords) -> str:
 def _few(words: Iterable[str]) -> str:
     """Return different words, and the number of those that are too many for an answer."""
     found = list(dict.fromkeys(words))
-    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
-    return f"{', '.join(found[:_MOST_NAMED])}{more}"
+    more = f" and {len(found) - _MAX_NAMED} more" if len(found) > _MAX_NAMED else ""
+    return f"{', '.join(found[:_MAX_NAMED])}{more}"
 
 
 def _gap_words(gaps: Sequence[Gap]) -> str:

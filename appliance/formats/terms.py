@@ -14,8 +14,8 @@ import msgspec
 _WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 _PATH = re.compile(r"([a-z0-9][a-z0-9-]{0,62}+)/([a-z0-9][a-z0-9-]{0,62}+)/([1-9][0-9]{0,8}+)\.tar")
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
-_MOST_RINGS = 20
-_MOST_ROBOTS = 1000
+_MAX_RINGS = 20
+_MAX_ROBOTS = 1000
 _LONGEST_WAIT = 30 * 86_400
 CUSTOM = "rosrv"
 
@@ -93,8 +93,8 @@ def _position(robot: str, path: BundlePath) -> int:
 def checked_terms(terms: Terms) -> Terms:
     """Return the terms. Raises `TermsError` if the rings are not in order or do not cover all robots."""
     rings = terms.rings
-    if not 1 <= len(rings) <= _MOST_RINGS:
-        raise TermsError(f"a bundle has 1 to {_MOST_RINGS} rings, not {len(rings)}")
+    if not 1 <= len(rings) <= _MAX_RINGS:
+        raise TermsError(f"a bundle has 1 to {_MAX_RINGS} rings, not {len(rings)}")
     if len({ring.name for ring in rings}) < len(rings):
         raise TermsError("two rings have the same name: give each --ring its own")
     for ring in rings:
@@ -102,9 +102,9 @@ def checked_terms(terms: Terms) -> Terms:
             raise TermsError(f"{ring.name[:80]!r} is not a valid name of a ring, for example canary")
         if not (ring.robots or ring.percent):
             raise TermsError(f"ring {ring.name} has no robots: give names or a percentage")
-        if len(ring.robots) > _MOST_ROBOTS or not all(map(ROBOT_NAME.fullmatch, ring.robots)):
+        if len(ring.robots) > _MAX_ROBOTS or not all(map(ROBOT_NAME.fullmatch, ring.robots)):
             raise TermsError(
-                f"ring {ring.name}: give at most {_MOST_ROBOTS} robots, each by its valid name, or a percentage"
+                f"ring {ring.name}: give at most {_MAX_ROBOTS} robots, each by its valid name, or a percentage"
             )
         if not (0 <= ring.percent <= 100 and 0 <= ring.after <= _LONGEST_WAIT):
             raise TermsError(f"ring {ring.name}: a percentage is 0 to 100, a wait at most 30 days")

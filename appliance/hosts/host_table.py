@@ -29,8 +29,8 @@ from appliance.store.state_file import StateStore
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _REVISION = "hosts.revision"
-MOST_HOSTS = 4096
-MOST_MACHINES = 1024
+MAX_HOSTS = 4096
+MAX_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
@@ -141,9 +141,9 @@ class HostTable:
             raise HostRefusedError(
                 f"{name} differs from {twin} only in letter case, which IKE ignores: choose another name"
             )
-        if name not in self.rows and len(self.rows) >= MOST_HOSTS:
+        if name not in self.rows and len(self.rows) >= MAX_HOSTS:
             raise HostRefusedError(
-                f"the table is full: it has {MOST_HOSTS} hosts, including revoked ones, whose names can be enrolled"
+                f"the table is full: it has {MAX_HOSTS} hosts, including revoked ones, whose names can be enrolled"
                 " again"
             )
 
@@ -229,8 +229,8 @@ class HostTable:
 
     def keep_ports(self, row: PortsRow) -> None:
         """Keep the check of a machine's ports. Raises `HostRefusedError` if there are too many machines."""
-        if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
-            raise HostRefusedError(f"the limit of {MOST_MACHINES} machines with known ports is reached")
+        if row.name not in self.ports and len(self.ports) >= MAX_MACHINES:
+            raise HostRefusedError(f"the limit of {MAX_MACHINES} machines with known ports is reached")
         self.ports[row.name] = row
         self._kept.save_ports(row)
         self.changed()

@@ -25,8 +25,8 @@ DECLARED_HOSTS = "declared hosts"
 """The setting of the store that keeps the file's last valid text."""
 
 _LARGEST = 1 << 20
-_MOST_GROUPS = 32
-_MOST_MISTAKES = 5
+_MAX_GROUPS = 32
+_MAX_MISTAKES = 5
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
@@ -131,8 +131,8 @@ def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:
         reason = "nested too deeply, or refers to itself" if isinstance(error, RecursionError) else str(error)
         raise DeclaredHostsError(f"{path}: {not_yaml(reason)}") from error
     if reading.mistakes:
-        more = len(reading.mistakes) - _MOST_MISTAKES
-        told = [f"{path}:{mistake}" for mistake in reading.mistakes[:_MOST_MISTAKES]]
+        more = len(reading.mistakes) - _MAX_MISTAKES
+        told = [f"{path}:{mistake}" for mistake in reading.mistakes[:_MAX_MISTAKES]]
         raise DeclaredHostsError("; ".join([*told, *([f"and {more} more"] if more > 0 else [])]))
     return reading.found
 
@@ -156,11 +156,11 @@ def _address(value: object) -> str | None:
 
 def _groups(value: object) -> tuple[str, ...]:
     groups = value if isinstance(value, list) else [None]
-    if len(groups) <= _MOST_GROUPS and all(
+    if len(groups) <= _MAX_GROUPS and all(
         isinstance(group, str) and _GROUP.fullmatch(group) for group in groups
     ):
         return tuple(dict.fromkeys(groups))
-    raise ValueError(f"groups are a list of at most {_MOST_GROUPS} names: `groups: [operators]`")
+    raise ValueError(f"groups are a list of at most {_MAX_GROUPS} names: `groups: [operators]`")
 
 
 def _tunnel(value: object) -> bool:

@@ -6,7 +6,7 @@
    the answer). An unknown log may begin with any number.
 3. The signer must have approved the removal that a checkpoint contains (`<log>.removed`). The first checkpoint
    with this field in a log from an older version is trusted.
-4. At most `MOST_LOGS` logs are remembered that no operator set aside, so control cannot fill the signer's disk.
+4. At most `MAX_LOGS` logs are remembered that no operator set aside, so control cannot fill the signer's disk.
 5. Every answer names the other logs that were signed: a log that took the place of another one cannot hide it.
 """
 
@@ -20,7 +20,7 @@ from appliance.base.atomic_files import write_whole
 from appliance.signing.log_proof import Checkpoint, parse_checkpoint
 from appliance.signing.signed_logs import OtherLog, others, remembered_logs, sync_index
 
-MOST_LOGS = 64
+MAX_LOGS = 64
 _HASH = 32
 _NUMBER = 8
 
@@ -135,9 +135,9 @@ class CheckpointMemory:
 
     def _room_for_another(self) -> None:
         kept = [one for one in remembered_logs(self._directory) if not one.is_set_aside]
-        if len(kept) >= MOST_LOGS:
+        if len(kept) >= MAX_LOGS:
             raise CheckpointRefusedError(
-                f"{MOST_LOGS} logs were signed before; set old ones aside: rosrv audit acknowledge"
+                f"{MAX_LOGS} logs were signed before; set old ones aside: rosrv audit acknowledge"
             )
 
     def _path(self, log: str, what: str) -> Path:

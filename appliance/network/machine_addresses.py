@@ -6,14 +6,14 @@ from pathlib import Path
 
 _NET = Path("/proc/thread-self/net")
 _GLOBAL_SCOPE = "00"
-_MOST = 64  # a machine of containers has one for each of its bridges
+_MAX = 64  # a machine of containers has one for each of its bridges
 
 
 def machine_addresses(net: Path = _NET) -> tuple[str, ...]:
     """Return the addresses, sorted, without loopback and IPv6 link-local ones; only the first 64 of a family."""
     found4 = sorted(set(_ipv4(_text(net / "fib_trie"))), key=int)
     found6 = sorted(set(_ipv6(_text(net / "if_inet6"))), key=int)
-    return tuple(sorted(map(str, (*found4[:_MOST], *found6[:_MOST]))))
+    return tuple(sorted(map(str, (*found4[:_MAX], *found6[:_MAX]))))
 
 
 def _text(path: Path) -> str:

@@ -14,7 +14,7 @@ from appliance.policy.policy_findings import quoted
 from appliance.policy.sections import PARAMETERS
 from roswire.names import is_global_name
 
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 VERBS = {"use-node" if category is Category.NODE else category.value: category for category in Category}
 
 
@@ -61,7 +61,7 @@ def find_host(text: str, policy: Policy) -> Address:
     """Return the address that a text names; for `robot`, the first one. Raises `BadWordError`, even for several."""
     found = find_hosts(text, policy)
     if len(found) > 1 and text != ROBOT:
-        some = ", ".join(map(str, found[:_MOST_NAMED]))
+        some = ", ".join(map(str, found[:_MAX_NAMED]))
         raise BadWordError(f"{quoted(text)} is not one host: give the address, such as {some}")
     return found[0]
 

@@ -28,7 +28,7 @@ Relays report once a second which publications move, so a holder that publishes 
 """
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}", re.ASCII)
 _SECONDS = re.compile(r"([0-9]{1,5}(?:\.[0-9]{1,3})?)s", re.ASCII)
-_MOST = 100
+_MAX = 100
 DEFAULT_FREE = 0.3
 SHORTEST_FREE, LONGEST_FREE = 0.1, 60.0
 """The bounds of `free`, the time in seconds from a ranked driver's zero until lower ranks may move."""
@@ -37,7 +37,7 @@ _MILLISECONDS = re.compile(r"([0-9]{1,5})ms", re.ASCII)
 _NODE = re.compile(r"([^/]++)(/[A-Za-z].*+)")
 """`HOST/NODE`. No name of a node begins with a digit, so no network has this form."""
 _HIGHER = ">"
-_MOST_RANKS = 16
+_MAX_RANKS = 16
 
 
 class Claim(StrEnum):
@@ -141,8 +141,8 @@ def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings:
         text = f"{quoted(word.text)} is not the name of a group: letters, digits and _ . - after a letter"
         findings.error(word, text)
         return
-    if len(found) >= _MOST:
-        findings.error(word, f"more than {_MOST} groups")
+    if len(found) >= _MAX:
+        findings.error(word, f"more than {_MAX} groups")
         return
     names: set[str] = set()
     taken = {name: group.name for group in found.values() for name in group.names}
@@ -195,8 +195,8 @@ def _read_rank(entry: Entry, groups: HostGroups, findings: Findings) -> tuple[tu
     if len(ranks) < 2 or not all(ranks):
         text = f"name at least two ranks with {_HIGHER} between them, the highest first"
         findings.error(entry.key, f"{text}: rank {entry.key.text.split()[1]} = host:ocu > host:autonomy")
-    if len(ranks) > _MOST_RANKS:
-        findings.error(entry.key, f"more than {_MOST_RANKS} ranks")
+    if len(ranks) > _MAX_RANKS:
+        findings.error(entry.key, f"more than {_MAX_RANKS} ranks")
     return tuple(map(tuple, ranks))
 
 

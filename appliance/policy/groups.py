@@ -17,7 +17,7 @@ ROBOT = "robot"
 _GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*+", re.ASCII)
 _HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,252}", re.ASCII)
 _SHOWN_LIMIT = 80
-_MOST_TIMES = 1000
+_MAX_TIMES = 1000
 
 
 @dataclass(slots=True)
@@ -112,10 +112,8 @@ class HostGroups:
         if time is None or member is None:
             return None
         if text not in self._kept:
-            if len(self.times) == _MOST_TIMES:
-                self._findings.error(
-                    unit[1], f"more than {_MOST_TIMES} hosts with a time: put them in groups"
-                )
+            if len(self.times) == _MAX_TIMES:
+                self._findings.error(unit[1], f"more than {_MAX_TIMES} hosts with a time: put them in groups")
             self._kept[text] = atom = self._table.group()
             self._table.put([member], atom)
             self.times[atom] = time

@@ -21,7 +21,7 @@ from appliance.policy.sections import GROUPS
 HostInWords = Callable[[str], str]
 """Returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
 
-_MOST_NAMED = 20
+_MAX_NAMED = 20
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
 
 
@@ -69,7 +69,7 @@ class HostNames:
         if text.startswith(HOST):
             return f"no host {quoted(name)} is enrolled{meant(name, self.enrolled)}"
         known = [*self.groups, *self.enrolled]
-        guess = meant(text, known) or f"; the names are {', '.join(known[:_MOST_NAMED])}"
+        guess = meant(text, known) or f"; the names are {', '.join(known[:_MAX_NAMED])}"
         return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
 
     def labels(self) -> list[tuple[Network, str]]:

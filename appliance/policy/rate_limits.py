@@ -53,7 +53,7 @@ _BYTES = {"B/s": 1.0, "kB/s": 1e3, "MB/s": 1e6, "GB/s": 1e9}
 _UNITS = {"Hz": 1.0, **_BYTES}
 _FOLDED = {unit.casefold(): unit for unit in _UNITS}
 _NUMBER = re.compile(r"([0-9]++(?:\.[0-9]++)?)([A-Za-z/]*+)", re.ASCII)
-_LEAST, _MOST = 1e-3, 1e12
+_LEAST, _MAX = 1e-3, 1e12
 _LINES = 1000
 
 
@@ -201,7 +201,7 @@ def _fault(number: float, known: str | None, unit: str, found: dict[str, float])
             f"{number:g} {unit}".strip()
             + f" has no unit of a limit{guess or ': Hz, B/s, kB/s, MB/s or GB/s'}"
         )
-    if not _LEAST <= number * _UNITS[known] <= _MOST:
+    if not _LEAST <= number * _UNITS[known] <= _MAX:
         return f"{number:g} {known} cannot be enforced; to forbid sending, leave the host out of [Publishers]"
     if ("Hz" if known == "Hz" else "B/s") in found:
         return f"{number:g} {known}: this is already limited; give one number of messages and one of bytes"

@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 
 Holder = TypeVar("Holder", bound=Hashable)
 Member = TypeVar("Member")
-_MOST_MOVED = 64  # the most members that one search moves to the present quota class of their hosts
+_MAX_MOVED = 64  # the most members that one search moves to the present quota class of their hosts
 
 
 class QuotaClass(IntEnum):
@@ -193,7 +193,7 @@ class Queue(Generic[Holder, Member]):
         return True
 
     def longest(self, quota_class: QuotaClass) -> tuple[Member, Holder, float] | None:
-        for _ in range(_MOST_MOVED):
+        for _ in range(_MAX_MOVED):
             found = next(iter(self._lines[quota_class].items()), None)
             if found is None:
                 break

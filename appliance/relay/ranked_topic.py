@@ -27,7 +27,7 @@ LOST_SECONDS = 2.0
 """Silence after a motion, after which the driver is reported as lost. Lower ranks wait from the motion on."""
 SETTLE_SECONDS, STALL_SECONDS = 0.08, 0.04
 """The time in which all has been read that was sent before, if the process did not pause for longer than `STALL`."""
-MOST_PAUSES = 20
+MAX_PAUSES = 20
 """Those that delay a hand-back. A process that pauses more often is so slow that lower ranks would wait for ever."""
 LISTEN_SECONDS, LISTEN_MOST_SECONDS = 1.0, 5.0
 
@@ -119,7 +119,7 @@ class RankedTopic:
     def _read_on(self, now: float) -> None:
         if self._settled is None:
             return
-        if now - self._seen > STALL_SECONDS and self._pauses < MOST_PAUSES:
+        if now - self._seen > STALL_SECONDS and self._pauses < MAX_PAUSES:
             settled = max(self._settled, now + SETTLE_SECONDS)  # what came in the pause is not read yet
             self._pauses += settled > self._settled
             self._settled = settled

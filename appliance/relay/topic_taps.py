@@ -14,8 +14,8 @@ from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.transport.frames import Batch
 from roswire.message_view import PublisherReader
 
-MOST_LOOKS = 8
-MOST_MESSAGES = 20
+MAX_LOOKS = 8
+MAX_MESSAGES = 20
 
 Tap = Callable[[Batch], None]
 
@@ -35,10 +35,10 @@ class TopicTaps:
             self._end(message.number)
 
     def _begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
-        if len(self._open) >= MOST_LOOKS:
+        if len(self._open) >= MAX_LOOKS:
             return
         taps = self._open[wanted.number] = []
-        self._left[wanted.number] = min(wanted.messages, MOST_MESSAGES)
+        self._left[wanted.number] = min(wanted.messages, MAX_MESSAGES)
         for topic in topics:
             tap = partial(self._see, wanted.number, topic, _Reader(topic))
             taps.append((topic, tap))

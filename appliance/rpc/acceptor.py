@@ -39,7 +39,7 @@ _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
 _PAUSE_SECONDS = 0.2  # the pause after the process ran out of descriptors
 
 FIRST, SECOND = 0, 1  # the sockets of a port, as the kernel numbers them
-_MOST_INSTRUCTIONS = 1024  # the most instructions of a program; each listener has a copy
+_MAX_INSTRUCTIONS = 1024  # the most instructions of a program; each listener has a copy
 
 _ATTACH = 51  # SO_ATTACH_REUSEPORT_CBPF
 # Classic BPF, as in linux/bpf_common.h and linux/filter.h.
@@ -120,9 +120,9 @@ def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> b
     networks = list(networks)
     tests = [(network, FIRST) for network in networks]
     code = _program([*((ipaddress.ip_network(address), SECOND) for address in blocked), *tests])
-    if len(code) > _MOST_INSTRUCTIONS:
+    if len(code) > _MAX_INSTRUCTIONS:
         code = _program(tests)
-    if len(code) > _MOST_INSTRUCTIONS:
+    if len(code) > _MAX_INSTRUCTIONS:
         _log.warning("the policy names too many networks to sort connections", networks=len(networks))
         code = [_instruction(_RETURN, FIRST)]
     return b"".join(code)

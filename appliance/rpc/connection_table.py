@@ -20,7 +20,7 @@ from appliance.base import clock
 from appliance.quotas.pool import Bounds, Holder, Pool, Queue, QuotaClass
 from appliance.quotas.table import RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
 
-_MOST_MOVED = 64  # the most idle connections that one search moves
+_MAX_MOVED = 64  # the most idle connections that one search moves
 
 
 class Stage(StrEnum):
@@ -184,7 +184,7 @@ class ConnectionTable(Generic[Holder]):
         self, stage: Stage, queue: Queue[Holder, TrackedConnection], quota_class: QuotaClass
     ) -> tuple[TrackedConnection, Holder, float] | None:
         """Return the connection that waits longest; idle ones that were used again are moved back first."""
-        for _ in range(_MOST_MOVED):
+        for _ in range(_MAX_MOVED):
             found = queue.longest(quota_class)
             if found is None or stage is not Stage.IDLE or found[0].progress <= found[2]:
                 return found

@@ -23,7 +23,7 @@ from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
 
 TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
-_MOST_KEPT = 1024  # keys with a stored use; beyond this, only the largest debts are kept
+_MAX_KEPT = 1024  # keys with a stored use; beyond this, only the largest debts are kept
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -57,9 +57,9 @@ class Line(Generic[Key, Item]):
         kept, start = self._used, self.start
         used = kept.get(key, start)
         kept[key] = (used if used > start else start) + seconds
-        if len(kept) > _MOST_KEPT:
+        if len(kept) > _MAX_KEPT:
             # Keep only half of them, so that the next removal does not follow soon.
-            largest = heapq.nlargest(_MOST_KEPT // 2, kept.items(), key=itemgetter(1))
+            largest = heapq.nlargest(_MAX_KEPT // 2, kept.items(), key=itemgetter(1))
             self._used = {one: used for one, used in largest if used > start}
 
     def forget(self) -> None:

@@ -33,7 +33,7 @@ _log = structlog.get_logger()
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: a close resets the connection
 
 # ROS clients wait for an answer before the next request. Other clients may send requests earlier, up to this number.
-_MOST_PIPELINED = 512
+_MAX_PIPELINED = 512
 # The bytes that count for a request in addition to body and path. They are ten times its memory, because thousands of
 # small requests take time.
 _REQUEST_BYTES = 4096
@@ -168,7 +168,7 @@ class HttpServer:
 
 
 class _Connection(Front, asyncio.BufferedProtocol):
-    most_waiting = _MOST_PIPELINED
+    most_waiting = _MAX_PIPELINED
     fields = frozenset({b"content-length", b"content-encoding", b"expect"})
 
     def __init__(self, server: HttpServer, sock: socket.socket, host: Address) -> None:

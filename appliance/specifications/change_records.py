@@ -13,14 +13,14 @@ from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.givens import DroppedValue, with_unit
 from appliance.specifications.in_force import InForce
 from appliance.specifications.specification_files import Sources
-from appliance.specifications.specification_revisions import MOST_WARNINGS
+from appliance.specifications.specification_revisions import MAX_WARNINGS
 from appliance.specifications.switches import SHADOW, Switch
 from appliance.store.state_file import MonitorRevisionRow
 from appliance.telemetry.audit_trail import AuditTrail
 from appliance.telemetry.text_changes import changed_lines
 
 _log = structlog.get_logger()
-_MOST_FINDINGS = 100
+_MAX_FINDINGS = 100
 _EVENTS: dict[Switch, str] = {
     True: "monitor enabled",
     False: "monitor disabled",
@@ -72,23 +72,23 @@ class ChangeRecords:
             began=list(began),
             signed_by=checked.signed_by,
             certificates=checked.certificates,
-            warnings=[*checked.warnings, *warnings][:MOST_WARNINGS],
+            warnings=[*checked.warnings, *warnings][:MAX_WARNINGS],
         )
 
     def refused(self, revision: int, reason: str, findings: Sequence[str], who: str) -> None:
         text = f"revision {revision} stays in force: {reason}"
-        self._trail.happened("specifications refused", text, findings=findings[:_MOST_FINDINGS], who=who)
+        self._trail.happened("specifications refused", text, findings=findings[:_MAX_FINDINGS], who=who)
 
     def folder_refused(self, revision: int, findings: Sequence[str]) -> None:
         text = f"revision {revision} of the specifications stays in force, because the folder has errors"
-        _log.error(text, findings=findings[:_MOST_FINDINGS])
+        _log.error(text, findings=findings[:_MAX_FINDINGS])
         self._trail.happened(
             "specifications refused",
             f"{text}: {findings[0]}",
             severity=Severity.ALARM,
             category="monitor",
             resource="",
-            findings=findings[:_MOST_FINDINGS],
+            findings=findings[:_MAX_FINDINGS],
             who=DISK,
         )
 

@@ -25,8 +25,8 @@ import structlog
 from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 
-_MOST_FILES = 8  # a start has a question for the contents, and one for the parts of several relays
-_MOST_BYTES = 64 << 20
+_MAX_FILES = 8  # a start has a question for the contents, and one for the parts of several relays
+_MAX_BYTES = 64 << 20
 _FREE_BYTES = 256 << 20  # left to the audit log and the state
 SOURCES = ("rosmop", "roswire", "appliance")
 LIBRARIES = ("wasmtime", "msgspec", "lark", "rosbags")
@@ -77,7 +77,7 @@ class CompiledStore:
 
     def keep(self, question: messages.Message, answer: messages.Message) -> None:
         path, content = self._path(question), msgspec.msgpack.encode(answer)
-        if path is None or len(content) > _MOST_BYTES // 2:
+        if path is None or len(content) > _MAX_BYTES // 2:
             return
         try:
             self._folder.mkdir(mode=0o700, exist_ok=True)
@@ -91,10 +91,10 @@ class CompiledStore:
 
     def _prune(self) -> None:
         files = sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime_ns, reverse=True)
-        room = _MOST_BYTES
+        room = _MAX_BYTES
         for number, path in enumerate(files):
             room -= path.stat().st_size
-            if number >= _MOST_FILES or room < 0:
+            if number >= _MAX_FILES or room < 0:
                 path.unlink()
 
     def _path(self, question: messages.Message) -> Path | None:

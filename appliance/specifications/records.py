@@ -46,7 +46,7 @@ STOPS = 5.0
 LONG_QUIET = 2 * PERIOD
 """The seconds without an action after which a stop has ended, if many stops have preceded it closely."""
 
-_MOST = 1000
+_MAX = 1000
 _BY_TEXT = frozenset({"verdict", "fault", "log", "missed"})
 
 
@@ -157,7 +157,7 @@ class Repetitions:
         kind = event.kind.removeprefix("shadow ")
         text = without_numbers(event.text) if kind in _BY_TEXT else ""
         key = (event.kind, event.monitor, event.resource, event.host, text)
-        return key if key in self._known or len(self._known) < _MOST else (event.kind, event.monitor)
+        return key if key in self._known or len(self._known) < _MAX else (event.kind, event.monitor)
 
 
 @dataclass(slots=True)
@@ -201,7 +201,7 @@ class Stops:
             )
             going.at = now
             return None
-        if key not in self._allowances and len(self._allowances) >= _MOST:
+        if key not in self._allowances and len(self._allowances) >= _MAX:
             self._allowances = {one: each for one, each in self._allowances.items() if not each.full(now)}
         allowance = self._allowances.setdefault(key, _Allowance(STOPS, LONG_QUIET, STOPS, now))
         first = int(event.detail.get("first_time") or event.time)

@@ -15,7 +15,7 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_view import read_fields
 
-_MOST_FILES = 1000
+_MAX_FILES = 1000
 _LONGEST_FILE = 1 << 20
 _LONGEST = (
     3 << 20
@@ -156,10 +156,10 @@ def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[s
 
 def require_bounded(sources: Sources) -> None:
     """Raise `SpecificationsRefusedError` if the specifications exceed a limit."""
-    if len(sources.files) > _MOST_FILES:
+    if len(sources.files) > _MAX_FILES:
         raise SpecificationsRefusedError(
             [
-                f"{len(sources.files)} specification files; the limit is {_MOST_FILES}: put several specifications"
+                f"{len(sources.files)} specification files; the limit is {_MAX_FILES}: put several specifications"
                 " into one file"
             ]
         )

@@ -24,7 +24,7 @@ Check = Callable[[Sources, Sequence[str], Sequence[str] | None], Awaitable[Check
 CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
 """Compiles sources; the files named last may still have errors. Raises `SpecificationsRefusedError`."""
 
-MOST_WARNINGS = 100
+MAX_WARNINGS = 100
 """The most warnings that are stored with a revision, or in a record."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
@@ -52,7 +52,7 @@ class StoredSpecifications(Sources, frozen=True):
 
 def text_with_warnings(sources: Sources, checked: CheckedSpecifications) -> str:
     """Return the text of a revision, with its warnings if they are few and each file was compiled."""
-    whole = not (checked.unbuilt or checked.left_out) and len(checked.warnings) <= MOST_WARNINGS
+    whole = not (checked.unbuilt or checked.left_out) and len(checked.warnings) <= MAX_WARNINGS
     return text_of(
         StoredSpecifications(**msgspec.structs.asdict(sources), warnings=checked.warnings if whole else None)
     )

@@ -75,7 +75,7 @@ CREATE TABLE IF NOT EXISTS door_ticket (
 REVISION_TABLES = frozenset({"policy_revision", "policy_signature", "monitor_revision"})
 
 LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at once
-_MOST_NOTED = 10_000  # keys with changes, before the tree replaces them
+_MAX_NOTED = 10_000  # keys with changes, before the tree replaces them
 _EMPTY = msgspec.msgpack.encode({})
 
 
@@ -230,7 +230,7 @@ class StateStore:
 
     @property
     def tree_is_due(self) -> bool:
-        return self._only_in_tree or len(self._noted) > _MOST_NOTED
+        return self._only_in_tree or len(self._noted) > _MAX_NOTED
 
     def note_parameter(self, key: str, value: Value) -> None:
         """Store the change of a parameter until the next tree is stored; None: it was deleted.

@@ -23,7 +23,7 @@ SIZE = 32 << 20
 """The size of each file in bytes."""
 
 _ENDED = "ended"
-_MOST_LIVES = 4  # folders kept while no run is complete
+_MAX_LIVES = 4  # folders kept while no run is complete
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _HEAD = 9  # bytes: the magic number, then a flag that content follows
 
@@ -105,7 +105,7 @@ class MonitorMemory:
         runs = [path for path in self._folder.iterdir() if path.is_dir() and path.name.isdecimal()]
         for life in sorted(runs, reverse=True):
             written = [_is_written(path) for path in life.iterdir()]
-            if not any(written) or len(kept) == _MOST_LIVES or (kept and _is_complete(kept[-1])):
+            if not any(written) or len(kept) == _MAX_LIVES or (kept and _is_complete(kept[-1])):
                 shutil.rmtree(life)
             else:
                 kept.append(life)

@@ -64,7 +64,7 @@ OUTPUT_LINES = 40  # last lines kept of a failing process
 _LONGEST_LINE = 500  # characters
 _SUSPENDED_SECONDS = 0.2  # until a start is tried again that a pause delays
 _AGREED_SECONDS = 10.0  # that an ordered end waits for control
-_MOST_UNANSWERED = 4096  # requests of control at once
+_MAX_UNANSWERED = 4096  # requests of control at once
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
     messages.Walled,
@@ -571,9 +571,9 @@ class Supervisor:
             process.send(messages.Announced())
 
     def _answer(self, process: ProcessHandle, work: Coroutine[object, object, None]) -> None:
-        if self._unanswered >= _MOST_UNANSWERED:
+        if self._unanswered >= _MAX_UNANSWERED:
             work.close()
-            self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
+            self._violated(process, f"sent more than {_MAX_UNANSWERED} requests at once")
             return
         self._unanswered += 1
         self._spawn(work).add_done_callback(self._answered)

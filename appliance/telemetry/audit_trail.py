@@ -23,7 +23,7 @@ from appliance.quotas.pool import QuotaClass
 NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can"
 
 _SECONDS = 60
-MOST_REQUESTS = 64
+MAX_REQUESTS = 64
 _LONGEST_RESOURCE = 200
 _NO_ADDRESS = "a caller without an address"
 _REST = "rest"
@@ -79,7 +79,7 @@ class Meter:
     """The counters of RVMaster's events since its start, and of the last minute.
 
     `denied_hosts` has the denials of nodes, those of unknown hosts together, as "". `denied_requests` has each denied
-    host and request, of at most `MOST_REQUESTS` in a second.
+    host and request, of at most `MAX_REQUESTS` in a second.
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class Meter:
         self.calls: dict[str, Histogram] = {}
         self.denied = LastMinute()
         self.denied_hosts = LastMinute()
-        self.denied_requests = LastMinute(most=MOST_REQUESTS)
+        self.denied_requests = LastMinute(most=MAX_REQUESTS)
         self.dropped = LastMinute()
 
     def recorded(self, record: AuditRecord) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 LONGEST = 32 << 10
 """The most characters of the changed lines in one record."""
 
-_MOST_LINES = 20_000  # of both texts: the comparison of longer ones takes too long
+_MAX_LINES = 20_000  # of both texts: the comparison of longer ones takes too long
 _CUT = "(more lines changed: compare the texts of both SHA-256)"
 
 
@@ -19,7 +19,7 @@ def changed_lines(before: Mapping[str, str], after: Mapping[str, str]) -> list[s
         if old == new:
             continue
         rows = (old.splitlines(), new.splitlines())
-        if sum(map(len, rows)) > _MOST_LINES:
+        if sum(map(len, rows)) > _MAX_LINES:
             return [*lines, f"--- {name}", _CUT]
         for line in difflib.unified_diff(*rows, name, name, n=0, lineterm=""):
             left -= len(line)

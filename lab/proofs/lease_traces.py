@@ -28,7 +28,7 @@ from pathlib import Path
 
 from lab.proofs.spin import LEASE, Model, Step, accepts
 
-_MOST_EPOCHS = 250
+_MAX_EPOCHS = 250
 _WITNESS = "witness"
 _FORMS = {
     "granted": r"(?P<who>\S+) (?P<epoch>\d+)",
@@ -70,8 +70,8 @@ def lease_accepts(folder: Path, events: Sequence[str], names: tuple[str, str] = 
     grants = [int(one["epoch"]) for one in fields if one["event"] == "granted"]
     first = max(0, min(grants) - 1) if grants else 0
     last = max([first, *epochs])
-    if last > _MOST_EPOCHS:
-        raise ValueError(f"epoch {last} is too large; give a trace with epochs up to {_MOST_EPOCHS}")
+    if last > _MAX_EPOCHS:
+        raise ValueError(f"epoch {last} is too large; give a trace with epochs up to {_MAX_EPOCHS}")
     return accepts(folder, TraceBounds(first, last), [_step(one, names) for one in fields])
 
 

@@ -87,7 +87,7 @@ class StateMachineFollower:
 # endless trace, exactly one sequence of guesses satisfies their definitions. So a formula can come true with
 # guesses exactly if it could without them.
 
-MOST_LETTERS = 1024
+MAX_LETTERS = 1024
 
 _DEFINED: Mapping[str, tuple[Callable[[Node, Node, Node], Node], bool]] = {
     "once": (lambda x, _y, before: ("or", x, before), False),
@@ -109,7 +109,7 @@ class PastGuesses:
             if node[0] in _DEFINED or node[0] in _BEFORE:
                 self._guessed.setdefault(node, len(self._guessed))
         count = 1 << len(self._guessed)
-        if len(events) * count > MOST_LETTERS:
+        if len(events) * count > MAX_LETTERS:
             raise WorkLimitError
         self.count = len(events) * count
         self.letters = {
@@ -152,8 +152,8 @@ def _within(node: Node) -> list[Node]:
     return [node, *(inner for part in node[1:] if isinstance(part, tuple) for inner in _within(part))]
 
 
-MOST_STEPS = 200_000
-MOST_WORK = 400_000
+MAX_STEPS = 200_000
+MAX_WORK = 400_000
 
 S = TypeVar("S", bound=Hashable)
 Verdicts = tuple[str, ...]
@@ -254,7 +254,7 @@ def _follow(
         if following not in came:
             came[following] = pair, event
             waiting.append(following)
-            if len(waiting) * len(events) > MOST_STEPS:
+            if len(waiting) * len(events) > MAX_STEPS:
                 raise WorkLimitError
 
     for pair in waiting:
@@ -309,7 +309,7 @@ def _check_past(
 
 
 def _check_words(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    words = ExpressionDerivatives(formula_reader.expression(formula, events), MOST_WORK)
+    words = ExpressionDerivatives(formula_reader.expression(formula, events), MAX_WORK)
     dead: dict[int, bool] = {}
 
     def is_dead(state: int) -> bool:
@@ -332,7 +332,7 @@ def _dead(words: ExpressionDerivatives, start: int, events: Sequence[str]) -> di
             if after not in leading:
                 leading[after] = set()
                 waiting.append(after)
-                if len(waiting) * len(events) > MOST_STEPS:
+                if len(waiting) * len(events) > MAX_STEPS:
                     raise WorkLimitError
             leading[after].add(state)
     alive = {state for state in waiting if words.matches(state)}
@@ -360,7 +360,7 @@ def _check_endless(
     formula: formula_reader.Node, events: Sequence[str], letters: Sequence[str], tables: AutomatonTables
 ) -> int:
     guesses = PastGuesses(formula, letters)
-    future = FutureFollower(guesses.count, MOST_WORK)
+    future = FutureFollower(guesses.count, MAX_WORK)
     sides = (guesses.formula, ("not", guesses.formula))
     start = tuple(future.start(positive(guesses.kept(side), guesses.count)) for side in sides)
 

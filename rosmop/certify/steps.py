@@ -7,7 +7,7 @@ compares the effect with that of the walk, below:
 - each event alone, in every state of every property; with a clock before, at and after its bound;
 - each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
 - each event that may drop, with a drop; two events on one message in every state, with a drop by the second, up to
-`MOST` steps; and several messages in one read, all with the same results;
+`MAX` steps; and several messages in one read, all with the same results;
 - a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
 Not checked: the functions themselves (see `prove`), the list of effects after a changed message, the stored
@@ -236,7 +236,7 @@ def _drops(compiled: Compiled, function: str) -> bool:
     return any(isinstance(node, nodes.Drop) for node in nodes.walk(compiled.functions[function]))
 
 
-MOST = 100_000
+MAX = 100_000
 
 _FEW = 16  # the number of states to try if the state does not matter
 _FUEL = 100_000  # for each message
@@ -250,7 +250,7 @@ class StepDiffersError(Exception):
 def check_steps(compiled: Compiled, module: WasmModule) -> int:
     if not module.feeds:
         return 0
-    pairs = MOST
+    pairs = MAX
     machine = WasmInstance(translated(scripted(module), module.memory), module.memory)
     benches = []
     for group, cells in zip(groups(compiled.specifications), module.cells, strict=True):

@@ -37,7 +37,7 @@ from rosmop.types.resolve import resolve
 # Comparisons in `when`, first values and `init` are not noted, nor are loop conditions, whose distance from the
 # end means nothing.
 
-MOST_NOTED = 32
+MAX_NOTED = 32
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
@@ -56,7 +56,7 @@ def noted(
         return value
     known = scope.names.comparisons
     if node not in known:
-        if len(known) >= MOST_NOTED:
+        if len(known) >= MAX_NOTED:
             return value
         variables = [(scope.symbols.fresh("g"), scope.symbols.fresh("g")) for _truth in range(2)]
         constant = (side for side, operand in enumerate((left, right)) if operand.constant is not None)

@@ -36,7 +36,7 @@ from rosmop.check.abstract_values import (
 )
 from rosmop.check.enforcement import bringing
 from rosmop.check.flow import Exits, FlowAnalysis
-from rosmop.check.flow_work import MOST_WORK, MOST_WORK_OF_SET, FlowLimitError, FlowWork
+from rosmop.check.flow_work import MAX_WORK, MAX_WORK_OF_SET, FlowLimitError, FlowWork
 from rosmop.check.message_fields import PatternField
 from rosmop.check.scope import CompilationContext
 from rosmop.form import nodes
@@ -47,7 +47,7 @@ from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.value_types import Type
 
-_MOST_LEAVES = 32
+_MAX_LEAVES = 32
 _ROUNDS = 2
 _PROBES = (1e300, -1e300, 0.0, 1e-3)
 _MIN_MAX = frozenset({"min", "max", "fmin", "fmax", "nearest"})
@@ -184,7 +184,7 @@ class SpecificationFlow:
                     walk(slot.type, f"{name}.{slot_name}", (*path, slot.index))
 
         walk(one.type, _path_of(one), ())
-        return found[:_MOST_LEAVES]
+        return found[:_MAX_LEAVES]
 
     # NaN
 
@@ -493,9 +493,9 @@ class SpecificationFlow:
 def flow_findings(shared: CompilationContext, compiled: Sequence[SpecificationCode]) -> list[Diagnostic]:
     """Follow each specification; one that is too large is a warning, and so is a defect of this analysis."""
     found, flows = list[Diagnostic](), list[SpecificationFlow]()
-    left = MOST_WORK_OF_SET
+    left = MAX_WORK_OF_SET
     for code in compiled:
-        work = FlowWork(min(left, MOST_WORK))
+        work = FlowWork(min(left, MAX_WORK))
         left -= work.left
         try:
             flow = SpecificationFlow(shared, code, work)

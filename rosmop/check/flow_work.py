@@ -7,10 +7,10 @@ from typing import NamedTuple
 from rosmop.check.abstract_values import AbstractValue, Places, is_shared
 from rosmop.form import nodes
 
-MOST_WORK = 40_000
+MAX_WORK = 40_000
 """The most statements that are followed in a specification: less than a second."""
 
-MOST_WORK_OF_SET = 10 * MOST_WORK
+MAX_WORK_OF_SET = 10 * MAX_WORK
 
 
 class FlowLimitError(Exception):
@@ -31,7 +31,7 @@ class PureCall(NamedTuple):
 class FlowWork:
     """The rest of the work for a specification, and what is known of its functions, calls and blocks."""
 
-    left: int = MOST_WORK
+    left: int = MAX_WORK
     functions: dict[str, "FunctionFacts"] = field(default_factory=dict)
     own: dict[str, "FunctionFacts"] = field(default_factory=dict)
     calls: dict[Hashable, PureCall] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
-MOST_PARAMETERS = 6
+MAX_PARAMETERS = 6
 
 _ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish)
 
@@ -49,8 +49,8 @@ def declare_parameters(
         )
         names.parameters[parameter.name] = variable
         shared.variables.declare(names, variable)
-    if len(specification.parameters) > MOST_PARAMETERS:
-        text = f"a specification has at most {MOST_PARAMETERS} parameters"
+    if len(specification.parameters) > MAX_PARAMETERS:
+        text = f"a specification has at most {MAX_PARAMETERS} parameters"
         shared.findings.append(Diagnostic(specification.parameters[-1].position, "error", text))
 
 

@@ -26,7 +26,7 @@ from roswire.errors import DefinitionError
 
 LARGE = 4096
 
-MOST_TABLE = 64 << 10
+MAX_TABLE = 64 << 10
 
 
 def write(scope: FunctionScope, node: tree.Statement) -> None:
@@ -91,7 +91,7 @@ def table(
         numbers_of.append(constant_of(number(literal, kind.element)))
     numbers_of += [0] * ((kind.length or 0) - len(numbers_of))
     raw = struct.pack(f"<{len(numbers_of)}{code}", *numbers_of)
-    return raw if len(raw) <= MOST_TABLE else None
+    return raw if len(raw) <= MAX_TABLE else None
 
 
 def known(

@@ -26,11 +26,11 @@ allocated memory.
 ARENA = 256 << 10
 """The bytes for tables of strings and messages, and for changed arrays. A message that finds it full is left."""
 
-MOST_KEPT = 1024
+MAX_KEPT = 1024
 
-MOST_KEPT_ARRAY = 16 << 10
+MAX_KEPT_ARRAY = 16 << 10
 
-MOST_TEXTS = 256
+MAX_TEXTS = 256
 
 BEYOND = 0xFFFFFFFF
 """Stands for the length of a string or array that is longer than `most_kept`."""
@@ -54,16 +54,16 @@ def is_kept(kind: Type) -> bool:
 
 def room_of(kind: Type) -> int:
     """Return the bytes of the longest string or array that is kept. An array of strings has its table first."""
-    return MOST_KEPT_ARRAY if is_texts(kind) else most_kept(kind) * kept_size(kind)
+    return MAX_KEPT_ARRAY if is_texts(kind) else most_kept(kind) * kept_size(kind)
 
 
 def most_kept(kind: Type) -> int:
     if is_texts(kind):
-        return MOST_TEXTS
-    return MOST_KEPT if isinstance(kind, value_types.StringType) else MOST_KEPT_ARRAY // kept_size(kind)
+        return MAX_TEXTS
+    return MAX_KEPT if isinstance(kind, value_types.StringType) else MAX_KEPT_ARRAY // kept_size(kind)
 
 
-SENDER = 16 + 2 * MOST_KEPT
+SENDER = 16 + 2 * MAX_KEPT
 """The bytes of a sender: address and length of its host and caller, and then their bytes."""
 
 AREA = 512 << 10

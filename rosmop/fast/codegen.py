@@ -105,7 +105,7 @@ HAPPENED, DROPPED, CHANGED, RESET, REPLACED = 1, 2, 4, 16, 32
 
 EARLY = 16
 
-MOST_SAFE = 1024
+MAX_SAFE = 1024
 
 
 @dataclass
@@ -368,8 +368,8 @@ class _FunctionCodegen(StringCodegen):
         safe = next((one for one in node.safes if one.topic == self._channel), None)
         if safe is None:
             raise NotCompiledError("publishes safe messages")
-        if len(safe.data) > MOST_SAFE:
-            raise NotCompiledError(f"sends a safe message of more than {MOST_SAFE} bytes")
+        if len(safe.data) > MAX_SAFE:
+            raise NotCompiledError(f"sends a safe message of more than {MAX_SAFE} bytes")
         self._safe, self._depends = safe, True
         differs = self._length() + constant(I64, len(safe.data)) + compare(I64, "!=")
         return self._when(differs, self._elsewhere) + constant(I32, 1) + self._set("replaced")

@@ -8,7 +8,7 @@ is that of its row.
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rosmop.fast.abi import ARENA, MOST_TEXTS, REST, USED
+from rosmop.fast.abi import ARENA, MAX_TEXTS, REST, USED
 from rosmop.fast.arithmetic import ArithmeticCodegen
 from rosmop.fast.memory_layout import NotCompiledError, machine_type
 from rosmop.fast.wasm import (
@@ -48,7 +48,7 @@ from rosmop.runtime.wire import MAX_EMPTY
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
-MOST_ROWS = 4096
+MAX_ROWS = 4096
 
 WIDTH = 32  # bytes of a string in C++
 
@@ -144,7 +144,7 @@ class MessageAccess(ArithmeticCodegen):
         )
         place = f"place of {node.name}"
         code = self._count(nodes.Count(node.site, count, node.at, 4))
-        code += self._few(count, MOST_TEXTS) + self._get(count, I64) + self._set(left, I64)
+        code += self._few(count, MAX_TEXTS) + self._get(count, I64) + self._set(left, I64)
         code += self._taken(self._get(count, I64) + I32_WRAP_I64 + constant(I32, 4) + I32_MUL, place)
         code += (
             self._position(node.at.plus(4)) + self._set(node.end, I64) + self._get(place) + self._set(entry)
@@ -179,7 +179,7 @@ class MessageAccess(ArithmeticCodegen):
         if isinstance(kind, value_types.VectorType):
             kind, start = kind.element, start.plus(4)
             code = self._count(nodes.Count(node.site, count, node.at, self._layout.least(kind)))
-            code += self._few(count, MOST_ROWS)
+            code += self._few(count, MAX_ROWS)
         place, row = f"place of {node.name}", constant(I32, self._layout.row(kind))
         code += self._taken(self._get(count, I64) + I32_WRAP_I64 + row + I32_MUL, place)
         code += self._get(count, I64) + self._set(left, I64) + self._get(place) + self._set(entry)

@@ -8,7 +8,7 @@ output may still read the strings of the last batch. A value longer than `most_k
 messages that bring or read it are left to the interpreter.
 """
 
-from rosmop.fast.abi import ARENA, MARK, MOST_TEXTS, Cells, is_kept, is_texts, kept_size, most_kept, room_of
+from rosmop.fast.abi import ARENA, MARK, MAX_TEXTS, Cells, is_kept, is_texts, kept_size, most_kept, room_of
 from rosmop.fast.codegen_access import MessageAccess
 from rosmop.fast.memory_layout import MemoryLayout, NotCompiledError, machine_type
 from rosmop.fast.wasm import (
@@ -134,7 +134,7 @@ class StringCodegen(MessageAccess):
         code, place, count = self._noted(first + place + count, most_kept(node.type))
         if is_texts(node.type):
             size = place + count + I32_WRAP_I64 + self._routine((I32, I32), size_of_texts)
-            long = size + constant(I32, room_of(node.type) - 4 * MOST_TEXTS) + I32_GT_U
+            long = size + constant(I32, room_of(node.type) - 4 * MAX_TEXTS) + I32_GT_U
             code += self._when(long, self._elsewhere)
         elif self._changes(node.value):
             copy, size = (
@@ -277,7 +277,7 @@ def size_of_texts() -> bytes:
 def moved_texts() -> bytes:
     """Write a function that copies a table, its count and its strings to an address, and returns the address."""
     to, entry, left, new, place, size = (local_get(local) for local in range(6))
-    begin = to + local_set(3) + to + constant(I32, 4 * MOST_TEXTS) + I32_ADD + local_set(4)
+    begin = to + local_set(3) + to + constant(I32, 4 * MAX_TEXTS) + I32_ADD + local_set(4)
     text = entry + i32_load(0) + i32_load(0) + constant(I32, 4) + I32_ADD + local_set(5)
     text += place + entry + i32_load(0) + size + MEMORY_COPY + new + place + i32_store(0)
     on = place + size + I32_ADD + local_set(4)

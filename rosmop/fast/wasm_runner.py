@@ -19,8 +19,8 @@ from rosmop.fast.abi import (
     BEYOND,
     LEFT,
     LOUD,
-    MOST_KEPT,
-    MOST_TEXTS,
+    MAX_KEPT,
+    MAX_TEXTS,
     POSITION,
     REST,
     SOONER,
@@ -141,7 +141,7 @@ class ModuleState:
         for address in self._senders:
             room = address + _SPANS.size
             words = [
-                entered(self._memory, name, room + place * MOST_KEPT, value_types.STRING)
+                entered(self._memory, name, room + place * MAX_KEPT, value_types.STRING)
                 for place, name in enumerate(names)
             ]
             _SPANS.pack_into(self._memory, address, *words)
@@ -232,8 +232,8 @@ def entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     if len(value) > most_kept(kind):
         return BEYOND << 32
     if is_texts(kind):
-        at, table = buffer + 4 * MOST_TEXTS, []
-        if sum(4 + len(text) for text in value) > room_of(kind) - 4 * MOST_TEXTS:
+        at, table = buffer + 4 * MAX_TEXTS, []
+        if sum(4 + len(text) for text in value) > room_of(kind) - 4 * MAX_TEXTS:
             return BEYOND << 32
         for text in value:
             table.append(at)

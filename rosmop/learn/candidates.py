@@ -138,7 +138,7 @@ def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> flo
 
 
 QUIET_HOURS = 10.0
-MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
+MAX = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
 """The most conditions of a kind for one topic. Other kinds have at most one for each field."""
 
 _FEWEST = 20  # the minimum number of messages for a statement about all messages
@@ -223,7 +223,7 @@ class LearntFacts:
             found: Counter[str] = Counter()
             for candidate in proposer.of_topic(topic):
                 found[candidate.kind] += 1
-                if found[candidate.kind] <= MOST.get(candidate.kind, len(self.fields[topic])):
+                if found[candidate.kind] <= MAX.get(candidate.kind, len(self.fields[topic])):
                     yield candidate
                 else:
                     self.trimmed[topic] += 1
@@ -476,7 +476,7 @@ class _Proposer:
         counts: dict[str, int] = {}
         for _, candidate in sorted(found, key=lambda ranked: ranked[0]):
             names = [topic for topic, _ in candidate.events.values()]
-            if all(counts.get(name, 0) < MOST["order"] for name in names):
+            if all(counts.get(name, 0) < MAX["order"] for name in names):
                 counts.update({name: counts.get(name, 0) + 1 for name in names})
                 yield candidate
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayout, StringPart
 from roswire.message_text import PRIMITIVES
 
-MOST_ELEMENTS = 20_000
+MAX_ELEMENTS = 20_000
 """The longest array whose elements are read: a monitor that reads a longer array would be too slow."""
 
 _LENGTH = struct.Struct("<I")
@@ -86,7 +86,7 @@ def _fixed(part: FixedPart) -> _Part:
     arrays = [
         (leaf.path, leaf.offset, struct.Struct(f"<{leaf.count}{PRIMITIVES[leaf.type][0]}"))
         for leaf in part.leaves
-        if leaf.count is not None and leaf.count <= MOST_ELEMENTS and _elements_read(leaf)
+        if leaf.count is not None and leaf.count <= MAX_ELEMENTS and _elements_read(leaf)
     ]
     chosen = {leaf.path for leaf in scalars}
     code = "<" + "".join(
@@ -122,7 +122,7 @@ def _array(part: ArrayPart) -> _Part:
                 texts.append(text)
             values[part.path] = texts
             return position
-        read_elements = kind is not None and count <= MOST_ELEMENTS
+        read_elements = kind is not None and count <= MAX_ELEMENTS
         values[part.path] = struct.unpack_from(f"<{count}{kind}", data, position) if read_elements else count
         if part.element_size is not None:
             return _within(data, position + count * part.element_size)

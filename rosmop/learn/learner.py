@@ -43,7 +43,7 @@ from rosmop.learn.passes import (
 )
 from rosmop.learn.recordings import LearnedSpan, LearningError, RecordingFacts, split
 from rosmop.learn.topic_orders import TopicOrders
-from rosmop.learn.topics import MOST_GAPS, TopicContent, TopicRhythm
+from rosmop.learn.topics import MAX_GAPS, TopicContent, TopicRhythm
 from roswire.counted import counted
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
@@ -296,7 +296,7 @@ class _Learner:
 
     def _facts(self) -> tuple[LearntFacts, LearntFacts]:
         times = [
-            TimeStep(*self._span(place), gaps=math.ceil(MOST_GAPS / len(self._trained)))
+            TimeStep(*self._span(place), gaps=math.ceil(MAX_GAPS / len(self._trained)))
             for place in range(len(self._parts))
         ]
         trained, every = self._pass(times, TimeFacts())

@@ -12,7 +12,7 @@ import msgspec
 Statistic = TypeVar("Statistic")
 _Key = TypeVar("_Key")
 
-MOST_VALUES = 8
+MAX_VALUES = 8
 
 
 def merged_rows(
@@ -72,7 +72,7 @@ class ValueSeries(msgspec.Struct):
         return sorted(self.windows, key=lambda value: (isinstance(value, bytes), value))
 
     def _limit(self) -> None:
-        if self.many or len(self.windows) > MOST_VALUES:
+        if self.many or len(self.windows) > MAX_VALUES:
             self.many = True
             self.windows, self.last = {}, {}
 

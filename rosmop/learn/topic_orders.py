@@ -11,7 +11,7 @@ import msgspec
 
 from rosmop.learn.series import HighestValues, merged_rows
 
-MOST_TOPICS = 24
+MAX_TOPICS = 24
 """The topics with the fewest messages are compared, because a command says more than a regular beat."""
 
 _SURE = 1e-6  # the probability that any of all pairs looks like an order by chance
@@ -69,8 +69,8 @@ class TopicOrders:
         names = sorted(
             (name for name in counts if counts[name] >= _FEWEST), key=lambda name: (counts[name], name)
         )
-        self.names: Sequence[str] = names[:MOST_TOPICS]
-        self.left_out: Sequence[str] = names[MOST_TOPICS:]
+        self.names: Sequence[str] = names[:MAX_TOPICS]
+        self.left_out: Sequence[str] = names[MAX_TOPICS:]
         self.pairs = {(a, b): TopicPair() for a in self.names for b in self.names if a != b}
 
     def add_recordings(self, pairs: Mapping[tuple[str, str], TopicPair]) -> None:

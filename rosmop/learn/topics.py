@@ -9,9 +9,9 @@ import msgspec
 from rosmop.learn.field_values import Fields
 from rosmop.learn.series import HighestValues, Series, ValueSeries, merged_rows
 
-MOST_SINGLE = 6
+MAX_SINGLE = 6
 
-MOST_GAPS = 5000
+MAX_GAPS = 5000
 
 _IN_STEP = 60.0  # seconds from a stamp to its reception; longer times mean clocks of different robots
 
@@ -147,7 +147,7 @@ class TopicContentReader:
                 self._add_length(path, value, window)
             elif kind == "string[]":
                 self._add_length(path, len(value), window)
-                if len(value) <= MOST_SINGLE:
+                if len(value) <= MAX_SINGLE:
                     self._add_set(path, tuple(value), window)
             elif isinstance(value, tuple):
                 self._add_array(path, value, seconds, window)
@@ -194,7 +194,7 @@ class TopicContentReader:
 
     def _add_array(self, path: str, array: tuple[float, ...], seconds: float, window: int) -> None:
         self._add_length(path, len(array), window)
-        if len(array) <= MOST_SINGLE and len(self.content.lengths[path].windows) == 1:
+        if len(array) <= MAX_SINGLE and len(self.content.lengths[path].windows) == 1:
             row = self.content.elements.setdefault(path, [Series(self._period) for _ in array])
             for series, value in zip(row, array, strict=True):
                 series.add(value, seconds, window)

@@ -26,10 +26,10 @@ from rosmop.logics.formula import Formula
 from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
 from rosmop.logics.past_monitors import FOREVER, VERDICTS, PastInstruction, PastProgram, SinceWindow, fold
 
-MOST_OPEN = 10_000
+MAX_OPEN = 10_000
 
-MOST_OPEN_IN_SLICE = 1_000
-"""Less than `MOST_OPEN`, because a parametric specification may have many slices."""
+MAX_OPEN_IN_SLICE = 1_000
+"""Less than `MAX_OPEN`, because a parametric specification may have many slices."""
 
 _LATER = ("until", "next")
 
@@ -480,7 +480,7 @@ class BoundedProperty(CompiledProperty):
     """A property for an mtl formula about the future, and perhaps the past."""
 
     timed = True
-    most = MOST_OPEN
+    most = MAX_OPEN
 
     def __init__(self, source: Source, formula: Formula) -> None:
         super().__init__(source, VERDICTS)

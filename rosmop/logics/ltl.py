@@ -409,7 +409,7 @@ SYNTAX = Syntax(
 _PAST = {"previously", "dual previously", "historically", "once", "since", "dual since"}
 _FUTURE = {"next", "always", "eventually", "until", "release"}
 VERDICTS = ("violation", "validation")
-MOST_LETTERS = 1024
+MAX_LETTERS = 1024
 """Bounds the number of past operators: each of them doubles the classes of events."""
 
 
@@ -421,7 +421,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
     past = _Past()
     future = past.replaced(formula)
     guesses = 1 << len(past.propositions)
-    if len(classes) * guesses > MOST_LETTERS:
+    if len(classes) * guesses > MAX_LETTERS:
         raise source.error(0, f"{len(past.propositions)} different past operators; write a smaller formula")
     of_class = [((1 << guesses) - 1) << letter * guesses for letter in range(len(classes))]
     atoms = {named[index]: of_class[letter] for letter, index in enumerate(classes) if index >= 0}

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from rosmop.fast.abi import ALTERED, BEYOND, MOST_KEPT, NOW, POSITION, SAID, UNDO, kept_size
+from rosmop.fast.abi import ALTERED, BEYOND, MAX_KEPT, NOW, POSITION, SAID, UNDO, kept_size
 from rosmop.fast.batch_codegen import WasmModule
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm import EXPORTED_FUNCTION, section, text, unsigned
@@ -203,7 +203,7 @@ class ConcreteRuns:
         if context in module.senders:
             sender = module.senders[context]
             for place, raw in enumerate(state.names):
-                word = entered(memory, raw, sender + 16 + place * MOST_KEPT, value_types.STRING)
+                word = entered(memory, raw, sender + 16 + place * MAX_KEPT, value_types.STRING)
                 _WORD.pack_into(memory, sender + 8 * place, word)
         _TIME.pack_into(memory, module.budgets[context], state.budget)
         _TIME.pack_into(memory, NOW, state.now)

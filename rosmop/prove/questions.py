@@ -11,7 +11,7 @@ _A_SECOND = 6_500_000
 """The effort of z3, in its own unit, that took a second of a processor for the events of the presets, on average."""
 _TOGETHER = 20_000_000
 """The effort for all conditions at once: a few seconds, and a fifth of all at most."""
-_MOST = 2**32 - 1
+_MAX = 2**32 - 1
 _SLOWEST = 20
 """The seconds after which z3 is ended, for each of `patience`: for work that it does not count."""
 
@@ -36,7 +36,7 @@ class Effort:
             return z3.unknown, None
         solver, before = z3.Solver(), _counted(z3.Solver())
         effort = min(most, self._left // 5) if most else self._left
-        solver.set(rlimit=min(max(1, effort), _MOST), timeout=int(1000 * _SLOWEST * self._patience))
+        solver.set(rlimit=min(max(1, effort), _MAX), timeout=int(1000 * _SLOWEST * self._patience))
         solver.add(*conditions)
         answer = solver.check()
         self._left -= _counted(z3.Solver()) - before

@@ -49,7 +49,7 @@ _COUNT = struct.Struct("<q")
 _RUN = struct.Struct("<qqq")
 _EVENT = 0xFFFFFF
 _LONGEST = 300  # longest path through an automaton that is shortened
-_MOST_STEPS = 5_000  # the maximum number of steps tried for one explanation: some milliseconds
+_MAX_STEPS = 5_000  # the maximum number of steps tried for one explanation: some milliseconds
 _DEADLINE = -1
 
 CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
@@ -342,7 +342,7 @@ class _Trial:
         )
         self._category = category
         self._ended = ended
-        self._left = _MOST_STEPS
+        self._left = _MAX_STEPS
 
     def gives(self, events: Sequence[EventOccurrence]) -> bool:
         self._left -= 1 + len(events)

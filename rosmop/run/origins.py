@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-MOST = 8
+MAX = 8
 """Nodes that are remembered; more are as one that never sends a message again."""
 
 
@@ -21,12 +21,12 @@ class Origin:
     first: str | None = None
     """The node of the first message since the monitor was loaded."""
     unreadable: set[str] = field(default_factory=set)
-    """The nodes whose last bytes were not a message, at most one more than `MOST`; of speakers, all that it awaits."""
+    """The nodes whose last bytes were not a message, at most one more than `MAX`; of speakers, all that it awaits."""
     waits: bool = True
     """Whether no message of the first node has come since the beginning."""
     speakers: bool = False
     known: set[str] = field(default_factory=set)
-    """The speakers that have sent a message, at most one more than `MOST`."""
+    """The speakers that have sent a message, at most one more than `MAX`."""
 
     @property
     def awaited(self) -> Collection[str]:
@@ -79,5 +79,5 @@ class Origin:
 
 
 def _remember(nodes: set[str], node: str) -> None:
-    if node not in nodes and len(nodes) <= MOST:
-        nodes.add(node if len(nodes) < MOST else "\0")
+    if node not in nodes and len(nodes) <= MAX:
+        nodes.add(node if len(nodes) < MAX else "\0")

@@ -34,8 +34,8 @@ _BOOLEAN: dict[str, Callable[[list[bool]], bool]] = {
     "implies": lambda values: not values[0] or values[1],
     "iff": lambda values: values[0] == values[1],
 }
-_MOST_EVENTS = 24
-_MOST = 8
+_MAX_EVENTS = 24
+_MAX = 8
 
 
 def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> list[str]:
@@ -44,7 +44,7 @@ def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> lis
     `events` are numbers in the source, and `times` are in nanoseconds.
     """
     syntax = _SYNTAXES.get(source.logic)
-    if syntax is None or not 0 < len(events) <= _MOST_EVENTS:
+    if syntax is None or not 0 < len(events) <= _MAX_EVENTS:
         return []
     formula = read_formula(source, syntax)
     if any(node.operator in mtl.FUTURE for node in nodes(formula)):
@@ -55,7 +55,7 @@ def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> lis
     found = [
         f"{words.text(part)} is {str(value).lower()}" for part, value in _decisive(meaning, formula, last)
     ]
-    return list(dict.fromkeys(found))[:_MOST]
+    return list(dict.fromkeys(found))[:_MAX]
 
 
 def _decisive(meaning: "Meaning", formula: Formula, at: int) -> Iterator[tuple[Formula, bool]]:

@@ -13,9 +13,9 @@ from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 
-MOST_VALUES = 200
-MOST_ELEMENTS = 16
-MOST_CHARACTERS = 200
+MAX_VALUES = 200
+MAX_ELEMENTS = 16
+MAX_CHARACTERS = 200
 Value: TypeAlias = "bool | int | float | bytes | bytearray | list[Value]"
 """The value of a variable (`rosmop/types/value_types.py`)."""
 _CUT = "…"
@@ -36,7 +36,7 @@ class _FullError(Exception):
 class _Reader:
     def __init__(self, messages: MessageTypes) -> None:
         self._messages = messages
-        self._left = MOST_VALUES
+        self._left = MAX_VALUES
 
     def value(self, kind: Type, value: Value) -> object:
         self._left -= 1
@@ -47,8 +47,8 @@ class _Reader:
         if isinstance(value, float):
             return value if math.isfinite(value) else str(value)
         if isinstance(value, bytes | bytearray):
-            text = bytes(value[:MOST_CHARACTERS]).decode("utf-8", "backslashreplace")
-            return text + (_more(len(value) - MOST_CHARACTERS) if len(value) > MOST_CHARACTERS else "")
+            text = bytes(value[:MAX_CHARACTERS]).decode("utf-8", "backslashreplace")
+            return text + (_more(len(value) - MAX_CHARACTERS) if len(value) > MAX_CHARACTERS else "")
         return value / 1e9 if isinstance(kind, value_types.TimeType | value_types.DurationType) else value
 
     def _list(self, kind: Type, value: list[Value]) -> object:
@@ -57,8 +57,8 @@ class _Reader:
             return {slot.name: self.value(slot.type, one) for slot, one in zip(slots, value, strict=True)}
         if not isinstance(kind, value_types.VectorType):
             raise TypeError(f"{kind} has no elements")
-        shown = [self.value(kind.element, one) for one in value[:MOST_ELEMENTS]]
-        return shown + ([_more(len(value) - MOST_ELEMENTS)] if len(value) > MOST_ELEMENTS else [])
+        shown = [self.value(kind.element, one) for one in value[:MAX_ELEMENTS]]
+        return shown + ([_more(len(value) - MAX_ELEMENTS)] if len(value) > MAX_ELEMENTS else [])
 
 
 def read_out(

@@ -28,7 +28,7 @@ from typing import Any, cast
 
 from rosmop.form.compiled import EventCode, PropertyCode, SpecificationCode
 from rosmop.form.sites import showing
-from rosmop.logics.bounded import MOST_OPEN_IN_SLICE, BoundedProperty
+from rosmop.logics.bounded import MAX_OPEN_IN_SLICE, BoundedProperty
 from rosmop.logics.interface import (
     Categories,
     ClockedProperty,
@@ -115,7 +115,7 @@ class Slices:
         self.limit = limit
         for one in properties:
             if isinstance(one, BoundedProperty):
-                one.most = MOST_OPEN_IN_SLICE
+                one.most = MAX_OPEN_IN_SLICE
         if any(not isinstance(one, FiniteProperty | ClockedProperty) for one in properties):
             self.limit = min(self.limit, GROWING_LIMIT)
         if any(_domain(event) != self._all for event in code.events):

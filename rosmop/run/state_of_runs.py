@@ -15,7 +15,7 @@ from rosmop.logics.cfg import GrammarProperty
 from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
 from rosmop.logics.parsing import EarleySet, EarleyShape
 
-MOST_PARTS = 5_000
+MAX_PARTS = 5_000
 """Limits the objects of one run, of which there are usually a hundred times fewer."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
@@ -67,8 +67,8 @@ class _Writer:
         ]
         parts: list[object] = []
         for part in self._parts:  # the list grows while parts refer to other parts
-            if len(parts) >= MOST_PARTS:
-                raise StateTooLargeError(f"a property has more than {MOST_PARTS} parts")
+            if len(parts) >= MAX_PARTS:
+                raise StateTooLargeError(f"a property has more than {MAX_PARTS} parts")
             parts.append(self._part(part))
         return [fields, parts]
 
@@ -103,8 +103,8 @@ class _Reader:
         self._compiled = compiled
         self._run = run
         self._fields, self._entries = data
-        if len(self._entries) > MOST_PARTS:
-            raise ValueError(f"a property has more than {MOST_PARTS} parts")
+        if len(self._entries) > MAX_PARTS:
+            raise ValueError(f"a property has more than {MAX_PARTS} parts")
         self._parts: list[Any] = []
 
     def read(self) -> None:

@@ -8,7 +8,7 @@ HEAD = 12
 
 _LENGTH = struct.Struct("<I")
 _STAMP = struct.Struct("<III")
-_MOST_SECONDS = (1 << 32) - 1
+_MAX_SECONDS = (1 << 32) - 1
 
 
 def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
@@ -32,4 +32,4 @@ def sent(safe: SafeMessage, time_ns: int) -> bytes:
     if not safe.stamped:
         return safe.data
     seconds, nanoseconds = divmod(max(0, time_ns), 1_000_000_000)
-    return _STAMP.pack(0, min(seconds, _MOST_SECONDS), nanoseconds) + safe.data[HEAD:]
+    return _STAMP.pack(0, min(seconds, _MAX_SECONDS), nanoseconds) + safe.data[HEAD:]

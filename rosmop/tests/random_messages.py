@@ -3,7 +3,7 @@ import struct
 from collections.abc import Sequence
 from random import Random
 
-from rosmop.fast.abi import MOST_KEPT
+from rosmop.fast.abi import MAX_KEPT
 from roswire.definitions import Definitions
 from roswire.message_text import PRIMITIVES, Field
 
@@ -13,7 +13,7 @@ FLOATS = (
 )  # fmt: skip
 TEXTS = (
     b"", b"a", b"b", b"abc", b"abd", b"arm", b"a\0b", b"\xe4\n", b"\xff%s\0", b"x" * 64, b"x" * 65,
-    b"y" * (MOST_KEPT + 1),
+    b"y" * (MAX_KEPT + 1),
 )  # fmt: skip
 LIES = (0, 1, 3, 4, 200, 2**29, 2**31 - 1, 2**31, 2**32 - 5, 2**32 - 1)
 

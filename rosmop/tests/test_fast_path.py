@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rosmop.check.sources import compiled_from
 from rosmop.fast import wasm_runner
-from rosmop.fast.abi import AREA, MOST_TEXTS
+from rosmop.fast.abi import AREA, MAX_TEXTS
 from rosmop.fast.batch_codegen import MAX_EFFECTS
 from rosmop.fast.memory_layout import LINES
 from rosmop.fast.wasm_runner import BEGINNING
@@ -152,7 +152,7 @@ def test_messages_that_do_not_need_the_engine_are_the_modules(case: Case) -> Non
 
 def test_an_array_with_too_many_strings_is_left_to_the_engine() -> None:
     both = BothWays(next(case.text for case in cases(PROGRAMS) if case.beside == "arrays of strings"))
-    many = message("sensor_msgs/JointState", name=["b"] * (MOST_TEXTS + 1), position=[0.5] * (MOST_TEXTS + 1))
+    many = message("sensor_msgs/JointState", name=["b"] * (MAX_TEXTS + 1), position=[0.5] * (MAX_TEXTS + 1))
     few = message("sensor_msgs/JointState", name=["b"], position=[0.5])
     both.check([few, many, few], "/s")
     assert both.came["together"] == 2

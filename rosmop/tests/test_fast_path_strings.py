@@ -5,14 +5,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosmop.fast import wasm_runner
-from rosmop.fast.abi import MOST_KEPT, MOST_TEXTS
+from rosmop.fast.abi import MAX_KEPT, MAX_TEXTS
 from rosmop.tests.acting import message
 from rosmop.tests.both_ways import BothWays, plain, stamped
 from rosmop.tests.examples import examples
 from rosmop.tests.reload import replaced
 
 SOME = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
-LONG = b"0123456789abcdef" * (MOST_KEPT // 16)
+LONG = b"0123456789abcdef" * (MAX_KEPT // 16)
 TEXTS = (
     b"", b"a", b"abc", b"ab\0c", b"ab\0d", b"\0", b"\xff\xfe", b"\xc3\x28", b"abcdefgh", b"abcdefgi", b"abcdefghi",
     b"x" * 64, b"x" * 65, b"x" * 64 + b"y", LONG[:-1], LONG, LONG + b"z", LONG * 3,
@@ -88,12 +88,12 @@ def test_every_kind_of_string_is_kept_and_compared(text: bytes) -> None:
     )
     for other in TEXTS:
         both.check([stamped(text), stamped(other), stamped(text)], "/stamped")
-    assert bool(both.came["together"]) == (len(text) <= MOST_KEPT)
+    assert bool(both.came["together"]) == (len(text) <= MAX_KEPT)
 
 
 def test_up_to_the_bound_nothing_is_for_the_engine() -> None:
     both = BothWays(kept("if (x == 1) { n += a.size(); } a = f; b = a;"))
-    both.check([stamped(LONG[:size]) for size in (0, 1, 7, 1000, MOST_KEPT)], "/stamped")
+    both.check([stamped(LONG[:size]) for size in (0, 1, 7, 1000, MAX_KEPT)], "/stamped")
     assert both.came["together"] == 1
     assert both.state()[:2] == [f"a {LONG!r}", f"b {LONG!r}"]
     both.check([stamped(LONG + b"x"), stamped(b"y")], "/stamped")
@@ -103,7 +103,7 @@ def test_up_to_the_bound_nothing_is_for_the_engine() -> None:
     before = both.came["together"]
     both.check([stamped(b"z", 1)], "/stamped")
     assert both.came["together"] == before
-    assert f"n {MOST_KEPT + 1}" in both.state()
+    assert f"n {MAX_KEPT + 1}" in both.state()
 
 
 def test_lines_show_the_string_of_their_message() -> None:
@@ -159,7 +159,7 @@ def test_what_is_too_long_to_keep_is_left_to_the_engine() -> None:
     text = """s() { std::vector<std::string> a; int n = 0; event e(std::vector<std::string> names, int k)
         /s sensor_msgs/JointState '{name:names, header.seq:k}' { if (k == 1) { a = names; } n += a.size(); } }"""
     both = BothWays(text)
-    few, long = ["x" * 20] * MOST_TEXTS, ["x" * 60] * MOST_TEXTS
+    few, long = ["x" * 20] * MAX_TEXTS, ["x" * 60] * MAX_TEXTS
     for names in (few, long, [*few, ""], few):
         both.check([message("sensor_msgs/JointState", name=names, header__seq=1)] * 2, "/s")
         before = both.came["together"]

@@ -1,7 +1,7 @@
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import fast_path_of
 from rosmop.run.engine import MonitorSet
-from rosmop.run.readout import MOST_CHARACTERS, MOST_ELEMENTS, MOST_VALUES, Readout
+from rosmop.run.readout import MAX_CHARACTERS, MAX_ELEMENTS, MAX_VALUES, Readout
 from rosmop.tests.acting import definitions, message
 
 SECOND = 10**9
@@ -40,12 +40,12 @@ def test_numbers_that_are_not_finite_are_text() -> None:
 def test_long_values_are_cut() -> None:
     grows = 'for (int i = 0; i < 300; i++) { all.push_back(i); s += "x"; }'
     values = read(on(grows, "std::vector<int> all; std::string s;"), 1).values
-    assert values["all"] == [*range(MOST_ELEMENTS), f"… {300 - MOST_ELEMENTS} more"]
-    assert values["s"] == "x" * MOST_CHARACTERS + f"… {300 - MOST_CHARACTERS} more"
+    assert values["all"] == [*range(MAX_ELEMENTS), f"… {300 - MAX_ELEMENTS} more"]
+    assert values["s"] == "x" * MAX_CHARACTERS + f"… {300 - MAX_CHARACTERS} more"
 
 
 def test_values_beyond_the_limit_are_left_out() -> None:
-    values = read(on("", "".join(f"int n{number} = 0;" for number in range(MOST_VALUES + 5)))).values
+    values = read(on("", "".join(f"int n{number} = 0;" for number in range(MAX_VALUES + 5)))).values
     assert [*values.values()].count("…") == 5
 
 

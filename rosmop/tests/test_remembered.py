@@ -12,7 +12,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.run import state_of_runs
 from rosmop.run.engine import MonitorSet
 from rosmop.run.state import states_of
-from rosmop.run.state_of_runs import MOST_PARTS, StateTooLargeError, kept, run_of
+from rosmop.run.state_of_runs import MAX_PARTS, StateTooLargeError, kept, run_of
 from rosmop.tests.examples import examples
 from roswire.standard import standard_definitions
 
@@ -80,7 +80,7 @@ def test_an_invalid_state_of_a_property_is_refused(name: str, data: object) -> N
 def test_a_deep_stack_is_too_large_to_keep() -> None:
     formula = compiled(FORMULAS["cfg"]).compiled.specifications[0].properties[0].property
     run = formula.start(0)
-    for _ in range(2 * MOST_PARTS):
+    for _ in range(2 * MAX_PARTS):
         run.step(0, 0)
     with pytest.raises(StateTooLargeError):
         kept(run)
@@ -88,7 +88,7 @@ def test_a_deep_stack_is_too_large_to_keep() -> None:
 
 def test_a_slice_that_is_too_large_loses_only_the_state_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once the slice has ended, or is small again, all slices of its specification are kept."""
-    monkeypatch.setattr(state_of_runs, "MOST_PARTS", 50)
+    monkeypatch.setattr(state_of_runs, "MAX_PARTS", 50)
     events = " ".join(
         f"event {name}(std::string k) /{name} std_msgs/String '{{data:k}}' {{ }}"
         for name in ("open", "close")

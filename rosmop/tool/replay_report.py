@@ -14,8 +14,8 @@ from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import say, say_json
 from roswire.counted import counted
 
-MOST_IN_ROWS = 10_000
-_MOST_RECORDINGS = 100  # lines of the table of recordings
+MAX_IN_ROWS = 10_000
+_MAX_RECORDINGS = 100  # lines of the table of recordings
 _WOULD = {"drop": "would drop it", "change": "would change it"}
 _HEADS = ("would drop", "would change", "verdicts", "warnings", "faults")
 
@@ -96,15 +96,15 @@ class ReplayReport:
         rows = [row for row in self._recordings if any(row.counts)]
         columns = (Column(head, justify="right") for head in ("messages", *_HEADS, "first at", "last at"))
         table = table_of(Column("recording", overflow="fold"), *columns)
-        for row in rows[:_MOST_RECORDINGS]:
+        for row in rows[:_MAX_RECORDINGS]:
             times = (f"{time / BILLION:.3f}" for time in (row.first, row.last))
             add_row(table, row.recording, str(row.messages), *map(str, row.counts), *times)
         if rows:
             say_table(table)
         failed = [row for row in self._recordings if row.error]
-        for row in failed[:_MOST_RECORDINGS]:
+        for row in failed[:_MAX_RECORDINGS]:
             say(f"{row.recording} failed: {row.error}", "red")
-        more = sum(max(len(some) - _MOST_RECORDINGS, 0) for some in (rows, failed))
+        more = sum(max(len(some) - _MAX_RECORDINGS, 0) for some in (rows, failed))
         if more:
             say(f"{counted(more, 'more recording')} with effects or errors: see --report or --json")
 

@@ -14,7 +14,7 @@ from rosmop.run.engine import MonitorSet
 from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session, progress
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
-from rosmop.tool.replay_report import MOST_IN_ROWS, ReplayReport
+from rosmop.tool.replay_report import MAX_IN_ROWS, ReplayReport
 from rosmop.tool.specification_input import read_for_recordings
 from rosmop.tool.terminal import refused, say, say_json
 from roswire.counted import counted
@@ -56,7 +56,7 @@ def run_batch(
 ) -> int:
     # Each recording has its rows, so the same places are kept with and without --json.
     jobs = [
-        ReplayJob(recording, specifications, topics or ["*"], EVER, MOST_IN_ROWS, margins, strict)
+        ReplayJob(recording, specifications, topics or ["*"], EVER, MAX_IN_ROWS, margins, strict)
         for recording in session.recordings
     ]
     results = session.in_order("replaying", jobs)
@@ -79,7 +79,7 @@ def run_spans(
 ) -> None:
     for name, path, span in spans:
         recording = RecordingName(name, path.stat().st_size, "")
-        job = ReplayJob(recording, specifications, topics, span, MOST_IN_ROWS, margins, strict=True)
+        job = ReplayJob(recording, specifications, topics, span, MAX_IN_ROWS, margins, strict=True)
         report.add(name, replayed(job, path))
     report.show(specifications.texts)
 

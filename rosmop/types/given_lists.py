@@ -47,18 +47,18 @@ EXAMPLES: Mapping[str, str] = MappingProxyType(
 )
 """An example for each kind of list."""
 NO_JOINTS = "none"
-_MOST_CORNERS = 100
+_MAX_CORNERS = 100
 _NUMBER = re.compile(r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?", re.ASCII)
 _JOINT = re.compile(r"[\w/]++", re.ASCII)
 _ENTRY = re.compile(r"(hardware_id:)?([^;={},\"\\\x00-\x1f*]{0,200})(\*?)")
-_MOST_ENTRIES = 16
+_MAX_ENTRIES = 16
 _SPAN = re.compile(r"(\d{1,9}+(?:\.\d{1,9}+)?)(ms|s)", re.ASCII)
 
 
 def corners(value: str) -> tuple[tuple[str, str], ...]:
     """Return x and y of each corner, as numbers of the language."""
     pairs = [word.split(",") for word in value.replace(" ,", ",").replace(", ", ",").split()]
-    if not 3 <= len(pairs) <= _MOST_CORNERS or any(len(pair) != 2 for pair in pairs):
+    if not 3 <= len(pairs) <= _MAX_CORNERS or any(len(pair) != 2 for pair in pairs):
         raise ValueError
     found = tuple((number(x), number(y)) for x, y in pairs)
     if fault := fault_of([(float(x), float(y)) for x, y in found]):
@@ -94,8 +94,8 @@ def entries(value: str) -> tuple[tuple[str, str], ...]:
         if found is None or not found[2] + found[3] or "//" in found[2] or "/*" in found[2]:
             raise ValueError
         rows.append((found[2], str(2 * bool(found[1]) + bool(found[3]))))
-    if len(rows) > _MOST_ENTRIES:
-        raise ValueError(f"at most {_MOST_ENTRIES} entries can be named")
+    if len(rows) > _MAX_ENTRIES:
+        raise ValueError(f"at most {_MAX_ENTRIES} entries can be named")
     return tuple(rows)
 
 

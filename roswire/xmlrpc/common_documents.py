@@ -16,7 +16,7 @@ from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
 from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Value, XmlRpcLimits
 
 _LONGEST = 32 << 10  # the maximum number of bytes for one pattern
-_MOST_ALONE = 256  # the maximum number of parts left to `xmlrpc_reader`, which take twice as long
+_MAX_ALONE = 256  # the maximum number of parts left to `xmlrpc_reader`, which take twice as long
 _SMALLEST = len("<value></value>")
 # Every repeat of a set is possessive (`*+`), so time is linear in the document.
 _SPACE = rb"[ \t\r\n]*+"
@@ -112,7 +112,7 @@ def _several(
     found = head.match(body)
     if found is None:
         return None
-    at, values, left = found.end(), list[Value](), _MOST_ALONE
+    at, values, left = found.end(), list[Value](), _MAX_ALONE
     try:
         while left and not (values and end.match(body, at)):
             found = part.match(body, at, at + _LONGEST)

@@ -23,7 +23,7 @@ from tests.support.virtual_clock import VirtualClock
 
 _Result = TypeVar("_Result")
 _Arguments = TypeVarTuple("_Arguments")
-_MOST_JUMPS = 200_000
+_MAX_JUMPS = 200_000
 
 
 class DeadlockError(Exception):
@@ -39,7 +39,7 @@ class _JumpingLoop(asyncio.BaseEventLoop):
 
     machine: VirtualClock
     _jumps = 0
-    _most_jumps = _MOST_JUMPS
+    _most_jumps = _MAX_JUMPS
     _thread_id: int | None  # of the thread that runs the loop
 
     def time(self) -> float:
@@ -109,7 +109,7 @@ class _JumpingLoop(asyncio.BaseEventLoop):
 
 
 class AutojumpLoop(_JumpingLoop):
-    def __init__(self, machine: VirtualClock, most_jumps: int = _MOST_JUMPS) -> None:
+    def __init__(self, machine: VirtualClock, most_jumps: int = _MAX_JUMPS) -> None:
         super().__init__()
         self.machine, self._most_jumps = machine, most_jumps
         self._selector = self  # `BaseEventLoop` selects when it has run what was ready
@@ -136,7 +136,7 @@ class AutojumpLoop(_JumpingLoop):
 class LocalLoop(_JumpingLoop, asyncio.SelectorEventLoop):
     """A loop for local sockets: time passes when no socket is ready. It is made inside `local_sockets`."""
 
-    def __init__(self, machine: VirtualClock, most_jumps: int = _MOST_JUMPS) -> None:
+    def __init__(self, machine: VirtualClock, most_jumps: int = _MAX_JUMPS) -> None:
         self.machine, self._most_jumps = machine, most_jumps
         super().__init__(_JumpingSelector(self._jump))
 
@@ -168,7 +168,7 @@ def _place(coroutine: Any) -> str:
 def autojump(
     machine: VirtualClock | None = None,
     *,
-    most_jumps: int = _MOST_JUMPS,
+    most_jumps: int = _MAX_JUMPS,
     kind: type[AutojumpLoop | LocalLoop] = AutojumpLoop,
 ) -> Iterator[Callable[[], AutojumpLoop | LocalLoop]]:
     """Yield a factory of loops. `machine` becomes the clock of the block; the default is the test's own."""
@@ -178,7 +178,7 @@ def autojump(
         yield lambda: kind(machine, most_jumps)
 
 
-def run(main: Coroutine[Any, Any, _Result], *, most_jumps: int = _MOST_JUMPS) -> _Result:
+def run(main: Coroutine[Any, Any, _Result], *, most_jumps: int = _MAX_JUMPS) -> _Result:
     with autojump(most_jumps=most_jumps) as new_loop, asyncio.Runner(loop_factory=new_loop) as runner:
         return runner.run(main)
 

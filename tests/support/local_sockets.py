@@ -23,7 +23,7 @@ _TCP_OPTIONS = (socket.IPPROTO_TCP, socket.IPPROTO_IP, socket.IPPROTO_IPV6)
 _ANYWHERE = ("0.0.0.0", "::")
 _RESET = struct.pack("ii", 1, 0)  # the value of SO_LINGER with which `close` resets a connection
 _FIRST_PORT = 40_000
-_MOST_WAITING = 4096  # connections that are not accepted yet; a further one would block
+_MAX_WAITING = 4096  # connections that are not accepted yet; a further one would block
 
 _networks = itertools.count()
 _network = ""
@@ -57,7 +57,7 @@ class LocalSocket(socket.socket):
         super().bind(address)
 
     def listen(self, _backlog: int = 0, /) -> None:
-        super().listen(_MOST_WAITING)
+        super().listen(_MAX_WAITING)
 
     def accept(self) -> "tuple[LocalSocket, Any]":
         descriptor, name = self._accept()  # type: ignore[attr-defined]  # of the base in C

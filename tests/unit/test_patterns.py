@@ -25,7 +25,7 @@ from tests.support.sources import LANGUAGE_TESTS, ROOT
 UNLIMITED = 64 << 20
 """The number of characters for a text without a limit: the largest message of ROS, and more than any request."""
 
-MOST_STEPS = 200_000  # ten milliseconds or less
+MAX_STEPS = 200_000  # ten milliseconds or less
 
 LIMITED = {
     "appliance.audit.proof.copies:_ELEMENT": "65,536 characters, `_LONGEST_LINE`; an operator's own file",
@@ -174,7 +174,7 @@ def test_no_pattern_has_many_steps() -> None:
         for path in files()
         for one in patterns_of(path)
     }
-    costly = {name: what for name, what in found.items() if what[0] > MOST_STEPS}
+    costly = {name: what for name, what in found.items() if what[0] > MAX_STEPS}
     assert {name: what for name, what in costly.items() if name not in LIMITED} == {}
     assert [name for name in LIMITED if name not in costly] == []
     assert len(found) > 100
@@ -195,12 +195,12 @@ def test_no_pattern_has_many_steps() -> None:
 )
 def test_backtracking_is_found(pattern: str) -> None:
     """Python 3.11 matches some possessive repeats wrongly."""
-    assert steps(pattern, 0, UNLIMITED, anywhere=False) > MOST_STEPS
+    assert steps(pattern, 0, UNLIMITED, anywhere=False) > MAX_STEPS
 
 
 def test_a_scan_costs_nothing_except_in_a_search() -> None:
     assert steps(r"\s*+x", 0, UNLIMITED, anywhere=False) < 10
-    assert steps(r"\s*+x", 0, UNLIMITED, anywhere=True) > MOST_STEPS
+    assert steps(r"\s*+x", 0, UNLIMITED, anywhere=True) > MAX_STEPS
     assert steps(r"[^\s,]++", 0, UNLIMITED, anywhere=True) < 10
 
 

@@ -256,7 +256,7 @@ RULES = {
         WITH_FLEET, miscounted,
         forbid("counted(number, noun) of appliance/base/counted.py or roswire/counted.py: there may be one"),
         ["f'{self.left} more errors are not shown'", "f'{len(found)} hosts'"],
-        ["f'more than {_MOST} hosts'", "'1 host' if n == 1 else f'{n} hosts'", "f'{counted(n, \"host\")} left'"],
+        ["f'more than {_MAX} hosts'", "'1 host' if n == 1 else f'{n} hosts'", "f'{counted(n, \"host\")} left'"],
     ),
 }  # fmt: skip
 

@@ -15,7 +15,7 @@ from tests.world.loop import BrokenPromiseError, present_process
 from tests.world.pair import PairWorld
 
 _AGAIN_SECONDS = 0.05  # sooner than a control is ready
-_WHOLE_SECONDS, _HARMED_SECONDS, _MOST_TAKEOVERS = (
+_WHOLE_SECONDS, _HARMED_SECONDS, _MAX_TAKEOVERS = (
     30.0,
     585.0,
     2,
@@ -58,7 +58,7 @@ class UnableWorld(PairWorld):
                 appliance.restart_relay()
                 appliance.kill_control()
             await self.passes(self.settles)
-        if not 0 < self.taken_over <= _MOST_TAKEOVERS:
+        if not 0 < self.taken_over <= _MAX_TAKEOVERS:
             raise BrokenPromiseError(f"{self.taken_over} takeovers in {_HARMED_SECONDS:g} s")
         await self.settled()
 

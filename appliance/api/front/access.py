@@ -30,7 +30,7 @@ from appliance.store.access_tokens import is_secret, parse_token
 
 USE_SECONDS = 60.0
 _KNOWN_SECONDS = 900.0
-_MOST_KNOWN = 1024
+_MAX_KNOWN = 1024
 _BLOCKED = "this host is blocked by an operator"
 
 
@@ -169,7 +169,7 @@ class TokenAuthenticator:
     def _remember(self, peer: str) -> None:
         self._shown[peer] = clock.now()
         self._shown.move_to_end(peer)
-        if len(self._shown) > _MOST_KNOWN:
+        if len(self._shown) > _MAX_KNOWN:
             self._shown.popitem(last=False)
 
     def _report_use(self, token: str) -> None:

@@ -1,6 +1,6 @@
 """Send the api's requests to control, and notices of REST calls without an answer.
 
-At most `_MOST_OPEN` requests are open. A notice never waits: the last `_MOST_KEPT` are kept for the next control.
+At most `_MAX_OPEN` requests are open. A notice never waits: the last `_MAX_KEPT` are kept for the next control.
 """
 
 import asyncio
@@ -34,8 +34,8 @@ from appliance.channel.operations import CHANGES, ORDERS
 from appliance.channel.rest_operation import ANSWER_SECONDS
 
 _log = structlog.get_logger()
-_MOST_OPEN = 48
-_MOST_KEPT = 1000
+_MAX_OPEN = 48
+_MAX_KEPT = 1000
 _GRACE_SECONDS = 10.0  # extra time for control to report on an order whose time is over
 _UNKNOWN = (
     ": the order may have taken effect; if it has not by now, it never will. Orders that took effect are in the audit"
@@ -116,7 +116,7 @@ class ControlLink:
             raise ControlAwayError(self.paused)
         if self._link.channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
-        if self._link.unanswered >= _MOST_OPEN:
+        if self._link.unanswered >= _MAX_OPEN:
             raise ControlAwayError("too many requests wait for the appliance: try again")
         changes = type(request) in ORDERS
         longest = seconds + _GRACE_SECONDS if changes else seconds
@@ -184,7 +184,7 @@ class ControlLink:
 
     def tell(self, call: RestCalled) -> None:
         self._kept.append(call)
-        if len(self._kept) > _MOST_KEPT:
+        if len(self._kept) > _MAX_KEPT:
             self._dropped += self._kept.popleft().count
         self._tell_kept()
 

@@ -22,7 +22,7 @@ BUSY_SECONDS = 2.0
 IDLE_SECONDS = 10.0
 LEAST_SECONDS = 0.2
 _KEPT_SECONDS = 3600.0
-_MOST = 1800
+_MAX = 1800
 _KINDS = ("verdict", "drop", "change", "fault")
 _AWAY = "RVMaster does not answer"
 
@@ -55,7 +55,7 @@ class SampleHistory:
 
     def __init__(self, measures: Callable[[], Awaitable[Measures]]) -> None:
         self._measures = measures
-        self._samples: deque[Sample] = deque(maxlen=_MOST)
+        self._samples: deque[Sample] = deque(maxlen=_MAX)
         self._followers = 0
         self._sooner = asyncio.Event()
         self._news = asyncio.Condition()

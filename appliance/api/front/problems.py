@@ -12,7 +12,7 @@ from appliance.channel.answers.monitor_answers import Finding, findings_of
 
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope for the reason of its answer
-_MOST_FINDINGS = 200
+_MAX_FINDINGS = 200
 
 
 class BadInput(msgspec.Struct, frozen=True):
@@ -76,8 +76,8 @@ class ProblemError(Exception):
             self.detail.encode("utf-8", "backslashreplace").decode(),
             line=self.line,
             column=self.column,
-            findings=self.findings[:_MOST_FINDINGS] if self.findings is not None else None,
-            errors=self.errors[:_MOST_FINDINGS] if self.errors is not None else None,
+            findings=self.findings[:_MAX_FINDINGS] if self.findings is not None else None,
+            errors=self.errors[:_MAX_FINDINGS] if self.errors is not None else None,
             active=self.active,
         )
         return Response(msgspec.json.encode(problem), self.status, self.headers, MEDIA_TYPE)
@@ -101,6 +101,6 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
     return ProblemError(
         422,
         "specifications-refused",
-        "\n".join([error, *findings[:_MOST_FINDINGS]]),
+        "\n".join([error, *findings[:_MAX_FINDINGS]]),
         findings=findings_of(findings) or None,
     )

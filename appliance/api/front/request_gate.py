@@ -51,7 +51,7 @@ _RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for hosts, which th
 _IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
 _LONG_SECONDS = 5.0
-_MOST_LONG = 200
+_MAX_LONG = 200
 _PAGE_SHARE = 10  # the rate limit of the console's files, as a multiple of REST's rate limit
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -128,7 +128,7 @@ class RequestGate:
             for answer, since in self._running.items()
             if now - since >= _LONG_SECONDS and answer.bearer
         )
-        return [LongRequest(*caller, count) for caller, count in rows.most_common(_MOST_LONG)]
+        return [LongRequest(*caller, count) for caller, count in rows.most_common(_MAX_LONG)]
 
     def admit_websocket(self, host: str, path: str) -> None:
         """Check the rate and the tunnel of a WebSocket's request. Raises `ProblemError`."""

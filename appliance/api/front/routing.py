@@ -19,8 +19,8 @@ A = TypeVar("A")
 Responses = dict[int | str, dict[str, Any]]
 ETAG = {"ETag": {"description": "the ETag for If-Match of the next change", "schema": {"type": "string"}}}
 _JSON = "application/json"
-_MOST_ERRORS = 50
-_MOST_SHOWN = 5
+_MAX_ERRORS = 50
+_MAX_SHOWN = 5
 
 
 class Tagged(NamedTuple, Generic[A]):
@@ -140,7 +140,7 @@ def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
             msgspec.convert(value, known[name].type)
         except msgspec.ValidationError as error:
             wrong.append(_bad(error, f"body.{name}", known[name].type))
-    return wrong[:_MOST_ERRORS]
+    return wrong[:_MAX_ERRORS]
 
 
 def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
@@ -206,7 +206,7 @@ async def _only_known(request: Request) -> None:
     if operation is None:
         return
     known = [parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "query"]
-    unknown = [name for name in dict.fromkeys(given) if name not in known][:_MOST_SHOWN]
+    unknown = [name for name in dict.fromkeys(given) if name not in known][:_MAX_SHOWN]
     if unknown:
         there_are = f"there are: {', '.join(known)}" if known else "this path takes none"
         bad = [

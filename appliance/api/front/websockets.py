@@ -31,7 +31,7 @@ from appliance.base import clock
 # 3. Tickets are remembered only as hashes under a random key of this process.
 
 _WRONG_SECONDS = 60.0
-_MOST = 1024  # right ones, and as many wrong ones
+_MAX = 1024  # right ones, and as many wrong ones
 _WRONG = "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
 
 
@@ -59,7 +59,7 @@ class ShownTickets:
             kept.pop(shown, None)
         kept = self._right if valid else self._wrong
         kept[shown] = clock.now()
-        if len(kept) > _MOST:
+        if len(kept) > _MAX:
             kept.popitem(last=False)
 
     def _digest(self, name: str, ticket: str) -> bytes:

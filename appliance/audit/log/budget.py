@@ -9,7 +9,7 @@
 `DiskParts` divides the free space among the robot and the hosts that the policy names:
 
 1. A group's debt is never charged to another group, and its part depends on the disk only: no host slows another one.
-2. Records that wait for the disk are finite too (`_MOST_QUEUED`): beyond that, a group has no part until the log has
+2. Records that wait for the disk are finite too (`_MAX_QUEUED`): beyond that, a group has no part until the log has
    caught up. The robot keeps its part for longer than others.
 3. A part that shrinks forgives what it shrank by: records that were cheap when they were made stop no host later.
 """
@@ -39,7 +39,7 @@ _RECORD_BYTES = 400  # on disk, with its entries in the indices
 _BYTES_PER_CHARACTER = 2  # the text, and its entry in the full-text index
 _PAID_EVERY_SECONDS = 0.1
 _LONGEST_PAUSE_SECONDS = 1.0
-_MOST_QUEUED = {True: 0.75, False: 0.25}  # of the log's queue, for the robot and for other groups
+_MAX_QUEUED = {True: 0.75, False: 0.25}  # of the log's queue, for the robot and for other groups
 
 
 class DiskGroup(NamedTuple):
@@ -91,7 +91,7 @@ class DiskParts:
     def beyond(self, host: str) -> int | None:
         """Return how many bytes the host's group owes beyond its part, at most 0 within it; None without a part."""
         group = self._group_of(host)
-        if group is None or self._queued >= _MOST_QUEUED[group.robot]:
+        if group is None or self._queued >= _MAX_QUEUED[group.robot]:
             return None
         return self._owed.get(group, 0) - self._part(group, self._free)
 

@@ -16,8 +16,8 @@ from appliance.signing import log_proof
 LARGEST_DETAIL = 65_536
 LONGEST_TEXT = 4_096
 _DEEPEST = 16
-_MOST_ITEMS = 256
-_MOST_KEYS = 128
+_MAX_ITEMS = 256
+_MAX_KEYS = 128
 _LARGEST_INTEGER = (1 << 63) - 1
 _Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 _Integer = Annotated[int, msgspec.Meta(ge=-_LARGEST_INTEGER, le=_LARGEST_INTEGER)]
@@ -114,7 +114,7 @@ def _shortened(detail: dict[str, object]) -> dict[str, object]:
         if room >= 0:
             kept[key] = detail[key]
     left_out = [key[:64] for key in detail if key not in kept]
-    return {**kept, "cut": "the details were too large to keep", "keys": left_out[:_MOST_KEYS]}
+    return {**kept, "cut": "the details were too large to keep", "keys": left_out[:_MAX_KEYS]}
 
 
 def _optional(value: object) -> str | None:
@@ -141,7 +141,7 @@ def _plain(value: object, depth: int = 0) -> object:
     elif isinstance(value, dict):
         plain = _plain_dict(value, depth)
     elif isinstance(value, list | tuple | set | frozenset):
-        plain = [_plain(item, depth + 1) for item in list(value)[:_MOST_ITEMS]]
+        plain = [_plain(item, depth + 1) for item in list(value)[:_MAX_ITEMS]]
         if len(value) > len(plain):
             plain.append(f"... {len(value) - len(plain)} more")
     else:
@@ -150,7 +150,7 @@ def _plain(value: object, depth: int = 0) -> object:
 
 
 def _plain_dict(value: dict[object, object], depth: int) -> dict[str, object]:
-    pairs = list(value.items())[:_MOST_ITEMS]
+    pairs = list(value.items())[:_MAX_ITEMS]
     plain = {_text(key): _plain(item, depth + 1) for key, item in pairs}
     if len(value) > len(pairs):
         plain["..."] = f"{len(value) - len(pairs)} more"

@@ -32,7 +32,7 @@ from appliance.signing.log_proof import NO_CHECKPOINT, genesis, signature_fault
 
 _WINDOW = 64
 _TOLD_EVERY = 5000
-_MOST_FINDINGS = 1000
+_MAX_FINDINGS = 1000
 _EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
 # The distances by which a record may have been renumbered.
 _DISTANCES = (0, *(distance for step in range(1, 1000) for distance in (step, -step)))
@@ -118,7 +118,7 @@ def _log_id(connection: sqlite3.Connection) -> str:
 
 
 class _Findings:
-    """The faults of a log. After `_MOST_FINDINGS`, one finding stands for all further ones."""
+    """The faults of a log. After `_MAX_FINDINGS`, one finding stands for all further ones."""
 
     def __init__(self) -> None:
         self.rows: list[LogFinding] = []
@@ -127,7 +127,7 @@ class _Findings:
 
     @property
     def full(self) -> bool:
-        return len(self.rows) >= _MOST_FINDINGS
+        return len(self.rows) >= _MAX_FINDINGS
 
     def add(self, kind: FindingKind, first: int, last: int, message: str) -> None:
         if not self.full:
@@ -307,7 +307,7 @@ class _Verifier:
     def _explain(self, row: _Row, previous: bytes) -> bytes:
         """Report why the row does not follow from the previous one, and return the hash to continue from.
 
-        After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take hours.
+        After `_MAX_FINDINGS`, no search is made, so that a forged log cannot take hours.
         """
         ahead = list(self._rows(row.sequence, _WINDOW)) if not self._findings.full else []
         place = row.sequence - self._shift

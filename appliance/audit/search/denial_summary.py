@@ -24,10 +24,10 @@ from appliance.audit.search.search import export
 from appliance.base.varying_numbers import without_numbers
 
 LARGEST_SUMMARY = 1000
-MOST_RECORDS = 1_000_000
+MAX_RECORDS = 1_000_000
 _PAGE = 5000
-_MOST_HOSTS = 10_000
-_MOST_NAMES = 256
+_MAX_HOSTS = 10_000
+_MAX_NAMES = 256
 _SHOWN_REASONS = 3
 _SHOWN_CALLERS = 5
 _NO_HOST = "(no host)"
@@ -107,7 +107,7 @@ def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
     hosts: dict[str, _HostCounts] = {}
     counted_since, last = None, 0
     for number, entry in enumerate(denials):
-        if number == MOST_RECORDS:
+        if number == MAX_RECORDS:
             counted_since = rfc3339(last)
             break
         record = without_contents(entry).record
@@ -146,7 +146,7 @@ def _hosts_of(record: AuditRecord) -> Iterator[tuple[str, int]]:
 
 
 def _count(hosts: dict[str, _HostCounts], host: str, number: int, record: AuditRecord) -> None:
-    if host not in hosts and len(hosts) >= _MOST_HOSTS:
+    if host not in hosts and len(hosts) >= _MAX_HOSTS:
         host = OTHERS
     first, last = time_span(record)
     counts = hosts.get(host)
@@ -185,7 +185,7 @@ def _tallied(names: object) -> list[tuple[str, int]]:
 
 
 def _tally(counts: Counter[str], name: str, number: int) -> None:
-    counts[name if name in counts or len(counts) < _MOST_NAMES else OTHERS] += number
+    counts[name if name in counts or len(counts) < _MAX_NAMES else OTHERS] += number
 
 
 def _shown(host: str, counts: _HostCounts) -> HostDenials:

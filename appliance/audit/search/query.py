@@ -13,7 +13,7 @@ from appliance.audit.search.equality import FOLDED
 IN_NETWORKS = "in_networks"
 """A function of SQL that `search` defines: whether a host is in one of the networks, which spaces separate."""
 _LONGEST_PATTERN = 256
-_MOST_STARS = 8
+_MAX_STARS = 8
 _TRIGRAM = 3
 _MAPPED_PREFIX = 96  # bits before the IPv4 address in ::ffff:10.0.0.1
 
@@ -171,8 +171,8 @@ def checked_pattern(name: str, value: str) -> str:
     """Return the pattern. Raises `FilterError` unless it is short, simple and valid Unicode."""
     if len(value) > _LONGEST_PATTERN:
         raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters; give a shorter pattern")
-    if value.count("*") > _MOST_STARS:
-        raise FilterError(f"{name}: more than {_MOST_STARS} times '*'; give a shorter pattern")
+    if value.count("*") > _MAX_STARS:
+        raise FilterError(f"{name}: more than {_MAX_STARS} times '*'; give a shorter pattern")
     try:
         value.encode()
     except UnicodeEncodeError as error:

@@ -27,7 +27,7 @@ _FOLLOWING = 50
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream sends at least a comment every 15 s
 _AGAIN_SECONDS = 1.0
-_MOST_FAILURES = 5
+_MAX_FAILURES = 5
 
 
 class RestLog:
@@ -101,7 +101,7 @@ class RestLog:
                 raise
             except NotRunningError:
                 failures += 1
-                if failures == _MOST_FAILURES:
+                if failures == _MAX_FAILURES:
                     raise
             pause.wait(_AGAIN_SECONDS)
 

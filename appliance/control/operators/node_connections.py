@@ -11,7 +11,7 @@ from appliance.master.graph.registry import Incarnation, Registry
 from appliance.rpc.xmlrpc_client import CallFailedError
 
 _LINK_BITS = {4: 30, 6: 126}  # of the link between the appliance's namespace and its machine
-_MOST_NAMED = 10
+_MAX_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class NodeConnections:
             return None
         known |= self._given(incarnation, topic)  # it may have changed in the meantime
         sources = (str(row[1]) for row in rows if row[2] == "i" and row[4] == topic)
-        return sorted({uri[:200] for uri in sources if _end_of(uri) not in known})[:_MOST_NAMED]
+        return sorted({uri[:200] for uri in sources if _end_of(uri) not in known})[:_MAX_NAMED]
 
     def _given(self, incarnation: Incarnation, topic: str) -> set[tuple[str | None, int | None]]:
         return {_end_of(uri) for uri in self.delivery.list_of(incarnation, topic) or ()}

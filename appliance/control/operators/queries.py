@@ -43,7 +43,7 @@ from appliance.control.assembly.policies import Policies
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.features.views import states_in
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic, Traffic
+from appliance.master.endpoints.traffic import MAX_RESOURCES, OTHERS, RelayTraffic, Traffic
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.rosmaster import RosMaster
 from appliance.policy.live_rights import LiveRight
@@ -146,7 +146,7 @@ def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[
 
 # Collect the measurements of control. The api formats them for Prometheus.
 
-MOST_DELAYED = 200  # the most topics that have their own histogram
+MAX_DELAYED = 200  # the most topics that have their own histogram
 
 _Labels = tuple[str, str]
 _Number = TypeVar("_Number", int, float)
@@ -165,9 +165,9 @@ def measures_of(
     hosts: list[Host],
     queued_deliveries: int,
 ) -> Measures:
-    """Return the measurements; all but `MOST_RESOURCES` topics and services are summed in `OTHERS`.
+    """Return the measurements; all but `MAX_RESOURCES` topics and services are summed in `OTHERS`.
 
-    For histograms, the limit is `MOST_DELAYED`.
+    For histograms, the limit is `MAX_DELAYED`.
     """
     lives = Counter(incarnation.life for incarnation in registry.all() if not incarnation.own)
     kinds = Counter(registration.kind.value for node, registration in registry.in_order() if not node.own)
@@ -211,7 +211,7 @@ def carried_of(carried: RelayTraffic) -> tuple[dict[str, list[int]], dict[str, l
     rows: list[tuple[str, Traffic]] = [*carried.past.items()]
     rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
     return by_resource((name, (row.messages, row.bytes, row.dropped)) for name, row in rows), by_resource(
-        ((name, (*row.delays, row.delay_seconds)) for name, row in rows if row.delays), MOST_DELAYED
+        ((name, (*row.delays, row.delay_seconds)) for name, row in rows if row.delays), MAX_DELAYED
     )
 
 
@@ -221,7 +221,7 @@ def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dic
 
 
 def by_resource(
-    rows: Iterable[tuple[str, tuple[_Number, ...]]], most: int = MOST_RESOURCES
+    rows: Iterable[tuple[str, tuple[_Number, ...]]], most: int = MAX_RESOURCES
 ) -> dict[str, list[_Number]]:
     sums: dict[str, list[_Number]] = {}
     for resource, values in rows:

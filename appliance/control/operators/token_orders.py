@@ -42,7 +42,7 @@ _USES_SINCE = "token uses since"
 _LEAST_SECONDS = 30.0  # between two stored uses of a token; an api that works reports one a minute
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
-_MOST = 1000
+_MAX = 1000
 _SAME_DATE = 2.0  # seconds; a smaller difference is not shown
 
 
@@ -225,8 +225,8 @@ class TokenOrders:
         return found
 
     def _require_room(self) -> None:
-        if sum(self._is_usable(row) for row in self._rows.values()) >= _MOST:
-            raise TokenRefusedError(f"there are {_MOST} tokens already: revoke some")
+        if sum(self._is_usable(row) for row in self._rows.values()) >= _MAX:
+            raise TokenRefusedError(f"there are {_MAX} tokens already: revoke some")
 
     def _keep(self, rows: Mapping[TokenRow, float]) -> None:
         """Store tokens with the seconds that each has left; after a crash, either all are stored or none.

@@ -2,9 +2,9 @@
 
 A flooded or compromised api cannot block RVMaster:
 
-1. At most `_MOST_WAITING` requests wait; the rest are answered `busy` at once. Between two requests, the event loop
+1. At most `_MAX_WAITING` requests wait; the rest are answered `busy` at once. Between two requests, the event loop
    serves nodes.
-2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
+2. Requests that wait for another process (`WaitingRequest`, at most `_MAX_SLOW`) do not delay other requests.
 3. The link ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
 5. A request needs a token whose role allows it, and a change also the client's own HTTP request, with a proof if the
@@ -51,7 +51,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 # Note who uses REST and the console from which host, for the answer to a block (`HostUses`).
 
 _RECENT_SECONDS = 900.0
-_MOST_RECENT = 1000
+_MAX_RECENT = 1000
 
 
 class RestUses:
@@ -71,7 +71,7 @@ class RestUses:
             return
         self._recent[key[0], who] = clock.now()
         self._recent.move_to_end((key[0], who))
-        while len(self._recent) > _MOST_RECENT:
+        while len(self._recent) > _MAX_RECENT:
             self._recent.popitem(last=False)
 
     def running(self, requests: list[LongRequest]) -> None:
@@ -95,11 +95,11 @@ def _address(text: str) -> Address | None:
 
 
 _log = structlog.get_logger()
-_MOST_WAITING = 64
+_MAX_WAITING = 64
 _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _METHODS = ("POST", "PUT", "PATCH", "DELETE")  # a rejected request with one of these methods changed nothing
-_MOST_SLOW = 16
+_MAX_SLOW = 16
 NO_WEBSOCKETS = (503, "this appliance opens no doors now")
 
 
@@ -154,7 +154,7 @@ class RestLink:
     def _received(self, message: object) -> None:
         match message:
             case RequestMade(number):
-                if len(self._waiting) >= _MOST_WAITING:
+                if len(self._waiting) >= _MAX_WAITING:
                     text = "too many requests wait for the appliance: try again"
                     self._send_answer(number, AdminAnswer(False, error=text, trouble="busy"))
                     return
@@ -199,7 +199,7 @@ class RestLink:
             await asyncio.sleep(0)
 
     def _begin(self, channel: Channel | None, made: RequestMade) -> None:
-        if len(self._slow) >= _MOST_SLOW:
+        if len(self._slow) >= _MAX_SLOW:
             text = "too many long requests are running: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
             return

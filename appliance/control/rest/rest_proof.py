@@ -38,7 +38,7 @@ from appliance.signing.request_signing import (
 from appliance.store.access_tokens import TokenRow, is_secret, parse_token
 
 SECONDS = 60.0
-_MOST_TAKEN = 4096
+_MAX_TAKEN = 4096
 
 
 class ChallengeRefusedError(Exception):
@@ -69,8 +69,8 @@ class Challenges:
             raise ChallengeRefusedError("the proof was already used: each is valid once")
         for old in [taken for taken, end in self._taken.items() if end <= now]:
             del self._taken[old]
-        if len(self._taken) >= _MOST_TAKEN:
-            raise ChallengeRefusedError(f"{_MOST_TAKEN} orders were signed within {SECONDS:g} s: wait")
+        if len(self._taken) >= _MAX_TAKEN:
+            raise ChallengeRefusedError(f"{_MAX_TAKEN} orders were signed within {SECONDS:g} s: wait")
         self._taken[challenge] = ends
 
     def _mac(self, begun: str) -> str:

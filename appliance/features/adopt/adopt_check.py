@@ -28,7 +28,7 @@ from appliance.rpc.graph_inventory import GraphInventory, SurveyedNode, problems
 Level = Literal["ok", "warn", "stop"]
 _CGROUPS = Path("/sys/fs/cgroup/cgroup.controllers")
 _SHOWN = 5
-_MOST_PROBLEMS = 20
+_MAX_PROBLEMS = 20
 _SYSTEMCTL_SECONDS = 5.0
 _SHELLS = {"sh", "dash", "bash", "zsh"}
 _DEPENDS = ("RequiredBy", "BoundBy", "ConsistsOf")
@@ -78,10 +78,10 @@ def graph_lines(state: CheckedRobot) -> Iterator[CheckLine]:
     yield from _policy(state, state.inventory)
     yield _cuts(state, state.inventory)
     found = [one for one in problems(state.inventory) if " cannot be asked: " not in one]
-    for problem in found[:_MOST_PROBLEMS]:
+    for problem in found[:_MAX_PROBLEMS]:
         yield CheckLine("warn", "graph", problem)
-    if len(found) > _MOST_PROBLEMS:
-        text = f"{len(found) - _MOST_PROBLEMS} more problems of the graph: rosrv survey lists them"
+    if len(found) > _MAX_PROBLEMS:
+        text = f"{len(found) - _MAX_PROBLEMS} more problems of the graph: rosrv survey lists them"
         yield CheckLine("warn", "graph", text)
 
 

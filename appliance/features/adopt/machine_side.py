@@ -50,13 +50,13 @@ from appliance.supervisor.users import account_of
 STAND_IN_UNIT = "rosrv-left-master"
 ROSMASTER = "/usr/bin/rosmaster"
 _SYSTEMD = Path("/run/systemd/system")
-_MOST_NAMES = _MOST_PORTS = 20_000
+_MAX_NAMES = _MAX_PORTS = 20_000
 _LOOKUP_SECONDS = 0.1
 _CALL_SECONDS = 0.25  # of an ordinary service call under way, which is not cut
 _START_SECONDS = 10.0
 _LOOK_SECONDS = 0.05
-_MOST_NODES = 1000  # whose keys are kept, the newest
-_MOST_CUTS = 60  # of one taking, which may begin again after kills of control
+_MAX_NODES = 1000  # whose keys are kept, the newest
+_MAX_CUTS = 60  # of one taking, which may begin again after kills of control
 _CUT_AGAIN_SECONDS = 60.0  # of a graph that is taken; until then the ports of the last cut are refused
 
 log = structlog.get_logger()
@@ -119,7 +119,7 @@ class AdoptWork:
 
     def _look(self, side: Isolation, terms: Terms) -> Found:
         ports = _ports(terms.get("ports", []))
-        names = msgspec.convert(terms.get("names", []), list[str])[:_MOST_NAMES]
+        names = msgspec.convert(terms.get("names", []), list[str])[:_MAX_NAMES]
         ends = side.ends[4]
         found = node_sockets(side.host, ports, _master_port(side)) if ports else {}
         facts = MachineFacts(
@@ -212,7 +212,7 @@ class AdoptWork:
         ):
             return False
         if phase is Phase.TAKING:
-            self._require(self._cuts < _MOST_CUTS, f"more than {_MOST_CUTS} cuts of one adoption")
+            self._require(self._cuts < _MAX_CUTS, f"more than {_MAX_CUTS} cuts of one adoption")
             self._cuts += 1
         self._cut_at = clock.now()
         return True
@@ -222,7 +222,7 @@ class AdoptWork:
         ports = set(_ports(terms.get("ports", [])))
         remote = {
             RemotePort(str(ipaddress.IPv4Address(address)), port)
-            for address, port in msgspec.convert(terms.get("remote", []), list[tuple[str, int]])[:_MOST_PORTS]
+            for address, port in msgspec.convert(terms.get("remote", []), list[tuple[str, int]])[:_MAX_PORTS]
         }
         master, appliance = _master_port(side), side.ends[4].appliance
         if any(port < FIRST_PORT or port == master for port in {*ports, *(one.port for one in remote)}):
@@ -258,7 +258,7 @@ class AdoptWork:
         record = load_record(self._state)
         connected = {process_key(one.pid) for one in found if one.master_address} - {*record.nodes, ""}
         if connected:
-            record = msgspec.structs.replace(record, nodes=(*record.nodes, *sorted(connected))[-_MOST_NODES:])
+            record = msgspec.structs.replace(record, nodes=(*record.nodes, *sorted(connected))[-_MAX_NODES:])
             try:
                 save_record(self._state, record)
             except NetworkError as error:  # a full disk prevents no cut
@@ -378,6 +378,6 @@ def _master_port(side: Isolation) -> int:
 
 def _ports(given: object) -> list[int]:
     ports = msgspec.convert(given, list[int])
-    if len(ports) > _MOST_PORTS or any(not 0 < port < 65_536 for port in ports):
+    if len(ports) > _MAX_PORTS or any(not 0 < port < 65_536 for port in ports):
         raise ValueError("not a list of ports")
     return ports

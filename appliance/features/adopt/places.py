@@ -27,8 +27,8 @@ TOPIC_SECONDS = 5.0
 """The time of `requestTopic`: a node that needs four seconds for it is slow, and no reason to leave connections."""
 
 _SECONDS = 2.0
-_MOST_ADDRESSES = 8  # of one name
-MOST_FAILED = 64
+_MAX_ADDRESSES = 8  # of one name
+MAX_FAILED = 64
 """The places of one host, or its ports, that may fail: registered URIs do not make the appliance scan ports."""
 
 _SHARE = HostShare(host=3.0, whole=5.0)
@@ -136,9 +136,9 @@ async def find_places(nodes: Mapping[str, str], facts: MachineFacts, call: NodeC
     failed = Counter[str]()
 
     async def ask(uri: NodeUri) -> CallFailedError | None:
-        if failed[shares[uri]] >= MOST_FAILED:
+        if failed[shares[uri]] >= MAX_FAILED:
             return CallFailedError(
-                f"it was not asked, because {MOST_FAILED} others of {uri.host} do not answer"
+                f"it was not asked, because {MAX_FAILED} others of {uri.host} do not answer"
             )
         try:
             await call(uri, "getPid")
@@ -179,7 +179,7 @@ def _possible(text: str, uri: NodeUri, facts: MachineFacts) -> list[NodePlace] |
     addresses = [uri.host] if _is_address(uri.host) else facts.resolved.get(uri.host, [])
     if not addresses:
         return f"{uri.host} is not known on this machine: add it to /etc/hosts"
-    ordered = sorted(set(addresses), key=lambda one: (":" in one, one))[:_MOST_ADDRESSES]
+    ordered = sorted(set(addresses), key=lambda one: (":" in one, one))[:_MAX_ADDRESSES]
     hosts = [host for one in ordered if (host := _seen_at(one, uri.port, facts)) is not None]
     places = [NodePlace(text, uri, host) for host in dict.fromkeys(hosts)]
     return places or f"no process of this machine listens on port {uri.port}"

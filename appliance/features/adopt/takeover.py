@@ -49,7 +49,7 @@ from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.graph_side import CLOCK, AdoptedGraph, service_text
 from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts
 from appliance.features.adopt.places import (
-    MOST_FAILED,
+    MAX_FAILED,
     TOPIC_SECONDS,
     NodeCaller,
     NodePlace,
@@ -100,7 +100,7 @@ _SHOWN = 3
 _TOPICS_ASKED = 5
 _NEWER_SECONDS = 3.0
 _AT_ONCE = 50  # registrations without a pause for other callers
-_MOST_SHOWN = 50  # registrations in a record
+_MAX_SHOWN = 50  # registrations in a record
 _OWN_MASTER_SECONDS = 30.0
 _KEPT_PARAMETER = "run_id"
 _OWN_PARAMETERS = frozenset({"run_id", "rosdistro", "rosversion"})  # each master has its own, from roslaunch
@@ -467,7 +467,7 @@ class AdoptOperation:
                 "graph restored",
                 f"{counted(len(unknown), 'registration')} that only the robot's own master had were unregistered there;"
                 f" {counted(len(begun), 'node')} of this machine taken over",
-                unregistered=[f"{' '.join(entry)} {there.nodes.get(entry[2], '')}" for entry in unknown[:_MOST_SHOWN]],
+                unregistered=[f"{' '.join(entry)} {there.nodes.get(entry[2], '')}" for entry in unknown[:_MAX_SHOWN]],
                 nodes=begun or None, seconds=round(clock.now() - began, 2),
             )  # fmt: skip
 
@@ -581,7 +581,7 @@ class AdoptOperation:
 
         async def ask(row: tuple[NodeUri, int, str]) -> None:
             uri, port, service = row
-            if port in served.get(uri, ()) or failed[shares[row]] >= MOST_FAILED:
+            if port in served.get(uri, ()) or failed[shares[row]] >= MAX_FAILED:
                 return
             try:
                 if await self.probe(NodeUri("rosrpc", uri.host, port, "/"), service):

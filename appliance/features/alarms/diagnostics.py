@@ -23,7 +23,7 @@ TOPIC = "/diagnostics"
 _TYPE = "diagnostic_msgs/DiagnosticArray"
 _LEVELS = {"alarm": b"\2", "warning": b"\1", "notice": b"\0"}  # ERROR, WARN, OK
 _OK = b"\0"
-_MOST_ALARMS = 50
+_MAX_ALARMS = 50
 _LONGEST = 500  # characters of a text
 _LOOK_SECONDS = 0.5  # a look takes control 2 to 3 ms
 _PERIOD_SECONDS = 1.0
@@ -40,7 +40,7 @@ class Entry(NamedTuple):
 
 
 def entries_of(status: Status) -> dict[str, Entry]:
-    """Return the entries by name: all alarms in one, the guards in one, and the `_MOST_ALARMS` most severe alarms."""
+    """Return the entries by name: all alarms in one, the guards in one, and the `_MAX_ALARMS` most severe alarms."""
     alarms = [*open_alarms(status), *activity(status)]
     alarms.sort(key=lambda alarm: _LEVELS[alarm.severity], reverse=True)
     worst = _LEVELS[alarms[0].severity] if alarms else _OK
@@ -53,14 +53,14 @@ def entries_of(status: Status) -> dict[str, Entry]:
             found["guards"] = Entry(
                 level, line if isinstance(line, str) else "".join(text for text, _ in line)
             )
-    for alarm in alarms[:_MOST_ALARMS]:
+    for alarm in alarms[:_MAX_ALARMS]:
         level, text = _LEVELS[alarm.severity], alarm.text
         if same := found.get(alarm.kind):  # a kind of which there are several, such as `ipsec`
             level, text = max(level, same.level), f"{same.message}\n{text}"
         values = {"severity": alarm.severity, "about": alarm.about}
         found[alarm.kind] = Entry(level, text, values | ({"handled": alarm.handled} if alarm.handled else {}))
-    if len(alarms) > _MOST_ALARMS:
-        found["alarms"] = found["alarms"]._replace(values={"left out": str(len(alarms) - _MOST_ALARMS)})
+    if len(alarms) > _MAX_ALARMS:
+        found["alarms"] = found["alarms"]._replace(values={"left out": str(len(alarms) - _MAX_ALARMS)})
     return found
 
 

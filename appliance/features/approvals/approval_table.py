@@ -19,7 +19,7 @@ from appliance.policy.policy import Approval, Policy
 from appliance.quotas.pool import Pool, QuotaClass
 from appliance.store.ends import EndKind, EndTable
 
-_MOST_UNANSWERED = 256
+_MAX_UNANSWERED = 256
 APPROVING = EndKind("approval", stored=False)
 WAIT_SECONDS = 120.0
 """How long a call waits for an answer, and how long an approval of one call can be used."""
@@ -172,7 +172,7 @@ class ApprovalTable:
         """End a call that no operator answered, and keep its number for a repetition."""
         self.end(entry)
         self._unanswered[entry.call] = entry.number
-        while len(self._unanswered) > _MOST_UNANSWERED:
+        while len(self._unanswered) > _MAX_UNANSWERED:
             self._unanswered.popitem(last=False)
 
     def forget_unanswered(self, asks: Callable[[HeldCall], bool]) -> None:

@@ -71,7 +71,7 @@ def _harmless(text: str) -> str:
 
 
 _log = structlog.get_logger()
-MOST_WAITING = 64
+MAX_WAITING = 64
 _AT_ONCE = 4
 _SECONDS = 5.0
 _LONGEST_SECRET = 4096
@@ -86,7 +86,7 @@ class _Process:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._child = Child(lifeline, HookLink, said=self._said)
         self._sender = HookSender(settings.of(ApprovalHook), settings.name)
-        self._queue: asyncio.Queue[tuple[CallWaits, float]] = asyncio.Queue(MOST_WAITING)
+        self._queue: asyncio.Queue[tuple[CallWaits, float]] = asyncio.Queue(MAX_WAITING)
 
     async def run(self) -> None:
         workers = [asyncio.create_task(self._work()) for _ in range(_AT_ONCE)]
@@ -101,7 +101,7 @@ class _Process:
         try:
             self._queue.put_nowait((message, clock.now() + message.seconds))
         except asyncio.QueueFull:
-            self._child.tell(CallSent(message.number, f"{MOST_WAITING} calls are already in the queue"))
+            self._child.tell(CallSent(message.number, f"{MAX_WAITING} calls are already in the queue"))
 
     async def _work(self) -> None:
         while True:

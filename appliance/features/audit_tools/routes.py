@@ -149,7 +149,7 @@ _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
 _LARGEST_PAGE = 1000
-_MOST_NEIGHBOURS = 1000  # the same limit as on the command line
+_MAX_NEIGHBOURS = 1000  # the same limit as on the command line
 
 _ONE = {
     "type": "object",
@@ -344,7 +344,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
 def _add_one(router: Routes, desk: LogReader) -> None:
     @router.get("/{record_id}", responses=_json(_ONE) | UNKNOWN)
     async def audit_record(
-        bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5
+        bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MAX_NEIGHBOURS)] = 5
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
         shown = await desk.record(bearer, record_id, neighbours)

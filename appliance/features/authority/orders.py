@@ -32,7 +32,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 #    one that may take it if all are taken. Otherwise the policy's host with the most waiting addresses gives one up.
 
 WAITING_SECONDS = 60.0
-MOST_WAITING = 16
+MAX_WAITING = 16
 ClaimOf = Callable[[AuthorityGroup, Address], Claim | None]
 
 
@@ -92,7 +92,7 @@ class GroupHolders:
 
     def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
         waiting = self.waiting(group, now)
-        if host not in waiting and len(waiting) >= MOST_WAITING:
+        if host not in waiting and len(waiting) >= MAX_WAITING:
             asks = self._claim_of(group, host) is Claim.ASK
             asking = [one for one in waiting if self._claim_of(group, one) is Claim.ASK]
             out = (
@@ -166,7 +166,7 @@ class GroupHolders:
 
 
 CHECK_SECONDS = 0.25
-_MOST_NAMED = 20  # hosts without an effect
+_MAX_NAMED = 20  # hosts without an effect
 
 
 class DriveOrders:
@@ -477,7 +477,7 @@ class DriveOrders:
                     found.setdefault((topic, host), []).append(node)
         return [
             NotCarried(str(host), topic, sorted(nodes), self._order(group, host))
-            for (topic, host), nodes in list(found.items())[:_MOST_NAMED]
+            for (topic, host), nodes in list(found.items())[:_MAX_NAMED]
         ]
 
     def _order(self, group: AuthorityGroup, host: Address) -> str:

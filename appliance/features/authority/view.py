@@ -8,7 +8,7 @@ import msgspec
 from appliance.channel.answers.field_docs import doc
 from appliance.features.view import AlarmKind, FeatureView, StateView, Trouble
 
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 
 
 class NotCarried(msgspec.Struct, frozen=True):
@@ -37,8 +37,8 @@ class AuthorityState(msgspec.Struct, frozen=True):
 
 
 def _publishers(group: UnheardGroup) -> str:
-    named = [f"{one.host} ({one.nodes[0]}) to {one.topic}" for one in group.hosts[:_MOST_NAMED]]
-    more = len(group.hosts) - _MOST_NAMED
+    named = [f"{one.host} ({one.nodes[0]}) to {one.topic}" for one in group.hosts[:_MAX_NAMED]]
+    more = len(group.hosts) - _MAX_NAMED
     return ", ".join(named) + (f" and {more} more" if more > 0 else "")
 
 

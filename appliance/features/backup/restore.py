@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Self
 
-from appliance.backup.contents import AUDIT_LOG, KEPT_PARTS, MOST_FILES, BackupError, belongs, trouble_with
+from appliance.backup.contents import AUDIT_LOG, KEPT_PARTS, MAX_FILES, BackupError, belongs, trouble_with
 from appliance.base.input_files import open_given
 from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import ROLES
@@ -26,7 +26,7 @@ from appliance.supervisor.users import account_of
 # Check an archive before it is restored: it is complete, and has only entries that `back_up` writes.
 #
 # 1. The checksum of the whole file is checked before any entry is used.
-# 2. An archive must fit into the free space, and have at most `MOST_FILES` regular files. Headers that modify the
+# 2. An archive must fit into the free space, and have at most `MAX_FILES` regular files. Headers that modify the
 #    next entry (sparse, pax, long names) are rejected, so exactly the checked entries are extracted. Every name is
 #    valid for a backup and occurs once.
 
@@ -88,9 +88,9 @@ def _entries(file: Path, archive: tarfile.TarFile) -> list[tarfile.TarInfo]:
     while (entry := archive.next()) is not None:
         if entry.name in entries or not belongs(entry.name, parts) or trouble_with(entry.name, entry.size):
             raise _strange(file, entry.name)
-        if len(entries) == MOST_FILES:
+        if len(entries) == MAX_FILES:
             raise BackupError(
-                f"{file} has more than {MOST_FILES} files, more than any backup: nothing is restored"
+                f"{file} has more than {MAX_FILES} files, more than any backup: nothing is restored"
             )
         entries[entry.name] = entry
     folders = {str(folder) for name in entries for folder in PurePosixPath(name).parents}

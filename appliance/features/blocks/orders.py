@@ -30,10 +30,10 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
-MOST = 1000
+MAX = 1000
 _NOT_BLOCKED = "not blocked"
 _LONGEST_NAME = 300
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 _FEW = 10  # registrations: two nodes; a robot has more
 _REGISTERED = {
     "registerPublisher": "publications",
@@ -88,8 +88,8 @@ class BlockOrders:
             self._require_not_the_robot(address, before)
             self._require_not_the_caller(address)
         earlier = self._blocks.rows().get(address)
-        if earlier is None and len(self._blocks) >= MOST:
-            raise HostRefusedError(f"{MOST} hosts are blocked, the limit: lift a block (rosrv host blocks)")
+        if earlier is None and len(self._blocks) >= MAX:
+            raise HostRefusedError(f"{MAX} hosts are blocked, the limit: lift a block (rosrv host blocks)")
         replaced = None if earlier is None else self._row(earlier)
         if request.dry_run:
             planned = HostBlockRow(str(address), clock.wall(), who, request.note)
@@ -192,7 +192,7 @@ class BlockOrders:
             raise SenselessError(str(error)) from None
         if len(networks) > 1 or networks[0].num_addresses > 1:
             some = ", ".join(
-                str(one).removesuffix("/32").removesuffix("/128") for one in networks[:_MOST_NAMED]
+                str(one).removesuffix("/32").removesuffix("/128") for one in networks[:_MAX_NAMED]
             )
             raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
         return plain_address(str(networks[0].network_address))

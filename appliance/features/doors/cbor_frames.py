@@ -14,10 +14,10 @@ from appliance.features.doors.message_reader import MessageValueError
 MOST_DEPTH = 70
 """The deepest nesting; messages nest at most 64 levels deep."""
 
-MOST_ITEMS = 50_000
+MAX_ITEMS = 50_000
 """The most values of one frame; a typed array is one value."""
 
-MOST_NUMBERS = 500_000
+MAX_NUMBERS = 500_000
 """The most numbers in the typed arrays of one frame. Arrays of `uint8` do not count, because they become base64."""
 
 _CODES = {
@@ -64,17 +64,17 @@ def _scan(frame: bytes) -> None:
         elif major == _TAG:
             position, count = _scan_typed_array(frame, position, argument)
             numbers += count
-        if numbers > MOST_NUMBERS:
+        if numbers > MAX_NUMBERS:
             raise MessageValueError(
-                f"a frame of more than {MOST_NUMBERS} numbers in typed arrays: send smaller messages"
+                f"a frame of more than {MAX_NUMBERS} numbers in typed arrays: send smaller messages"
             )
         if position + left[-1] > len(frame):
             raise MessageValueError(f"not CBOR: the frame ends inside the value at byte {start}")
         if len(left) > MOST_DEPTH:
             raise MessageValueError(f"a frame nested deeper than {MOST_DEPTH} levels: nest it less")
-        if items > MOST_ITEMS:
+        if items > MAX_ITEMS:
             raise MessageValueError(
-                f"a frame of more than {MOST_ITEMS} values; send numbers as a typed array (RFC 8746)"
+                f"a frame of more than {MAX_ITEMS} values; send numbers as a typed array (RFC 8746)"
             )
     if position != len(frame):
         raise MessageValueError(f"{len(frame) - position} bytes after the end of the CBOR value")

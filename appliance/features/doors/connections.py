@@ -30,7 +30,7 @@ class ClientWriter(ByteWriter, Protocol):
 ServeClient = Callable[[asyncio.StreamReader, ClientWriter], Awaitable[None]]
 
 _REFUSAL_SECONDS = 5.0
-_MOST_REFUSALS = 64  # at the same time; further connections end without words
+_MAX_REFUSALS = 64  # at the same time; further connections end without words
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class DoorConnections:
         self.refused = 0
         self._open = of_hosts("connections of this door", limits.connections)
         self._new = of_hosts("new connections of this door in ten seconds", limits.in_ten_seconds)
-        self._refusing = of_hosts("refusals of this door", _MOST_REFUSALS)
+        self._refusing = of_hosts("refusals of this door", _MAX_REFUSALS)
         self._recent: deque[tuple[float, str]] = deque()
         self._tasks = OwnedTasks()
 

@@ -100,7 +100,7 @@ class SocketRefused(Message, frozen=True):
     reason: str
 
 
-MOST_NODES = 200
+MAX_NODES = 200
 """The most names in one `HostsWanted`."""
 
 
@@ -157,7 +157,7 @@ class DoorCounted(Message, frozen=True):
     """Refused requests of clients."""
 
 
-MOST_SHOWN = 50
+MAX_SHOWN = 50
 
 
 class ClientShown(msgspec.Struct, frozen=True):

@@ -30,8 +30,8 @@ from roswire.node.network import OwnedTasks
 from roswire.xmlrpc import Value
 
 TOO_MANY_CALLS = "too many calls of this door wait for answers; repeat it later: "
-_MOST_READ = 1000  # of one request
-_MOST_READS = 8  # of one connection that wait
+_MAX_READ = 1000  # of one request
+_MAX_READS = 8  # of one connection that wait
 
 
 class ParameterClient(Protocol):
@@ -74,9 +74,9 @@ class DoorParameters:
         self._doubtful = {*self._clients}
 
     def begin_read(self, request: ReadParameters, client: ParameterClient) -> None:
-        if self._reads[client] >= _MOST_READS:
+        if self._reads[client] >= _MAX_READS:
             raise LimitExceededError(
-                f"{_MOST_READS} reads of parameters wait for this client; repeat it later"
+                f"{_MAX_READS} reads of parameters wait for this client; repeat it later"
             )
         _check_number(request.names)
         size = sum(map(sys.getsizeof, request.names))
@@ -181,5 +181,5 @@ def _in_words(denials: Mapping[str, str]) -> str:
 
 
 def _check_number(names: Sequence[str]) -> None:
-    if len(names) > _MOST_READ:
-        raise LimitExceededError(f"{len(names)} parameters; name at most {_MOST_READ} of them")
+    if len(names) > _MAX_READ:
+        raise LimitExceededError(f"{len(names)} parameters; name at most {_MAX_READ} of them")

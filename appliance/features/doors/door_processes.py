@@ -1,7 +1,7 @@
 """Control's side of the processes of doors: which door each serves, its sockets, and its reports.
 
 1. A process gets only sockets with the address of its door, and connects only to RVMaster's port and to ports of
-   proxy endpoints and relays. At most `_MOST_PENDING` requests for sockets wait at once.
+   proxy endpoints and relays. At most `_MAX_PENDING` requests for sockets wait at once.
 2. A process of a door that was removed or replaced gets `DoorEnded`, and nothing after it. A door that was added
    again counts as a new door, because its tickets and its agent's address are new.
 3. A process that got `DoorEnded` must end, and one without its link must be replaced, within `_END_SECONDS`. Otherwise
@@ -26,7 +26,7 @@ from appliance.configuration.settings import Settings
 from appliance.control.core import Core
 from appliance.features.doors import door_link
 from appliance.features.doors.door_table import DoorRow, DoorTable
-from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.settings import MAX_DOORS, Doors
 from appliance.features.doors.view import LATELY_SECONDS, DoorHealth
 from appliance.policy.model import Address
 from appliance.rpc.server import listen
@@ -35,10 +35,10 @@ ROLE = "door"
 _CONNECT_SECONDS = 5.0
 _END_SECONDS = 5.0
 _LONGEST = 1 << 16  # bytes of a message
-_MOST_PENDING = 64
+_MAX_PENDING = 64
 _BACKLOG = 128
-_MOST_DEATHS = 16
-_MOST_HOSTS = 4096  # with a number; then they get new ones
+_MAX_DEATHS = 16
+_MAX_HOSTS = 4096  # with a number; then they get new ones
 _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104  compared only
 
 
@@ -56,7 +56,7 @@ class _Slot:
     pending: int = 0
     definitions: Mapping[str, str] = field(default_factory=dict)
     restarts: int = 0
-    deaths: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_DEATHS))
+    deaths: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_DEATHS))
     full_since: float | None = None
 
     def clear(self) -> None:
@@ -84,7 +84,7 @@ class DoorProcesses:
         self._revision = core.policy.revision
         self._slots = [
             _Slot(Link(partial(self._heard, number), partial(self._lost, number)))
-            for number in range(MOST_DOORS)
+            for number in range(MAX_DOORS)
         ]
         for number, slot in enumerate(self._slots):
             core.links.attach(ROLE, slot.link, door_link.DoorLink, index=number, longest=_LONGEST)
@@ -184,7 +184,7 @@ class DoorProcesses:
             case door_link.DefinitionsDiffer():
                 self._record_definitions(row, message)
             case door_link.ClientsShown(clients):
-                slot.clients = clients[: door_link.MOST_SHOWN]
+                slot.clients = clients[: door_link.MAX_SHOWN]
             case door_link.ConnectionsChanged():
                 self._record(row, message)
             case _:
@@ -196,7 +196,7 @@ class DoorProcesses:
             return -1
         if host.is_loopback or any(host in network for network in self._core.policy.current().robot):
             return 0
-        if len(self._host_numbers) >= _MOST_HOSTS:
+        if len(self._host_numbers) >= _MAX_HOSTS:
             self._host_numbers.clear()
         return self._host_numbers.setdefault(host, next(self._numbers))
 
@@ -289,7 +289,7 @@ class DoorProcesses:
 
     def _make(self, slot: _Slot, row: DoorRow, request: int, port: int) -> None:
         allowed = port in (0, self._core.graph.master_port) or port in self._core.policy.current().ports
-        if not allowed or slot.pending >= _MOST_PENDING:
+        if not allowed or slot.pending >= _MAX_PENDING:
             reason = "too many connections are being made" if allowed else "doors do not connect to this port"
             self._send(slot, door_link.SocketRefused(request, reason))
             return

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from appliance.base import clock
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.doors.door_link import node_name
-from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.settings import MAX_DOORS, Doors
 from appliance.policy.model import DOOR, Address, address_of
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database
@@ -75,7 +75,7 @@ class DoorTables:
 
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,30}", re.ASCII)
-_MOST_NAMES = 2000  # including removed ones
+_MAX_NAMES = 2000  # including removed ones
 
 
 class DoorTable:
@@ -134,10 +134,10 @@ class DoorTable:
         if taken is not None:
             raise SenselessError(f"port {port} is the port of the door {taken.name}: choose another one")
         slots = {row.slot for row in self.live()}
-        slot = next((number for number in range(MOST_DOORS) if number not in slots), None)
+        slot = next((number for number in range(MAX_DOORS) if number not in slots), None)
         if slot is None:
             raise SenselessError(
-                f"there are {MOST_DOORS} doors, the limit: remove one (rosrv door remove NAME)"
+                f"there are {MAX_DOORS} doors, the limit: remove one (rosrv door remove NAME)"
             )
         earlier = self._rows.get(name)
         address = earlier.address if earlier is not None else self._free_address()
@@ -160,14 +160,14 @@ class DoorTable:
             raise SenselessError(
                 f"{name} differs from {twin} only in - and _, which is the same name in ROS: choose another name"
             )
-        if name not in self._rows and len(self._rows) >= _MOST_NAMES:
+        if name not in self._rows and len(self._rows) >= _MAX_NAMES:
             raise SenselessError(
-                f"{_MOST_NAMES} names of doors were used, the limit: use an earlier name again"
+                f"{_MAX_NAMES} names of doors were used, the limit: use an earlier name again"
             )
 
     def _free_address(self) -> str:
         taken = {row.address for row in self._rows.values()} | {self._gateway}
-        for candidate in itertools.islice(self._network.hosts(), _MOST_NAMES + 2):
+        for candidate in itertools.islice(self._network.hosts(), _MAX_NAMES + 2):
             if str(candidate) not in taken:
                 return str(candidate)
         raise SenselessError(f"no address of {self._network} is free: set a larger doors.network")

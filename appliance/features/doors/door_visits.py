@@ -1,7 +1,7 @@
 """The visits of signed-in people: the console opens the caller's own door, with a ticket for one connection.
 
 Nothing is stored. A visit ends with control's process, and with the last of the tokens and sessions that its person
-had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit replaces the oldest.
+had. A person has at most `_MAX_OF_PERSON` visits; beyond them, a new visit replaces the oldest.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -18,7 +18,7 @@ from appliance.store.state_file import StateStore
 # Tickets that open a door. A browser or Foxglove can be given nothing but a URL, so the ticket is part of it.
 
 TICKET_FORM = SecretForm("", ".")
-_MOST = 1000
+_MAX = 1000
 TICKETS = EndKind("door ticket", dated=True)
 
 
@@ -42,9 +42,9 @@ class DoorTickets:
 
     def make(self, door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
         """Return a new ticket and its text, which is stored nowhere."""
-        if len(self.valid()) >= _MOST:
+        if len(self.valid()) >= _MAX:
             raise SenselessError(
-                f"there are {_MOST} tickets, the limit: wait until some end, or remove a door (rosrv door remove NAME)"
+                f"there are {_MAX} tickets, the limit: wait until some end, or remove a door (rosrv door remove NAME)"
             )
         row, text = new_ticket(door, seconds, who)
         self._rows[row.id] = row
@@ -88,7 +88,7 @@ def left_by_its_maker(row: TicketRow, bearers: Collection[str]) -> str:
 _OPEN_SECONDS = 60.0
 VISITS = EndKind("door visit", stored=False)
 """Visits whose ticket is not used yet."""
-_MOST_OF_PERSON = 8
+_MAX_OF_PERSON = 8
 
 
 @dataclass(slots=True)
@@ -109,7 +109,7 @@ class DoorVisits:
 
     def make(self, door: str, who: str, seconds: float = _OPEN_SECONDS) -> tuple[TicketRow, str]:
         own = [one for one in self._visits.values() if one.row.who == who and not one.replaced]
-        for visit in own[: max(0, len(own) + 1 - _MOST_OF_PERSON)]:
+        for visit in own[: max(0, len(own) + 1 - _MAX_OF_PERSON)]:
             visit.replaced = True
         row, text = new_ticket(door, seconds, who)
         credentials = frozenset(number for number, name in self._bearers().items() if name == who)

@@ -2,7 +2,7 @@
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.doors.quotas import ROWS
-from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.settings import MAX_DOORS, Doors
 from appliance.features.feature import ConsolePart, Feature
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
@@ -16,7 +16,7 @@ FEATURE = Feature(
     roles=(
         Role(
             "door", "rosrv-doors", "doors", "appliance.features.doors.process:main",
-            indexed=True, most=MOST_DOORS, links=("control",), ended_early=700, nice=10, dispensable=True,
+            indexed=True, most=MAX_DOORS, links=("control",), ended_early=700, nice=10, dispensable=True,
             on_demand=True, network=False,
             sandbox=lambda _facts: SandboxPlan(allowlist=True),
         ),

@@ -16,7 +16,7 @@ from appliance.features.doors.known_types import KnownType, KnownTypes, TypeKey
 from roswire.errors import DefinitionError, ProtocolError
 
 Client = TypeVar("Client")
-_MOST_TOLD = 8  # other types of one topic; a publisher can change its own at will
+_MAX_TOLD = 8  # other types of one topic; a publisher can change its own at will
 _DESCRIBE = ("type", "md5sum", "message_definition")
 
 
@@ -55,7 +55,7 @@ class HeardTopic(Generic[Client]):
     def tells(self, header: Mapping[str, str], reason: str) -> bool:
         """Return whether clients have not yet got the reason about the type of this header."""
         key = self.types.key(header)
-        if key in self.told or len(self.told) >= _MOST_TOLD:
+        if key in self.told or len(self.told) >= _MAX_TOLD:
             return False
         self.told[key] = reason
         return True

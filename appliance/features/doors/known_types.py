@@ -24,12 +24,12 @@ from roswire.tcpros import Body
 Form = TypeVar("Form", bound=Hashable)
 _FRAME_OVERHEAD = 500  # bytes that a shared frame takes besides its own and those of its message
 
-MOST_CHARACTERS = 500_000
+MAX_CHARACTERS = 500_000
 """The most characters of all definitions and layouts. A codec takes up to 140 bytes for each of its own."""
-_MOST_DEFINED_CHARACTERS = 100_000  # of them: of types that are found by their name
-_MOST_FAILURES = 1000
-_MOST_READ = 1000  # definitions of which the fingerprint is kept
-_MOST_DIFFERING = 8
+_MAX_DEFINED_CHARACTERS = 100_000  # of them: of types that are found by their name
+_MAX_FAILURES = 1000
+_MAX_READ = 1000  # definitions of which the fingerprint is kept
+_MAX_DIFFERING = 8
 
 
 class TypeKey(NamedTuple):
@@ -180,12 +180,12 @@ class KnownTypes:
     """The types of one door. Methods raise `DefinitionError` for types that cannot be used."""
 
     def __init__(
-        self, standard: Definitions, limits: ValueLimits, *, most_characters: int = MOST_CHARACTERS
+        self, standard: Definitions, limits: ValueLimits, *, most_characters: int = MAX_CHARACTERS
     ) -> None:
         self._standard = self._definitions = standard
         self._limits = limits
-        self._defined = _Cache(_MOST_DEFINED_CHARACTERS)
-        self._heard = _Cache(most_characters - _MOST_DEFINED_CHARACTERS)
+        self._defined = _Cache(_MAX_DEFINED_CHARACTERS)
+        self._heard = _Cache(most_characters - _MAX_DEFINED_CHARACTERS)
         self._failed: OrderedDict[_TextKey, DefinitionError] = OrderedDict()  # oldest first
         self._read: OrderedDict[_TextKey, TypeKey] = OrderedDict()  # oldest first
         self._first: OrderedDict[tuple[str, str], tuple[str, tuple[str, str]]] = OrderedDict()
@@ -238,7 +238,7 @@ class KnownTypes:
             return make()
         except DefinitionError as error:
             self._failed[text] = error.with_traceback(None)
-            while len(self._failed) > _MOST_FAILURES:
+            while len(self._failed) > _MAX_FAILURES:
                 self._failed.popitem(last=False)
             raise
 
@@ -255,7 +255,7 @@ class KnownTypes:
         except DefinitionError:
             definitions = None
         key = self._read[text] = TypeKey(text.name, text.md5sum, fingerprint)
-        while len(self._read) > _MOST_READ:
+        while len(self._read) > _MAX_READ:
             self._read.popitem(last=False)
         if fingerprint:
             self._compare(key, (header.get("callerid", ""), header.get("topic", "")))
@@ -268,13 +268,13 @@ class KnownTypes:
             first = self.message(key.name).key.fingerprint, ("", "")
         else:
             first = self._first.setdefault(row, (key.fingerprint, publisher))
-            while len(self._first) > _MOST_READ:
+            while len(self._first) > _MAX_READ:
                 self._first.popitem(last=False)
-        if first[0] != key.fingerprint and len(self._differing) < _MOST_DIFFERING:
+        if first[0] != key.fingerprint and len(self._differing) < _MAX_DIFFERING:
             self._differing.append(Differing(*row, first[1], publisher))
 
     def take_differing(self) -> list[Differing]:
-        """Return the differences since the last call, at most `_MOST_DIFFERING`."""
+        """Return the differences since the last call, at most `_MAX_DIFFERING`."""
         taken, self._differing = self._differing, []
         return taken
 

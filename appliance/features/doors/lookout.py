@@ -4,7 +4,7 @@ Viewers need a definition before they subscribe. If it is unknown, the door itse
 
 1. A result belongs to one topic or service, and is kept until its nodes change. A denial is kept at most until the
    policy changes.
-2. A look asks about at most `_MOST_PROBES` things, in turn for each host, and first about those that wait longest. So
+2. A look asks about at most `_MAX_PROBES` things, in turn for each host, and first about those that wait longest. So
    names that never answer delay only the names of their own host.
 """
 
@@ -22,12 +22,12 @@ from roswire.node import MasterDenialError
 from roswire.node.network import PeerUnreachableError
 
 _FRESH_SECONDS = 1.0
-_MOST_PROBES = 50  # topics and services that one look asks about
+_MAX_PROBES = 50  # topics and services that one look asks about
 _PROBE_SECONDS = 1.0
 _AGAIN_SECONDS = (
     10.0  # after which a node is asked again that did not answer, or for which the door had no slot
 )
-_MOST_ROUNDS = 20  # of looks for one answer about all services
+_MAX_ROUNDS = 20  # of looks for one answer about all services
 
 _Thing = tuple[Literal["topic", "service"], str]
 HostsOf = Callable[[Collection[str]], Awaitable[Mapping[str, str]]]
@@ -78,7 +78,7 @@ class Lookout:
     async def service_types(self) -> Mapping[str, str]:
         """Return the type of each service that answers the door. Raise `RosError` if the graph is denied."""
         async with self._lock:
-            for _round in range(_MOST_ROUNDS):
+            for _round in range(_MAX_ROUNDS):
                 graph = await self._sight.graph()
                 if not await self._ask(
                     graph, {("service", name): nodes for name, nodes in graph.services.items()}
@@ -126,10 +126,10 @@ class Lookout:
         due = [one for one in things if one not in self._asked or self._asked[one].again <= now]
         due.sort(key=lambda one: (self._asked[one].at if one in self._asked else -math.inf, one))
         chosen = due
-        if len(due) > _MOST_PROBES:
+        if len(due) > _MAX_PROBES:
             hosts = await self._hosts({name for one in due for name in nodes[one]})
             chosen = in_turn([(one, [hosts.get(name, name) for name in nodes[one]]) for one in due])[
-                :_MOST_PROBES
+                :_MAX_PROBES
             ]
         await asyncio.gather(*(self._ask_one(thing, nodes[thing]) for thing in chosen))
         return len(due) - len(chosen)

@@ -6,7 +6,7 @@ A door learns no address of another host: control gives each host a number, and 
 import asyncio
 from collections.abc import Callable, Collection, Mapping
 
-from appliance.features.doors.door_link import MOST_NODES, HostsWanted
+from appliance.features.doors.door_link import MAX_NODES, HostsWanted
 
 _SECONDS = 2.0
 ROBOT = "0"
@@ -24,8 +24,8 @@ class NodeHosts:
     async def of(self, nodes: Collection[str]) -> Mapping[str, str]:
         """Return what control knows: nodes that are missing count as hosts of their own."""
         names, found = sorted(nodes), dict[str, str]()
-        for start in range(0, len(names), MOST_NODES):
-            part = names[start : start + MOST_NODES]
+        for start in range(0, len(names), MAX_NODES):
+            part = names[start : start + MAX_NODES]
             hosts = await self._asked(part)
             found |= {name: str(host) for name, host in zip(part, hosts, strict=False) if host >= 0}
         return found

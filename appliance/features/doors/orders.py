@@ -20,7 +20,7 @@ from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorRow, DoorTable, TicketRow, is_door_name
 from appliance.features.doors.door_visits import DoorTickets, DoorVisits, left_by_its_maker
-from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.settings import MAX_DOORS, Doors
 from appliance.features.doors.view import DoorsState
 from appliance.policy.model import address_of
 
@@ -285,7 +285,7 @@ class DoorOrders:
         most = max(counts, key=lambda address: counts[address], default="")
         allowed = self._settings.connections
         return (
-            LimitUse("doors", len(rows), MOST_DOORS, ""),
+            LimitUse("doors", len(rows), MAX_DOORS, ""),
             LimitUse(
                 "connections of doors",
                 sum(counts.values()),

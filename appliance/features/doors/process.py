@@ -25,7 +25,7 @@ from appliance.channel.child_process import Child
 from appliance.features.doors import door_link
 from appliance.features.doors.client_requests import CallOfService
 from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections
-from appliance.features.doors.door_link import MOST_SHOWN, ClientShown, SocketWanted, node_name
+from appliance.features.doors.door_link import MAX_SHOWN, ClientShown, SocketWanted, node_name
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
@@ -155,7 +155,7 @@ class CountedClient:
 
 def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
     oldest_first = sorted((one.shown() for one in clients), key=lambda one: one.since)
-    yield from oldest_first[:MOST_SHOWN]
+    yield from oldest_first[:MAX_SHOWN]
 
 
 # Assemble the parts of a door that all its clients share.
@@ -182,7 +182,7 @@ def assembled_door(
 
 _AGAIN_SECONDS = 1.0
 _REPORT_SECONDS = 1.0
-_MOST_PEERS = 256  # in one report
+_MAX_PEERS = 256  # in one report
 _BLOCKED = "this host is blocked by an operator"
 _REPLACED = "this person opened the door again and again, which ended the oldest connection"
 _log = structlog.get_logger()
@@ -465,7 +465,7 @@ class DoorProcess:
         self, peer: str, ticket: str, *, began: int = 0, ended: int = 0, refused: int = 0, reason: str = ""
     ) -> None:
         key = (peer, ticket)
-        if key not in self._changes and len(self._changes) >= _MOST_PEERS:
+        if key not in self._changes and len(self._changes) >= _MAX_PEERS:
             key = ("", "")
         change = self._changes.setdefault(key, _Change())
         change.began += began

@@ -57,7 +57,7 @@ from roswire.errors import PeerError, quoted
 from roswire.names import resolve
 from roswire.xmlrpc import Value
 
-_MOST_TOLD = 100
+_MAX_TOLD = 100
 _WITHOUT_DIGITS = str.maketrans("", "", "0123456789")  # such as the seconds that are left
 _LEVELS = ("none", "error", "warning", "info")
 _STRENGTH: tuple[Compression, ...] = ("none", "cbor", "cbor-raw")
@@ -314,7 +314,7 @@ class Rosbridge:
         self.status(level, reason, reply_to)
         # roslib shows a program only statuses without an id. Once for each topic and reason, it gets this one too.
         told = f"{topic} {reason.translate(_WITHOUT_DIGITS)}"
-        if reply_to is not None and told not in self._told and len(self._told) < _MOST_TOLD:
+        if reply_to is not None and told not in self._told and len(self._told) < _MAX_TOLD:
             self._told.add(told)
             self.status(level, reason)
 

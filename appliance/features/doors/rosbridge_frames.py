@@ -14,12 +14,12 @@ from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 
-_MOST_CHARACTERS = 1024
-_MOST_INTEGER = (1 << 63) - 1
-Name = Annotated[str, Meta(max_length=_MOST_CHARACTERS)]
+_MAX_CHARACTERS = 1024
+_MAX_INTEGER = (1 << 63) - 1
+Name = Annotated[str, Meta(max_length=_MAX_CHARACTERS)]
 Id = (
-    Annotated[str, Meta(max_length=_MOST_CHARACTERS)]
-    | Annotated[int, Meta(ge=-_MOST_INTEGER, le=_MOST_INTEGER)]
+    Annotated[str, Meta(max_length=_MAX_CHARACTERS)]
+    | Annotated[int, Meta(ge=-_MAX_INTEGER, le=_MAX_INTEGER)]
     | float
     | None
 )

@@ -62,12 +62,12 @@ from roswire.xmlrpc import Value
 # no
 # client is disconnected while one of its calls waits.
 
-MOST_REFUSALS = 100
+MAX_REFUSALS = 100
 REFUSAL_SECONDS = 30.0
 HELD = "held for approval"
 """A call with these words in its reason waits for an operator."""
 _HELD_SECONDS = 120.0  # as long as a held call waits
-_MOST_TOPICS = 100
+_MAX_TOPICS = 100
 
 
 class RefusalCounts:
@@ -84,11 +84,11 @@ class RefusalCounts:
             return False
         if not topic:
             return False
-        if topic not in self._times and len(self._times) >= _MOST_TOPICS:
+        if topic not in self._times and len(self._times) >= _MAX_TOPICS:
             self._times.clear()
-        times = self._times.setdefault(topic, deque(maxlen=MOST_REFUSALS))
+        times = self._times.setdefault(topic, deque(maxlen=MAX_REFUSALS))
         times.append(now)
-        return len(times) == MOST_REFUSALS and now - times[0] <= REFUSAL_SECONDS and now >= self._held_until
+        return len(times) == MAX_REFUSALS and now - times[0] <= REFUSAL_SECONDS and now >= self._held_until
 
 
 _READ_BYTES = 1 << 16
@@ -103,7 +103,7 @@ _CLOSE_BYTES = 120  # of the reason in a closing frame
 _LAST_SECONDS = 1.0  # in which the client may take the last frames
 _LAST_TURN_SECONDS = 0.05
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
-_MOST_PINGS = 100  # of the client that wait for their answers
+_MAX_PINGS = 100  # of the client that wait for their answers
 _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for compression
 
 
@@ -325,7 +325,7 @@ class DoorSession:
                     await asyncio.sleep(0)
             self._charge_unfinished()
             self._wake.set()  # for the answer to a ping
-            if self._pings > _MOST_PINGS:
+            if self._pings > _MAX_PINGS:
                 async with asyncio.timeout(self._silent_seconds):
                     await self._flush()
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
@@ -428,7 +428,7 @@ class DoorSession:
         if isinstance(request, AdvertiseTopic | PublishMessage | CallOfService):
             topic = "" if isinstance(request, CallOfService) else request.topic
             if self._refusals.exceeded(topic, reason, asyncio.get_running_loop().time()):
-                self.disconnect(f"{MOST_REFUSALS} refusals in {REFUSAL_SECONDS:g} s: {reason}")
+                self.disconnect(f"{MAX_REFUSALS} refusals in {REFUSAL_SECONDS:g} s: {reason}")
 
     def _note_will(self, request: DoorRequest) -> None:
         match request:

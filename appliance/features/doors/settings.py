@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 from appliance.configuration.quantities import Count, rules
 from appliance.configuration.sections import FeatureSection, key, section
 
-MOST_DOORS = 32
+MAX_DOORS = 32
 """The most doors at the same time; each has a process."""
 
 

@@ -13,7 +13,7 @@ from appliance.features.view import AlarmKind, FeatureView, Samples, StateView, 
 LATELY_SECONDS = 600.0
 _MANY_RESTARTS = 3  # within `LATELY_SECONDS`
 _FULL_SECONDS = 60.0
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 
 
 class DoorHealth(msgspec.Struct, frozen=True, kw_only=True):
@@ -86,8 +86,8 @@ def _alarms(state: DoorsState) -> Iterator[Trouble]:
 
 
 def _listed(names: list[str]) -> str:
-    more = len(names) - _MOST_NAMED
-    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - _MAX_NAMED
+    return ", ".join(names[:_MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _samples(state: DoorsState) -> dict[str, Samples]:

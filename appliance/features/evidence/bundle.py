@@ -52,7 +52,7 @@ from appliance.signing import log_proof
 from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"
-MOST_RECORDS = 1_000_000
+MAX_RECORDS = 1_000_000
 
 
 class Ask(Protocol):
@@ -145,15 +145,15 @@ class _Bundle:
     def _find(self, log: sqlite3.Connection) -> None:
         self._id = log_id(log)
         _number, sealed = last_signed(log)
-        found = sequences_in_period(log, *self._span, upto=sealed, limit=MOST_RECORDS + 1)
+        found = sequences_in_period(log, *self._span, upto=sealed, limit=MAX_RECORDS + 1)
         self._runs = _runs(found)
         if not found:
             raise BundleError(
                 "the log has no record in that period: give another one (rosrv audit search --since)",
                 "unknown",
             )
-        if len(found) > MOST_RECORDS:
-            raise BundleError(f"more than {MOST_RECORDS} records match: export a shorter period", "request")
+        if len(found) > MAX_RECORDS:
+            raise BundleError(f"more than {MAX_RECORDS} records match: export a shorter period", "request")
         begin = self._runs[0][0]
         loads = {last_of(log, event, begin) for event in (_POLICY, _SPECIFICATIONS)}
         self._policies: set[int] = set()

@@ -58,7 +58,7 @@ class RecordingSummary(Protocol):
     def topics(self) -> Sequence[TopicOfRecording]: ...
 
 
-_MOST_ROWS = 2000
+_MAX_ROWS = 2000
 _SEVERE = ("notice", "warning", "alarm")
 _TITLE = "Evidence of a ROSRV appliance"
 _PROOF = """\
@@ -95,7 +95,7 @@ class Page:
         self._events[record["event"]] += 1
         if record["severity"] not in _SEVERE and record["decision"] in (None, "allow"):
             return
-        if len(self._rows) == _MOST_ROWS:
+        if len(self._rows) == _MAX_ROWS:
             self._left_out += 1
             return
         kind = record["severity"] if record["decision"] in (None, "allow") else "deny"

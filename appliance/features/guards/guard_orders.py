@@ -62,7 +62,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 _PAUSE_SECONDS = 2.0
 """Between two questions, so that each of ten drivers is asked every 20 seconds."""
-_MOST_UNANSWERED = 3
+_MAX_UNANSWERED = 3
 
 
 class GuardedDriver(NamedTuple):
@@ -107,9 +107,7 @@ class Placement:
     @property
     def unanswered(self) -> list[str]:
         """The nodes that do not say from whom they take a guarded command."""
-        return sorted(
-            {driver.node for driver, times in self._unanswered.items() if times >= _MOST_UNANSWERED}
-        )
+        return sorted({driver.node for driver, times in self._unanswered.items() if times >= _MAX_UNANSWERED})
 
     async def watch(self) -> None:
         while True:

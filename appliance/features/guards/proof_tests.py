@@ -33,7 +33,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 WATCH_SECONDS = 3.0
 _STANDING = 0.01  # m/s and rad/s, as in `cli/robot_motions.py`
 _MESSAGES = 20  # of a look
-_MOST_ODOMETRY = 4
+_MAX_ODOMETRY = 4
 _SETTING = "guard tests"
 _ODOMETRY = "nav_msgs/Odometry"
 _WITHOUT_ROLE = {"stop": "std_msgs/Bool", "reset": "std_msgs/Bool", "check": "std_msgs/Bool", "mute": "std_msgs/Bool",
@@ -121,7 +121,7 @@ class ProofTests:
             raise SenselessError(f"no node publishes or subscribes to {command}: there is no driver to reach")
         robots = RobotGraph(tuple(facts))
         sources = robots.sources(topic, (_ODOMETRY,)) if kind in VELOCITIES else []
-        odometry = [one.name for one in sources][:_MOST_ODOMETRY]
+        odometry = [one.name for one in sources][:_MAX_ODOMETRY]
         watched = [command, *odometry]
         seen = dict(zip(watched, await asyncio.gather(*map(self._watch, watched)), strict=True))
         if kind not in VELOCITIES:

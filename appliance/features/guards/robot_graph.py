@@ -5,7 +5,7 @@
 2. A source below the namespace of another robot never belongs to this one. A source below no robot's namespace
    belongs to the only robot, or to the one whose nodes use it.
 3. An undecided source belongs to no robot; callers report it.
-4. The work is bounded, since any host can add topics: `MOST_COMMANDS` of each kind, `_MOST_STEPS` back from a driver.
+4. The work is bounded, since any host can add topics: `MAX_COMMANDS` of each kind, `_MAX_STEPS` back from a driver.
 """
 
 import re
@@ -54,8 +54,8 @@ _ESTIMATOR = re.compile(r"odom|ekf|ukf|locali[sz]|fusion|estimat|slam|track", re
 """In the name of a node that does not drive."""
 SIDE = re.compile(r"(?:^|[/_])(?:f|b|r|l|front|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
 
-MOST_COMMANDS = 20
-_MOST_STEPS = 10
+MAX_COMMANDS = 20
+_MAX_STEPS = 10
 
 Namespace = tuple[str, ...]
 
@@ -116,7 +116,7 @@ class RobotGraph:
         directed = [topic for topic in self.topics if topic.type in VELOCITIES and not self._reports(topic)]
         found = [topic for topic in directed if COMMAND.search(topic.name)]
         others = [topic for topic in directed if topic not in found and self._carrying_out(topic)]
-        for _step in range(_MOST_STEPS):
+        for _step in range(_MAX_STEPS):
             takers = {node for topic in found for node in _used(topic)}
             senders = {node for topic in found if _used(topic) for node in topic.publishers}
             kinds = {topic.type for topic in found}
@@ -210,7 +210,7 @@ class RobotGraph:
     @cached_property
     def velocity_commands(self) -> list[TopicFacts]:
         """The topics by which drivers take velocities."""
-        return [topic for topic in self.velocities if self.drivers(topic)][:MOST_COMMANDS]
+        return [topic for topic in self.velocities if self.drivers(topic)][:MAX_COMMANDS]
 
     @cached_property
     def bases(self) -> list[TopicFacts]:
@@ -223,7 +223,7 @@ class RobotGraph:
     @cached_property
     def arms(self) -> list[TopicFacts]:
         found = [topic for topic in self.topics if topic.type in TRAJECTORIES and _used(topic)]
-        return [topic for topic in found if topic not in self.legs][:MOST_COMMANDS]
+        return [topic for topic in found if topic not in self.legs][:MAX_COMMANDS]
 
     @cached_property
     def legs(self) -> list[TopicFacts]:
@@ -426,7 +426,7 @@ class RobotGraph:
                 break
         drivers = frozenset(node for command in group for node in self.ends(command))
         chain = drivers.union(*(command.publishers for command in group))
-        for _step in range(_MOST_STEPS):
+        for _step in range(_MAX_STEPS):
             inputs = (topic for topic in self.velocities if not chain.isdisjoint(topic.subscribers))
             chain = chain.union(*(topic.publishers for topic in inputs))
         prefixed = len(namespace) == 1 and namespace[0] in self._prefixes

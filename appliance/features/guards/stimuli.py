@@ -32,7 +32,7 @@ VELOCITIES: Mapping[str, tuple[str, ...]] = {
 }
 """The types of velocities, with the place of the linear one."""
 _STAND_SECONDS, _DRIVE_SECONDS, _PERIOD = 0.5, 1.0, 0.05
-_MOST = 4000  # messages of a test
+_MAX = 4000  # messages of a test
 _METRES = 111_195.0  # of a degree of latitude
 _FAR, _NEAR = 20.0, 0.12
 _DRIVER, _ROBOT = "/test_driver", "/test_robot"
@@ -92,7 +92,7 @@ class _Robot:
         wait = sum(self.number(name) for name in ("resume", "clear"))
         stand, drive = (round((each + wait) / period) + 2 for each in (_STAND_SECONDS, _DRIVE_SECONDS))
         last = math.ceil(fault.seconds / period) + 2
-        if (stand + drive + last + fault.at_once) * (1 + len(readings)) > _MOST:
+        if (stand + drive + last + fault.at_once) * (1 + len(readings)) > _MAX:
             raise GuardError("its values need a test of too many messages: test it on the robot")
         made: list[SyntheticMessage] = []
         for number in range(stand + drive):

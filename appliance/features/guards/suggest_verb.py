@@ -28,7 +28,7 @@ from roswire.standard import standard_definitions
 SCAN = "sensor_msgs/LaserScan"
 WITHOUT: Mapping[str, Mapping[str, str]] = {"separation": {"person": "0"}}
 """The presets that limit a velocity by a scan, with the values whose effect is also shown."""
-MOST_SCANS = 6
+MAX_SCANS = 6
 """The interval of the scans counts, and it is known after a few."""
 _FAST = 100.0
 _VELOCITY = struct.Struct("<6d")
@@ -163,7 +163,7 @@ def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Sc
     types = dict.fromkeys(topics, SCAN)
     try:
         with recorded(appliance, _SINCE, None, types) as spans:
-            return last_messages(spans, types, MOST_SCANS), ""
+            return last_messages(spans, types, MAX_SCANS), ""
     except typer.Exit:  # no recording of the topic; the reason has been printed
         return {}, "the flight recorder has no scan"
 

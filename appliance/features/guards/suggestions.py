@@ -12,7 +12,7 @@ from appliance.base.counted import counted
 from appliance.features.guards import robot_graph as types
 from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS
-from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, SIDE, RobotGraph, TopicFacts
+from appliance.features.guards.robot_graph import COMMAND, MAX_COMMANDS, SIDE, RobotGraph, TopicFacts
 
 _WORD = re.compile(r"[a-z]+")
 _STOP = re.compile(r"e_?stop|emergency(?:_stop)?|protective_stop|run_?stop(?:ped)?", re.IGNORECASE)
@@ -44,7 +44,7 @@ _SLOWEST_HZ = 2.0
 _STEADY_HZ = 5.0
 """A joystick that repeats its state at least this often."""
 
-_MOST_TOPICS = 500
+_MAX_TOPICS = 500
 _READ = {
     *types.COMMANDS, *types.GOALS, *types.RESULTS, *types.POSES, *types.SCANS, *types.BATTERIES, *types.DIAGNOSTICS,
     _BOOL, _JOY, _CLOUD, "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
@@ -102,7 +102,7 @@ def advice(
         or COMMAND.search(topic.name)
         or _STOP.search(topic.name)
     ]
-    graph = RobotGraph(tuple(read[:_MOST_TOPICS]))
+    graph = RobotGraph(tuple(read[:_MAX_TOPICS]))
     writer = _Writer(graph, loaded, {*names, *(guard.name for guard in loaded)})
     for base in graph.bases:
         writer.add_base(base)
@@ -117,20 +117,20 @@ def advice(
         writer.add_joystick(command)
     unguarded = graph.unguarded({*types.COMMANDS, *types.GOALS})
     if unguarded and graph.robots:
-        named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:_MOST_NAMED])
+        named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:_MAX_NAMED])
         writer.left_out.append(f"no preset works with these commands, which may also move the robot: {named}")
-    if len(read) > _MOST_TOPICS or MOST_COMMANDS in (len(graph.velocity_commands), len(graph.arms)):
+    if len(read) > _MAX_TOPICS or MAX_COMMANDS in (len(graph.velocity_commands), len(graph.arms)):
         writer.left_out.append(
-            f"only the first {MOST_COMMANDS} commands of each kind among {_MOST_TOPICS} topics were read: others may"
+            f"only the first {MAX_COMMANDS} commands of each kind among {_MAX_TOPICS} topics were read: others may"
             " need a guard"
         )
-    for topic in graph.legs[:_MOST_NAMED]:
+    for topic in graph.legs[:_MAX_NAMED]:
         writer.left_out.append(
             f"{topic.name} comes from {', '.join(topic.publishers)}, which carries out a velocity of the base: it may"
             " move legs, and a robot with legs may fall at a stop; if it moves an arm:"
             f" rosrv guard new joints {topic.name} --shadow"
         )
-    for topic in graph.undecided[:_MOST_NAMED]:
+    for topic in graph.undecided[:_MAX_NAMED]:
         ends = f"{', '.join(topic.publishers)} to {', '.join(sorted(graph.ends(topic)))}"
         writer.left_out.append(
             f"{topic.name} ({topic.type}) goes from {ends}, and may be a command or a measurement; if it moves the"
@@ -324,7 +324,7 @@ class _Writer:
         rate = button.slowest()
         if len(button.publishers) > 1:
             self._say(
-                f"{button.name} comes from {', '.join(button.publishers[:_MOST_NAMED])}: {preset} waits for"
+                f"{button.name} comes from {', '.join(button.publishers[:_MAX_NAMED])}: {preset} waits for"
                 f" {counted(len(button.publishers), 'node')}; if not each is a button, set publishers"
             )
         if not button.rate and not button.subscribers:
@@ -577,12 +577,12 @@ _NEVER_PROTECTED = (
     " failure of this appliance, its power or its network, for which the driver needs its own timeout and the robot its"
     " own emergency stop; and nothing is stopped by a guard in shadow mode"
 )
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 
 
 def _named(topics: Sequence[TopicFacts]) -> str:
-    named = ", ".join(topic.name for topic in topics[:_MOST_NAMED])
-    return f"{named} and {len(topics) - _MOST_NAMED} others" if len(topics) > _MOST_NAMED else named
+    named = ", ".join(topic.name for topic in topics[:_MAX_NAMED])
+    return f"{named} and {len(topics) - _MAX_NAMED} others" if len(topics) > _MAX_NAMED else named
 
 
 def _stops(topic: str) -> bool:
@@ -618,7 +618,7 @@ def _slug(topic: str) -> str:
 
 def _publishers(topic: TopicFacts) -> dict[str, str]:
     """Return the number of nodes that have to be heard, if a guard can know all of them."""
-    return {"publishers": f"{len(topic.publishers)}"} if len(topic.publishers) <= _MOST_PUBLISHERS else {}
+    return {"publishers": f"{len(topic.publishers)}"} if len(topic.publishers) <= _MAX_PUBLISHERS else {}
 
 
 def _silence_of_each(topic: TopicFacts) -> dict[str, str]:
@@ -627,7 +627,7 @@ def _silence_of_each(topic: TopicFacts) -> dict[str, str]:
     return {"silent": f"{min(max(2.5 / rate, 0.5), 60):.3g}"} if rate > 0 else {}
 
 
-_MOST_PUBLISHERS = 8
+_MAX_PUBLISHERS = 8
 
 
 def _silence(topic: TopicFacts, periods: int, least: float, most: float) -> dict[str, str]:

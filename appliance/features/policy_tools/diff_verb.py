@@ -34,7 +34,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import refused, say
 
-_MOST_CALLERS = 4  # names in one line
+_MAX_CALLERS = 4  # names in one line
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,8 @@ def _say_requests(differences: list[Difference]) -> None:
     for (word, category, resource, before, after), its in equal.items():
         style = "yellow" if its[0].granted else "red"
         callers = [one.request.caller_id for one in its if one.request.caller_id]
-        named = ", ".join(callers[:_MOST_CALLERS]) or "clients without a name"
-        more = f" and {len(callers) - _MOST_CALLERS} more" if len(callers) > _MOST_CALLERS else ""
+        named = ", ".join(callers[:_MAX_CALLERS]) or "clients without a name"
+        more = f" and {len(callers) - _MAX_CALLERS} more" if len(callers) > _MAX_CALLERS else ""
         say(
             f"  {word}: {category} {resource} by {named}{more}, in {counted(sum(one.count for one in its), 'record')}",
             style,

@@ -41,7 +41,7 @@ from appliance.policy.rights import Right, decide_right
 from appliance.policy.sections import PARAMETERS
 from rosmop.tool.terminal import printable, refused, say
 
-_MOST_SHOWN = 20
+_MAX_SHOWN = 20
 
 
 class WouldDeny(msgspec.Struct, frozen=True):
@@ -174,16 +174,16 @@ def _show(appliance: Appliance, found: _Comparison, period: RecordedPeriod, chan
         return
     number = sum(row.count for row in rows)
     say(f"would have denied since {start}: {number}", "yellow" if rows else "green")
-    for row in rows[:_MOST_SHOWN]:
+    for row in rows[:_MAX_SHOWN]:
         say(printable(f"  {row.count}x {row.caller_id or 'a client'}: {row.reason}"), "yellow")
-    if len(rows) > _MOST_SHOWN:
-        say(f"  and {counted(len(rows) - _MOST_SHOWN, 'more request')}: --json lists all", "yellow")
+    if len(rows) > _MAX_SHOWN:
+        say(f"  and {counted(len(rows) - _MAX_SHOWN, 'more request')}: --json lists all", "yellow")
     if ended:
         say(f"would end {counted(len(ended), 'right')} of nodes that run now", "yellow")
-    for end in ended[:_MOST_SHOWN]:
+    for end in ended[:_MAX_SHOWN]:
         say(printable(f"  {end.caller_id or 'a client'}: {end.reason}"), "yellow")
-    if len(ended) > _MOST_SHOWN:
-        say(f"  and {len(ended) - _MOST_SHOWN} more: --json lists all", "yellow")
+    if len(ended) > _MAX_SHOWN:
+        say(f"  and {len(ended) - _MAX_SHOWN} more: --json lists all", "yellow")
     compared = f"{counted(found.requests, 'recorded request')}, {counted(found.rights, 'right')} of nodes that run now"
     say(f"compared: {compared}", "" if found.requests else "yellow")
     if period.removed:

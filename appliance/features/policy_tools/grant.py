@@ -26,7 +26,7 @@ from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import ASK, BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
 
-_MOST_LINES = 8  # the most lines that one grant may change, besides one for each right
+_MAX_LINES = 8  # the most lines that one grant may change, besides one for each right
 
 
 NO_DECISION = (
@@ -87,7 +87,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest, unt
     if block is not None:
         raise UngrantableError(f"no line of a policy grants it: {block.reason}")
     added: list[str] = []
-    most = _MOST_LINES + len(asked.rights)
+    most = _MAX_LINES + len(asked.rights)
     while (
         missing := next((right for right in asked.rights if not _granted(policy, right)), None)
     ) is not None:

@@ -55,12 +55,12 @@ from appliance.policy.model import Category
 
 # Find the uses of each rule of the policy in force, for `/v1/policy/uses`.
 
-MOST_READ = 100_000
+MAX_READ = 100_000
 """The most records that one request reads, newest first in each kind. With more, what was not seen is unknown."""
 
 
 def policy_uses(
-    path: Path, current: PolicyKnown, registrations: Iterable[Registration], since: int, most: int = MOST_READ
+    path: Path, current: PolicyKnown, registrations: Iterable[Registration], since: int, most: int = MAX_READ
 ) -> PolicyUses:
     """Return the uses since a time (nanoseconds since the epoch). Raises `LogUnreadableError`."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
@@ -107,7 +107,7 @@ class _NewestRecords:
 
 
 _NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
-_MOST_SHOWN = 1000
+_MAX_SHOWN = 1000
 
 
 def routes(services: Services) -> Routes:
@@ -177,7 +177,7 @@ def _of_policy(services: Services) -> Routes:
             exists=current.cases is not None,
             passed=passed,
             failed=len(cases) - passed,
-            cases=cases[:_MOST_SHOWN],
+            cases=cases[:_MAX_SHOWN],
         )
 
     return router

@@ -26,14 +26,14 @@ from appliance.features.recorder.recording_answers import (
     TriggerKind,
 )
 from appliance.features.recorder.recording_plan import RecordingPlan
-from appliance.features.recorder.recording_store import MOST_TEMPORARY
+from appliance.features.recorder.recording_store import MAX_TEMPORARY
 from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.view import RecorderState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
-_MOST_TOPICS = 20
+_MAX_TOPICS = 20
 _LONGEST_NAME = 500
 _M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemoved, recorder_link.MemoryLent)
 
@@ -136,8 +136,8 @@ class RecordingOrders:
     async def read(self, request: recording_requests.RecordingRead, who: str) -> Recording:
         """Record who reads messages. Repetitions within a few seconds are only counted."""
         topics = request.topics
-        if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
-            raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
+        if len(topics) > _MAX_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
+            raise SenselessError(f"at most {_MAX_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
         reason = f"messages of {', '.join(topics) or 'all topics'}, by {who}"
         return await self._given_out(request.id, "recording read", reason, who, reads=True, topics=topics)
 
@@ -176,7 +176,7 @@ class RecordingOrders:
         lent = await self._ask(
             lambda number: recorder_link.MemoryWanted(number, trigger, since, until), recorder_link.MemoryLent
         )
-        self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_TEMPORARY:])
+        self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MAX_TEMPORARY:])
         return lent.recording
 
     async def remove(self, request: recording_requests.RecordingRemove, who: str) -> Recording:

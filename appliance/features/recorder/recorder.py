@@ -20,10 +20,10 @@ from appliance.audit.search.search import Follower, export, search
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.features.recorder import recorder_link
-from appliance.features.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
+from appliance.features.recorder.recording import MAX_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.features.recorder.recording_answers import Recording, Trigger
 from appliance.features.recorder.recording_plan import KEPT, HourlyLimit, recording_owner, span, trigger_of
-from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
+from appliance.features.recorder.recording_store import MAX_TEMPORARY, RecordingStore
 from appliance.features.recorder.settings import RecorderRules
 
 SETTLE_SECONDS = 0.5
@@ -31,10 +31,10 @@ SETTLE_SECONDS = 0.5
 
 _IDLE_SECONDS, _BUSY_SECONDS = 0.5, 0.25
 _PAGES = 20  # pages of the log in one step
-_MOST_RECORDS = 200_000  # records of the log in one recording
+_MAX_RECORDS = 200_000  # records of the log in one recording
 _SECOND = 1_000_000_000
 _TELL_AGAIN = 600 * _SECOND
-_MOST_TOLD = 4096
+_MAX_TOLD = 4096
 _log = structlog.get_logger()
 
 
@@ -145,7 +145,7 @@ class Recorder:
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
         try:
             if not self._store.has_temporary_room(now):
-                reason = f"{MOST_TEMPORARY} requests came within seconds: try again in half a minute"
+                reason = f"{MAX_TEMPORARY} requests came within seconds: try again in half a minute"
                 self._answers.append(recorder_link.RecordingRefused(wanted.number, reason))
                 return
             self._store.mark_temporary(progress.id)
@@ -208,7 +208,7 @@ class Recorder:
         begun = Filter(since=self._memory - int(self._rules.before * _SECOND), until=self._memory)
         unmade: dict[str, Trigger] = {}
         try:
-            for entry in islice(export(self._log, begun), _MOST_RECORDS):
+            for entry in islice(export(self._log, begun), _MAX_RECORDS):
                 trigger = trigger_of(entry.record, self._rules.triggers)
                 planned = str(entry.record.detail.get("recording", ""))
                 if trigger is not None and planned and not self._store.has(planned):
@@ -246,7 +246,7 @@ class Recorder:
         if (
             planned or abs(now - self._told.get(kind, -_TELL_AGAIN)) >= _TELL_AGAIN
         ):  # `abs`, because the clock may have been set back
-            if len(self._told) > _MOST_TOLD:
+            if len(self._told) > _MAX_TOLD:
                 self._told.clear()
             self._told[kind] = now
             self._answers.append(recorder_link.RecordingMissed(trigger, why, planned))
@@ -332,7 +332,7 @@ class Recorder:
         progress = making.progress
         within = Filter(since=progress.began, until=progress.ends + 1)
         try:
-            records = list(islice(export(self._log, within), _MOST_RECORDS))
+            records = list(islice(export(self._log, within), _MAX_RECORDS))
         except LogUnreadableError as error:
             records = []
             progress.why_not = progress.why_not or f"the audit log could not be read: {error}"
@@ -403,5 +403,5 @@ def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
     if trigger.charged_to in KEPT and progress.charged_to not in KEPT:
         progress.charged_to = trigger.charged_to  # from now on not removed in favour of a host's recording
     known = any(trigger.record == other.record for other in progress.triggers)
-    if not known and len(progress.triggers) < MOST_TRIGGERS:
+    if not known and len(progress.triggers) < MAX_TRIGGERS:
         progress.triggers.append(trigger)

@@ -3,7 +3,7 @@
 1. After each step, the file `progress` is replaced atomically. A new recorder cuts the bag at the length in it
    and continues: the memory still holds the unwritten messages.
 2. Missing messages are reported, as a count by topic if possible.
-3. The headers of connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.
+3. The headers of connections have at most `_MAX_HEADERS` bytes, because publishers choose their content.
 """
 
 import hashlib
@@ -58,7 +58,7 @@ from roswire.tcpros import decode_header
 _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
-MOST_MESSAGES = 1 << 53
+MAX_MESSAGES = 1 << 53
 
 _Blocks = dict[int, tuple[int, BlockRow]]
 
@@ -185,7 +185,7 @@ class RingReader:
                 if at + RECORD.size > len(view):
                     break
                 mark, messages, size, time, first = RECORD.unpack_from(view, at)
-                if mark != MARK or first > MOST_MESSAGES:
+                if mark != MARK or first > MAX_MESSAGES:
                     torn, done = True, len(view)  # the start of the next record is unknown
                     break
                 torn, in_doubt = torn or (in_doubt and time >= since), False
@@ -229,11 +229,11 @@ def _frames(view: memoryview, messages: int) -> list[memoryview] | None:
 
 
 RECORDS, LOG = "/rosrv/records", "/rosrv/log"
-MOST_TRIGGERS = 200
+MAX_TRIGGERS = 200
 _CHUNK = 1 << 20
-_MOST_NAMED = 10
-_MOST_LEFT_OUT = 100
-_MOST_HEADERS = 8 << 20
+_MAX_NAMED = 10
+_MAX_LEFT_OUT = 100
+_MAX_HEADERS = 8 << 20
 _LENGTH = struct.Struct("<I")
 _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
@@ -258,7 +258,7 @@ class Progress(msgspec.Struct):
     topics: list[RecordedTopic] = []
     torn: list[str] = []
     unconnected: int = 0
-    """The number of messages left out because headers exceed `_MOST_HEADERS`."""
+    """The number of messages left out because headers exceed `_MAX_HEADERS`."""
     why_not: str = ""
     charged_to: str = OPERATORS
     hold: int = 0
@@ -321,7 +321,7 @@ class RecordingInProgress:
             progress.torn.append(header["topic"])
         if not found.batches:
             return
-        if _key(header) not in self._numbers and self._headers + _length(header) > _MOST_HEADERS:
+        if _key(header) not in self._numbers and self._headers + _length(header) > _MAX_HEADERS:
             progress.unconnected += sum(len(batch.frames) for batch in found.batches)
             return
         connection = self._connection(header)
@@ -333,7 +333,7 @@ class RecordingInProgress:
         size = 0
         for batch in found.batches:
             gap = max(0, batch.first - following.get(found.stream, batch.first))
-            row.missed = min(row.missed + gap, MOST_MESSAGES)
+            row.missed = min(row.missed + gap, MAX_MESSAGES)
             following[found.stream] = batch.first + len(batch.frames)
             if progress.size + size + self._headers > self._largest:
                 progress.why_not = f"it reached {self._largest} bytes, an eighth of recorder.disk"
@@ -356,7 +356,7 @@ class RecordingInProgress:
         if seen and row not in self._left_out:
             self._left_out.add(row)
             progress.claims += row.why != NAMED
-            if len(progress.left_out) < _MOST_LEFT_OUT:
+            if len(progress.left_out) < _MAX_LEFT_OUT:
                 progress.left_out.append(row)
 
     def _connection(self, header: dict[str, str]) -> int:
@@ -408,12 +408,12 @@ class RecordingInProgress:
         if progress.unconnected:
             reasons.append(f"{counted(progress.unconnected, 'message')} of too many different connections")
         if progress.claims:
-            claims = [row.topic for row in progress.left_out if row.why != NAMED][:_MOST_NAMED]
+            claims = [row.topic for row in progress.left_out if row.why != NAMED][:_MAX_NAMED]
             named = ", ".join(claims) + (" and others" if progress.claims > len(claims) else "")
             reasons.append(f"left out because of the publisher's type (recorder.never): {named}")
         if progress.torn:
-            named = ", ".join(progress.torn[:_MOST_NAMED]) + (
-                " and others" if progress.torn[_MOST_NAMED:] else ""
+            named = ", ".join(progress.torn[:_MAX_NAMED]) + (
+                " and others" if progress.torn[_MAX_NAMED:] else ""
             )
             reasons.append(f"the beginning was no longer in recorder.memory: {named}")
         for reader, (missed_before, refused_before) in zip(self._readers, progress.not_there, strict=False):

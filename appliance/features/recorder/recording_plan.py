@@ -5,7 +5,7 @@ none. The recorder finds the triggers in the audit log, so the log proves each o
 restarts. A recording is charged to the cause of its first trigger: `ROBOT`, a host or network as the policy names it,
 `UNKNOWN` for all other hosts together, `OPERATORS`, or `APPLIANCE`. Times are nanoseconds since the epoch.
 
-1. Each host has at most one open recording, and all hosts except the robot together `_MOST_AT_ONCE`. An act
+1. Each host has at most one open recording, and all hosts except the robot together `_MAX_AT_ONCE`. An act
    during a recording extends it, up to `longest`.
 2. Each host may begin `per_hour` recordings an hour for each kind of trigger.
 3. Recordings of one host do not overlap, unless an order requests one.
@@ -32,11 +32,11 @@ KEPT = frozenset({ROBOT, OPERATORS})
 """The owners whose recordings are never removed for another host's recording."""
 
 _OURS = KEPT | {APPLIANCE}
-_MOST_AT_ONCE = 2
+_MAX_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
 _OBSTACLE_LASTS = 60 * _SECOND
-_MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
+_MAX_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
 _BY_EVENT: dict[str, tuple[TriggerKind, ...]] = {
@@ -130,7 +130,7 @@ class HourlyLimit:
                 self._begun.setdefault((recording.charged_to, trigger.what), deque()).append(trigger.time)
 
     def take(self, charged_to: str, what: TriggerKind, now: int) -> bool:
-        for key, begun in list(self._begun.items()) if len(self._begun) > _MOST_HOSTS else []:
+        for key, begun in list(self._begun.items()) if len(self._begun) > _MAX_HOSTS else []:
             if begun[-1] + _HOUR <= now:
                 del self._begun[key]
         begun = self._begun.setdefault((charged_to, what), deque())
@@ -188,8 +188,8 @@ class RecordingPlan:
         if since <= now < since + _OBSTACLE_LASTS:  # not after the clock was set back
             return "", why_not
         others = [name for name, (_id, other) in self._open.items() if name != ROBOT and now <= other.ends]
-        if own != ROBOT and len(others) >= _MOST_AT_ONCE:
-            return "", f"{_MOST_AT_ONCE} recordings of other hosts are in progress"
+        if own != ROBOT and len(others) >= _MAX_AT_ONCE:
+            return "", f"{_MAX_AT_ONCE} recordings of other hosts are in progress"
         if not self._limit.take(charged_to, what, now):
             return "", self._limit.refusal(charged_to)
         ended = found[1].ends if found is not None else self._ended.get(own, 0)
@@ -221,7 +221,7 @@ class RecordingPlan:
         own = recording_owner(recording.charged_to)
         self._close(own, recording.id)
         self._ended[own] = max(recording.ended, self._ended.pop(own, 0))
-        if len(self._ended) > _MOST_HOSTS:
+        if len(self._ended) > _MAX_HOSTS:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:

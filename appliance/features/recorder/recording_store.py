@@ -10,7 +10,7 @@ garbage.
    most bytes.
 3. The file `noted` marks a recording that is in the audit log. Other recordings are reported again.
 4. The file `lent` marks a temporary recording, which does not count in `disk`. A new one replaces the oldest of
-   `MOST_TEMPORARY`, unless its reader may not have opened it yet.
+   `MAX_TEMPORARY`, unless its reader may not have opened it yet.
 5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
    atomically before anything in it is removed.
 """
@@ -29,11 +29,11 @@ from appliance.features.recorder.recording_answers import Recording
 from appliance.features.recorder.recording_plan import KEPT
 
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
-MOST_KEPT = 500
+MAX_KEPT = 500
 TEMPORARY_SECONDS = 600
-MOST_TEMPORARY = 4
+MAX_TEMPORARY = 4
 _OPENING_SECONDS = 30
-_MOST_DESCRIBED = 32 << 20  # bytes; control gets all descriptions in one message
+_MAX_DESCRIBED = 32 << 20  # bytes; control gets all descriptions in one message
 _NOTED, _TEMPORARY, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
@@ -150,8 +150,8 @@ class RecordingStore:
 
     def has_temporary_room(self, now: int) -> bool:
         """Return False if all temporary recordings are too new to remove."""
-        self._expire(now, MOST_TEMPORARY - 1, _OPENING_SECONDS)
-        return len(self._temporary) < MOST_TEMPORARY
+        self._expire(now, MAX_TEMPORARY - 1, _OPENING_SECONDS)
+        return len(self._temporary) < MAX_TEMPORARY
 
     def publish_temporary(self, recording: Recording) -> None:
         self.part(recording.id).rename(self._folder / recording.id)
@@ -232,10 +232,10 @@ class RecordingStore:
             why = "hosts other than the robot used their quota of recorder.disk"
         elif sum(held.values()) > self._disk:
             why = "recorder.disk is full"
-        elif len(self.recordings) + len(making) >= MOST_KEPT:
-            why = f"the limit is {MOST_KEPT} recordings"
-        elif sum(self._described.values()) > _MOST_DESCRIBED:
-            why = f"the descriptions of all recordings have more than {_MOST_DESCRIBED} bytes"
+        elif len(self.recordings) + len(making) >= MAX_KEPT:
+            why = f"the limit is {MAX_KEPT} recordings"
+        elif sum(self._described.values()) > _MAX_DESCRIBED:
+            why = f"the descriptions of all recordings have more than {_MAX_DESCRIBED} bytes"
         else:
             return None, ""
         others, own = kept_here - KEPT, kept_here & KEPT

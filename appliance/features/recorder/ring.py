@@ -48,8 +48,8 @@ _WORDS = 8  # 64-bit words of a row
 _ROW = struct.Struct("=QQQIIQ24x")  # birth, stream, number, kind, begins, used
 MISSED, REFUSED = 0, 1  # indexes of the counters' words
 _LONG = 4  # blocks; a longer record begins in a new block, so that it does not depend on a much older block
-_MOST_NUMBER = 1 << 62
-_MOST_HEADERS = 4  # headers may take a quarter
+_MAX_NUMBER = 1 << 62
+_MAX_HEADERS = 4  # headers may take a quarter
 
 
 class Geometry(NamedTuple):
@@ -84,9 +84,9 @@ class BlockRow(NamedTuple):
     def sound(self) -> bool:
         """Return whether the numbers are possible: a compromised writer's numbers must not overflow a word."""
         return (
-            0 < self.birth < _MOST_NUMBER
-            and 0 < self.stream < _MOST_NUMBER
-            and self.number < _MOST_NUMBER
+            0 < self.birth < _MAX_NUMBER
+            and 0 < self.stream < _MAX_NUMBER
+            and self.number < _MAX_NUMBER
             and self.kind in {HEADER, DATA}
         )
 
@@ -331,7 +331,7 @@ class RingWriter:
             has, whole = (
                 (host.headers, self._most_of_host) if of_host else (self._headers, self.geometry.blocks)
             )
-            return has + needed > whole // _MOST_HEADERS
+            return has + needed > whole // _MAX_HEADERS
 
         for of_host in (False, True):
             closed = (

@@ -30,8 +30,8 @@ from appliance.features.recorder.recording_answers import (
 )
 from appliance.features.recorder.timeline import (
     COLUMNS,
-    MOST_COLUMNS,
-    MOST_NEIGHBOURS,
+    MAX_COLUMNS,
+    MAX_NEIGHBOURS,
     NEIGHBOURS,
     is_record,
     messages_around,
@@ -108,7 +108,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         since: _Moment = None,
         until: _Moment = None,
         columns: Annotated[
-            int, Query(ge=1, le=MOST_COLUMNS, description="number of columns that the time is divided into")
+            int, Query(ge=1, le=MAX_COLUMNS, description="number of columns that the time is divided into")
         ] = COLUMNS,
         record: Annotated[
             str | None,
@@ -139,7 +139,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         ],
         topic: _Topics = [],  # noqa: B006  FastAPI copies it
         neighbours: Annotated[
-            int, Query(ge=1, le=MOST_NEIGHBOURS, description="number of messages before, and after")
+            int, Query(ge=1, le=MAX_NEIGHBOURS, description="number of messages before, and after")
         ] = NEIGHBOURS,
     ) -> RecordedMessages:
         """Messages of a recording around a time, as fields. For investigators; the audit log records who read them."""

@@ -37,13 +37,13 @@ from appliance.features.recorder.recording_answers import (
 from appliance.features.recorder.recording_plan import kinds_of
 from roswire.message_view import PublisherReader
 
-COLUMNS, MOST_COLUMNS = 200, 1000
-NEIGHBOURS, MOST_NEIGHBOURS = 5, 25
-MOST_TOPICS = 300
-MOST_EVENTS = 500
-_MOST_BYTES = 1 << 20  # bytes read of a message; people are shown far fewer
+COLUMNS, MAX_COLUMNS = 200, 1000
+NEIGHBOURS, MAX_NEIGHBOURS = 5, 25
+MAX_TOPICS = 300
+MAX_EVENTS = 500
+_MAX_BYTES = 1 << 20  # bytes read of a message; people are shown far fewer
 _LONGEST_RECORD = 1 << 22
-_MOST_LATER = 20_000  # records after a recording that are searched for repetitions during it
+_MAX_LATER = 20_000  # records after a recording that are searched for repetitions during it
 _SECOND = 1_000_000_000
 _ROUNDED = 1000  # nanoseconds by which a record's rounded time may differ from that of its message
 _RECORD_ID = re.compile("[0-9a-f]{20}")
@@ -113,7 +113,7 @@ def timeline(
                 wanted.spread(first, last, event.times, counts[event.kind])
             if event.time <= end:
                 listed.add(event)
-    kept = sorted(flows, key=lambda flow: -sum(flow.counts))[:MOST_TOPICS]
+    kept = sorted(flows, key=lambda flow: -sum(flow.counts))[:MAX_TOPICS]
     return Timeline(
         recording.id,
         start,
@@ -127,26 +127,26 @@ def timeline(
 
 
 class _Listed:
-    """The first `MOST_EVENTS`, or those around the event of `record` if it comes later."""
+    """The first `MAX_EVENTS`, or those around the event of `record` if it comes later."""
 
     def __init__(self, record: str) -> None:
         self._record = record
         self._first: list[RecordedEvent] = []
-        self._around: deque[RecordedEvent] = deque(maxlen=MOST_EVENTS)
+        self._around: deque[RecordedEvent] = deque(maxlen=MAX_EVENTS)
         self._found = self.happened = 0
         """The number of events up to that of `record` (0: none yet), and of all events."""
 
     @property
     def events(self) -> list[RecordedEvent]:
-        return list(self._around) if self._found > MOST_EVENTS else self._first
+        return list(self._around) if self._found > MAX_EVENTS else self._first
 
     def add(self, event: RecordedEvent) -> None:
         self.happened += 1
         if event.record == self._record:
             self._found = self.happened
-        if len(self._first) < MOST_EVENTS:
+        if len(self._first) < MAX_EVENTS:
             self._first.append(event)
-        if not self._found or self.happened < self._found + MOST_EVENTS // 2:
+        if not self._found or self.happened < self._found + MAX_EVENTS // 2:
             self._around.append(event)
 
 
@@ -177,7 +177,7 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
 def _counted_later(log: Path, recording: Recording) -> list[AuditRecord]:
     ended = recording.ended
     written = Filter(since=ended + 1, until=ended + int((FoldSettings().seconds + 1) * _SECOND))
-    found = (entry.record for entry in islice(export(log, written), _MOST_LATER))
+    found = (entry.record for entry in islice(export(log, written), _MAX_LATER))
     return [one for one in found if _is_before(one.detail.get("first_time"), ended)]
 
 
@@ -264,7 +264,7 @@ def messages_around(
             header = reader.connections[number]
             if number not in readers:
                 readers[number] = PublisherReader(header)
-            size, data = reader.body(found, _MOST_BYTES)
+            size, data = reader.body(found, _MAX_BYTES)
             fields, why = readers[number].read(data)
             messages.append(
                 RecordedMessage(

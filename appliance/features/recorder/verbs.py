@@ -27,8 +27,8 @@ from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import RecordedMessages, Recording, Sender, Timeline
 from appliance.features.recorder.timeline import (
-    MOST_COLUMNS,
-    MOST_NEIGHBOURS,
+    MAX_COLUMNS,
+    MAX_NEIGHBOURS,
     NEIGHBOURS,
     is_record,
     messages_around,
@@ -133,7 +133,7 @@ def show_timeline(
     ] = None,
     until: Annotated[str | None, typer.Option(help="Up to this time", show_default=False)] = None,
     columns: Annotated[
-        int, typer.Option(min=1, max=MOST_COLUMNS, help="Columns that the time is divided into")
+        int, typer.Option(min=1, max=MAX_COLUMNS, help="Columns that the time is divided into")
     ] = 60,
 ) -> None:
     """Show the messages on each topic and the events of a recording on one time line.
@@ -176,7 +176,7 @@ def messages(
         list[str] | None, typer.Option(help="Only this topic (repeatable)", show_default=False)
     ] = None,
     neighbours: Annotated[
-        int, typer.Option(min=1, max=MOST_NEIGHBOURS, help="Number of messages before and after it")
+        int, typer.Option(min=1, max=MAX_NEIGHBOURS, help="Number of messages before and after it")
     ] = NEIGHBOURS,
 ) -> None:
     """Show the messages of a recording around a point in time. The audit log records the request.

@@ -41,7 +41,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 ONLINE = EndKind("session", stored=False)
 _PREFIX = "sso:"  # no token has such a name
-_MOST, _MOST_OF_PERSON = SESSIONS.bounds.whole, SESSIONS.bounds.host
+_MAX, _MAX_OF_PERSON = SESSIONS.bounds.whole, SESSIONS.bounds.host
 
 
 class _Kept(NamedTuple):
@@ -80,9 +80,9 @@ class SessionTable:
         own = [one for one in present if one.subject == identity.subject]
         ended = [one for one in own if (one.role, one.groups) != rights]
         staying = [one for one in own if one not in ended]
-        ended += staying[: max(0, len(staying) + 1 - _MOST_OF_PERSON)]
-        if len(present) - len(ended) >= _MOST:
-            raise TokenRefusedError(f"{_MOST} people's sessions are open: end some (rosrv sso end NAME)")
+        ended += staying[: max(0, len(staying) + 1 - _MAX_OF_PERSON)]
+        if len(present) - len(ended) >= _MAX:
+            raise TokenRefusedError(f"{_MAX} people's sessions are open: end some (rosrv sso end NAME)")
         self._drop(*(one.id for one in ended))
         session = SignedOn(keys.id, name, identity.subject, identity.mail, *rights, identity.ends)
         # No hash: a session has only keys, and its token is never sent.

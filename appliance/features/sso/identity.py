@@ -17,7 +17,7 @@ from appliance.features.sso.settings import Sso
 _ESCAPED = re.compile(rb"[^A-Za-z0-9._@+|:-]|^[^A-Za-z0-9]")
 _LONGEST_NAME, _DIGITS = 128, 32
 _UNPRINTABLE = re.compile(rb"[^!-$&-~]")
-_MOST_VALUES = 5000
+_MAX_VALUES = 5000
 _UPPER = {ord(letter): ord(letter.lower()) for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"}
 
 
@@ -103,11 +103,11 @@ def _at(claims: object, path: str) -> Iterator[object]:
 def _values(claims: Mapping[str, Any], path: str) -> frozenset[str]:
     found = _found(claims, path)
     found = [found] if isinstance(found, str) else found
-    if not isinstance(found, list) or len(found) > _MOST_VALUES:
+    if not isinstance(found, list) or len(found) > _MAX_VALUES:
         overage = "_claim_names" in claims or claims.get("hasgroups") in (True, "true")
         hint = "it leaves out the groups of a person who has many: use app roles" if overage else ""
         raise SignOnRefusedError(
-            f"the claim {path} (sso.roles_claim) must be a string or a list of at most {_MOST_VALUES}: "
+            f"the claim {path} (sso.roles_claim) must be a string or a list of at most {_MAX_VALUES}: "
             + (hint or "let the provider put it into the ID token")
         )
     return frozenset(unicodedata.normalize("NFC", value) for value in found if isinstance(value, str))

@@ -32,7 +32,7 @@ from appliance.features.sso.sign_on import SignOns
 
 _log = structlog.get_logger()
 _LONGEST_SECRET = 4096
-_MOST_AT_ONCE = 32
+_MAX_AT_ONCE = 32
 
 
 def main(lifeline_fd: int, config: Path) -> None:
@@ -59,7 +59,7 @@ class _Process:
             task.cancel()
 
     def _said(self, message: Any) -> None:
-        if len(self._tasks) >= _MOST_AT_ONCE:
+        if len(self._tasks) >= _MAX_AT_ONCE:
             self._child.tell(
                 SignOnFailed(message.number, "too many sign-ons at once: try again", refused=False)
             )

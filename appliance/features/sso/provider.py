@@ -20,7 +20,7 @@ from appliance.features.sso.settings import origin_of
 
 _FRESH_SECONDS = 3600.0
 _AGAIN_SECONDS = 5.0
-_MOST_KEYS = 100
+_MAX_KEYS = 100
 _DISCOVERY = "/.well-known/openid-configuration"
 _OK = 200
 
@@ -103,8 +103,8 @@ class Provider:
         url = (await self.endpoints()).jwks_uri
         try:
             found = json.loads(await self._get(url))["keys"]
-            if not isinstance(found, list) or len(found) > _MOST_KEYS:
-                raise ValueError(f"`keys` is not a list of at most {_MOST_KEYS} keys")
+            if not isinstance(found, list) or len(found) > _MAX_KEYS:
+                raise ValueError(f"`keys` is not a list of at most {_MAX_KEYS} keys")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ProviderError(f"{url}: not a set of keys: {error}") from None
         return [key for key in found if isinstance(key, dict)]

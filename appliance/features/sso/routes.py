@@ -34,8 +34,8 @@ from appliance.features.sso.requests import SignOnBegin, SignOnComplete, SignOnP
 # 2. While all places are taken, the next free one goes to the address that has fewest, then to the one that has used
 #    them least. Without a queue, no address waits.
 
-MOST_AT_ONCE = 6  # of the 16 requests that may wait for other processes
-MOST_WAITING = 64
+MAX_AT_ONCE = 6  # of the 16 requests that may wait for other processes
+MAX_WAITING = 64
 WAITING_SECONDS = 10.0
 _REMEMBERED = 1024  # addresses
 
@@ -73,7 +73,7 @@ class SignOnPlaces:
     @asynccontextmanager
     async def place(self, peer: str) -> AsyncIterator[None]:
         key = peer_key(peer)
-        if self._running.total() < MOST_AT_ONCE:
+        if self._running.total() < MAX_AT_ONCE:
             self._running[key] += 1
         else:
             await self._wait(key)
@@ -100,7 +100,7 @@ class SignOnPlaces:
             self._waiting = [one for one in self._waiting if one[1] is not turn]
 
     def _make_room(self, key: str) -> None:
-        if len(self._waiting) < MOST_WAITING:
+        if len(self._waiting) < MAX_WAITING:
             return
         waiting = Counter(one for one, _ in self._waiting)
         other, most = waiting.most_common(1)[0]

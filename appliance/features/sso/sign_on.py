@@ -3,7 +3,7 @@
 1. Each sign-on has its own random state, nonce and code verifier. A state is accepted once.
 2. The keys of the browser's session are bound to the sign-on when it begins. So a stolen code, state or URL gives no
    other browser a session.
-3. Beyond `_MOST` sign-ons, a new one replaces the oldest of the address that has most, so a flood from one address
+3. Beyond `_MAX` sign-ons, a new one replaces the oldest of the address that has most, so a flood from one address
    ends only its own. Before that, an address may have all: many people can have one.
 """
 
@@ -173,7 +173,7 @@ def _refused(reason: str) -> SignOnRefusedError:
 
 
 PENDING_SECONDS = 600.0
-_MOST = SIGN_ONS.bounds.whole
+_MAX = SIGN_ONS.bounds.whole
 _LONGEST_CODE = 4096
 _OK = 200
 
@@ -293,7 +293,7 @@ class SignOns:
     def _make_room(self, address: str) -> None:
         now, peer = clock.now(), peer_key(address)
         self._pending = {state: one for state, one in self._pending.items() if one.until > now}
-        if len(self._pending) < _MOST:
+        if len(self._pending) < _MAX:
             return
         held = Counter({peer: 1})
         held.update(peer_key(one.address) for one in self._pending.values())

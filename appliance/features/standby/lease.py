@@ -31,8 +31,8 @@ CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different sp
 SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
 FARTHEST = 1 << 20  # takeovers and restarts that an appliance may have missed
 _RENEWABLE = 2 * EXPIRY  # in this time after its lease has lapsed, the other appliance has claimed, or cannot
-_MOST_PENDING = 16
-_MOST_TOLD = 400  # characters of a fault in a datagram
+_MAX_PENDING = 16
+_MAX_TOLD = 400  # characters of a fault in a datagram
 
 Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
 
@@ -389,7 +389,7 @@ class ApplianceLease:
     def _ask(self, now: float) -> PromiseRequest:
         self._number += 1
         self._asked[self._number] = now
-        self._asked.pop(self._number - _MOST_PENDING, None)
+        self._asked.pop(self._number - _MAX_PENDING, None)
         return PromiseRequest(self.epoch, self._session, self._number, _in_datagram(self.fault))
 
     def _take_over(self) -> TakeOver:
@@ -399,5 +399,5 @@ class ApplianceLease:
 def _in_datagram(fault: str) -> str:
     """Return a fault without the middle of a long one: its beginning says what is wrong, its end what is done."""
     text = fault.encode("ascii", "replace").decode("ascii")
-    half = _MOST_TOLD // 2
-    return text if len(text) <= _MOST_TOLD else f"{text[:half]}...{text[-half:]}"
+    half = _MAX_TOLD // 2
+    return text if len(text) <= _MAX_TOLD else f"{text[:half]}...{text[-half:]}"

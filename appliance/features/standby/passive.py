@@ -136,7 +136,7 @@ class TakeoverCheck:
 
 # Serve the api of a standby: it knows the replicated tokens, and gets the same answers as the admin socket.
 
-_MOST_WAITING = 64
+_MAX_WAITING = 64
 _READ_SECONDS = 2.0
 _TAKING_OVER = "the appliance is taking over: try again"
 _NO_DOORS = "this appliance is the standby: open the door at the active appliance (rosrv standby status)"
@@ -229,7 +229,7 @@ class PassiveRest:
             self._send(ConnectionAnswered(message.number, 503, _NO_DOORS))
         if not isinstance(message, RequestMade):
             return  # the standby records no calls: the active appliance records its own
-        if len(self._serving) >= _MOST_WAITING:
+        if len(self._serving) >= _MAX_WAITING:
             text = "too many requests wait for the appliance: try again"
             self._answer(message.number, AdminAnswer(False, error=text, trouble="busy"))
             return
@@ -260,7 +260,7 @@ class PassiveRest:
 
 
 _AGAIN_SECONDS = 0.3
-_MOST_AGAIN_SECONDS = 5.0  # after refusals: each begins with the whole state
+_MAX_AGAIN_SECONDS = 5.0  # after refusals: each begins with the whole state
 _ADMIN = "admin"
 
 _log = structlog.get_logger()
@@ -472,7 +472,7 @@ class PassiveControl:
                     self._connected = False
                     if not (refused and self._receiver.refusal.reason):
                         self._away_since = clock.now()
-            pause = min(2 * pause, _MOST_AGAIN_SECONDS) if self._receiver.refusal.reason else _AGAIN_SECONDS
+            pause = min(2 * pause, _MAX_AGAIN_SECONDS) if self._receiver.refusal.reason else _AGAIN_SECONDS
             await asyncio.sleep(pause)
 
     async def _prepare_tunnels(self) -> None:

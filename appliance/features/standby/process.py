@@ -50,7 +50,7 @@ from appliance.features.standby.witness.protocol import (
 
 # The datagrams between an appliance and the witness.
 
-_MOST_PENDING = 32
+_MAX_PENDING = 32
 
 _Count = Annotated[int, msgspec.Meta(ge=0, le=HIGHEST)]
 
@@ -85,7 +85,7 @@ class WitnessChannel:
     def write(self, request: WitnessRequest) -> bytes:
         self._number += 1
         self._pending[self._number] = request
-        if len(self._pending) > _MOST_PENDING:
+        if len(self._pending) > _MAX_PENDING:
             del self._pending[next(iter(self._pending))]
         body = {
             "boot": self._boot,

@@ -40,7 +40,7 @@ from appliance.store.writer_thread import Database, StoreError
 
 _HANDSHAKE_SECONDS = 5.0
 _PAUSE_SECONDS = 1.0
-_MOST_CONNECTIONS = 8  # one is in use; others are in their handshake, or replace it
+_MAX_CONNECTIONS = 8  # one is in use; others are in their handshake, or replace it
 
 
 class _Server(Protocol):
@@ -66,7 +66,7 @@ class ReplicationListener:
                     _log.warning("a connection for replication was not accepted", error=str(error))
                     await asyncio.sleep(_PAUSE_SECONDS)
                     continue
-                if len(self._connections) >= _MOST_CONNECTIONS:
+                if len(self._connections) >= _MAX_CONNECTIONS:
                     connection.close()
                     continue
                 task = loop.create_task(self._serve(connection))

@@ -36,7 +36,7 @@ from appliance.signing.log_proof import ProofFault
 _SECOND = 1_000_000_000
 _TOLERANCE = 5 * _SECOND
 _DRIFT = 5_000  # clocks may differ by one part in this number
-_MOST_FINDINGS = 1000
+_MAX_FINDINGS = 1000
 _DECISION, _HANDED_OVER, _STAYED = "decision", "handed over", "switchover failed"
 _CLOCK_SET = ("clock set back", "clock set forward")
 _EVENTS = (TOOK_OVER, _HANDED_OVER, _STAYED, *_CLOCK_SET)
@@ -129,7 +129,7 @@ def verify_takeovers(*logs: VerifiedLog, absent: str = "") -> PairVerification:
     results = tuple(log.result for log in logs)
     return PairVerification(
         ok=not findings and all(result.ok for result in results), logs=results, takeovers=proofs,
-        findings=findings[:_MOST_FINDINGS], absent=absent,
+        findings=findings[:_MAX_FINDINGS], absent=absent,
     )  # fmt: skip
 
 

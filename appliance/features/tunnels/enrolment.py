@@ -23,7 +23,7 @@ from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.certification import NO_TUNNELS, Certification
 from appliance.features.tunnels.enrolment_kit import filled
-from appliance.features.tunnels.enrolment_tokens import MOST, BadEnrolmentTokenError
+from appliance.features.tunnels.enrolment_tokens import MAX, BadEnrolmentTokenError
 from appliance.features.tunnels.host_view import HostView, span
 from appliance.features.tunnels.tunnel_answers import Endpoint, KitParts, NewCertificate, PortsReport, Renewed
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
@@ -155,7 +155,7 @@ class HostSelfService:
 # Keep the results of port checks from other machines.
 
 _CLOCKS_DIFFER = 86_400.0
-_MOST_PORTS = 100
+_MAX_PORTS = 100
 
 
 class PortChecks:
@@ -186,7 +186,7 @@ class PortChecks:
                 "the time of the check is more than a day in the future: correct the clock of the host, or of the"
                 " appliance"
             )
-        row = PortsRow(key, state, sorted(set(request.open))[:_MOST_PORTS], min(checked, now), who)
+        row = PortsRow(key, state, sorted(set(request.open))[:_MAX_PORTS], min(checked, now), who)
         self._table.keep_ports(row)
         self._trail.happened(
             "ports checked",
@@ -473,8 +473,8 @@ class HostEnrolment(TunnelHosts):
             raise HostRefusedError(self._certification.rest.trouble)
         if not await self._certification.served.wait():
             raise HostRefusedError("REST is not running: see `rosrv status` and the log", ours=True)
-        if len(self._awaited.rows()) >= MOST:
-            raise HostRefusedError(f"{MOST} hosts are already awaited: revoke some")
+        if len(self._awaited.rows()) >= MAX:
+            raise HostRefusedError(f"{MAX} hosts are already awaited: revoke some")
 
     async def _await_no_longer(self, awaited: EnrolmentTokenRow, who: str) -> answers.Revoked:
         self._table.changed()

@@ -10,7 +10,7 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
 _FORM = SecretForm("rosrv-enrol_")
-MOST = 1000
+MAX = 1000
 ENROLMENT = EndKind("enrolment", dated=True)
 
 

@@ -28,7 +28,7 @@ from rosmop.tool.terminal import printable
 
 OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # most open ports listed on a terminal
-_MOST_TOLD = 100
+_MAX_TOLD = 100
 _UNANNOUNCED_SECONDS = 5.0
 
 
@@ -235,7 +235,7 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
         "addresses": addresses,
     }
     _say(running.as_json, report, "".join(_sentence(result, checked.ports) for result in results))
-    found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
+    found = sorted({port for result in results for port in result.open})[:_MAX_TOLD]
     result = HostPorts(checked.name or results[0].address, state, found, clock.wall())
     reported = not running.said or _report(running, result)
     if opened:

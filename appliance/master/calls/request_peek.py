@@ -20,7 +20,7 @@ _CALLS: Mapping[str, RosCall[Any]] = {**NODE_CALLS, **MASTER_CALLS}
 _LIMITS = XmlRpcLimits(body=8192, elements=256, depth=16, string=4096, parts=64)
 _UNKNOWN = "unknown"
 _LONGEST = 200
-_MOST_PARTS = 8
+_MAX_PARTS = 8
 _BEGINNING = 4096  # the number of bytes that are searched for the name of a method
 _METHOD = re.compile(rb"<methodName>\s*+([^<>&\s]{1,128}+)\s*+</methodName>")
 
@@ -60,8 +60,8 @@ def _only_named(method: str, caller_id: str | None, about: dict[str, str] | None
 def _parts(params: tuple[Value, ...]) -> str:
     parts = params[0] if params and isinstance(params[0], list) else []
     names = [str(part.get("methodName"))[:_LONGEST] for part in parts if isinstance(part, dict)]
-    more = f" and {len(names) - _MOST_PARTS} more" if len(names) > _MOST_PARTS else ""
-    return ", ".join(names[:_MOST_PARTS]) + more
+    more = f" and {len(names) - _MAX_PARTS} more" if len(names) > _MAX_PARTS else ""
+    return ", ".join(names[:_MAX_PARTS]) + more
 
 
 def method_named(body: bytes) -> str:

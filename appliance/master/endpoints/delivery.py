@@ -42,8 +42,8 @@ from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits
 
 _UNASKED_APART_SECONDS = 0.2  # between two rounds of calls to a node
 _AT_ONCE_OF_HOST = 8
-_MOST_UNANSWERED = 5  # in a row; a node that hangs for some seconds still gets the newest value
-_MOST_KEYS = 2_000  # of a node, that wait or are known not to be subscribed
+_MAX_UNANSWERED = 5  # in a row; a node that hangs for some seconds still gets the newest value
+_MAX_KEYS = 2_000  # of a node, that wait or are known not to be subscribed
 
 
 class Named(Protocol):
@@ -81,9 +81,9 @@ class UnaskedCalls(Generic[N, C]):
 
     def push(self, node: N, key: str, call: C) -> None:
         known = self._nodes.setdefault(node.key, _Node())
-        if key in known.foreign or known.unanswered >= _MOST_UNANSWERED:
+        if key in known.foreign or known.unanswered >= _MAX_UNANSWERED:
             return
-        if key not in known.waiting and len(known.waiting) >= _MOST_KEYS:
+        if key not in known.waiting and len(known.waiting) >= _MAX_KEYS:
             del known.waiting[next(iter(known.waiting))]
         known.waiting[key] = call
         if known.worker is None:
@@ -106,7 +106,7 @@ class UnaskedCalls(Generic[N, C]):
         while known.waiting:
             for key in [*known.waiting]:
                 await self._tell(node, known, key)
-                if known.unanswered >= _MOST_UNANSWERED:
+                if known.unanswered >= _MAX_UNANSWERED:
                     _log.info("a node does not take parameters that it did not ask for", node=node.name)
                     known.waiting.clear()
                     break
@@ -126,7 +126,7 @@ class UnaskedCalls(Generic[N, C]):
                 return
         known.unanswered = 0
         if isinstance(answer, list) and answer[:1] == [-1]:
-            if len(known.foreign) >= _MOST_KEYS:
+            if len(known.foreign) >= _MAX_KEYS:
                 known.foreign.clear()
             known.foreign.add(key)
         elif known.foreign:  # it has what is below this key
@@ -146,7 +146,7 @@ LONG_ANSWER = XmlRpcLimits(body=256 << 10, elements=16_384, depth=4, string=16 <
 
 _REUSES = frozenset({"requestTopic", "publisherUpdate", "paramUpdate"})  # a node may get each of these twice
 _KEPT_SECONDS = 1.0  # between two rounds that close connections
-_MOST_KEPT = 256  # addresses, each with one connection
+_MAX_KEPT = 256  # addresses, each with one connection
 
 
 class NodeApiClient:
@@ -183,11 +183,11 @@ class NodeApiClient:
         return await client.call(method, *params)
 
     def _kept(self, incarnation: Incarnation) -> XmlRpcClient:
-        """Return a client with a kept connection (at most `_MOST_KEPT`): a starting node gets ten calls in a second."""
+        """Return a client with a kept connection (at most `_MAX_KEPT`): a starting node gets ten calls in a second."""
         uri = incarnation.call_uri
         client = self._used.get(uri) or self._unused.pop(uri, None)
         if client is None:
-            if len(self._used) + len(self._unused) >= _MOST_KEPT:
+            if len(self._used) + len(self._unused) >= _MAX_KEPT:
                 return self.client(incarnation)
             client = self.client(incarnation, pool=1)
         self._used[uri] = client

@@ -195,7 +195,7 @@ class NodePorts:
 _log = structlog.get_logger()
 _ANSWER_SECONDS = 3.0
 _AGAIN_SECONDS = 30.0  # without an answer; each call of the host would wait again
-_MOST_ROUTES = 10_000
+_MAX_ROUTES = 10_000
 
 
 class AdvertisedAddresses:
@@ -243,7 +243,7 @@ class AdvertisedAddresses:
             return
         if self._routes.get(peer.host, (None, -math.inf))[1] > clock.now():
             return
-        if len(self._routes) > _MOST_ROUTES:
+        if len(self._routes) > _MAX_ROUTES:
             self._routes.clear()
         try:
             async with asyncio.timeout(_ANSWER_SECONDS):

@@ -7,7 +7,7 @@ import msgspec
 
 from appliance.channel import messages
 
-MOST = 8
+MAX = 8
 """The most taps at once; relays have the same limit."""
 
 _STOP_SECONDS = 5.0
@@ -34,8 +34,8 @@ class TapRequests:
         self, topic: str, count: int, seconds: float, *, latched: bool
     ) -> list[messages.MessageSeen]:
         """Return up to `count` messages, or those that came in time. Raises `TooManyTapsError`."""
-        if len(self._open) >= MOST:
-            raise TooManyTapsError(f"{MOST} queries of topics' messages are running: try again")
+        if len(self._open) >= MAX:
+            raise TooManyTapsError(f"{MAX} queries of topics' messages are running: try again")
         send = self._sender(topic)
         self._number += 1
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()

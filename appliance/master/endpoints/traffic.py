@@ -19,7 +19,7 @@ from appliance.policy.rate_limits import LimitRule
 from appliance.store.state_file import PermissionRow
 from appliance.telemetry.audit_trail import AuditTrail
 
-MOST_RESOURCES = 2000
+MAX_RESOURCES = 2000
 OTHERS = "(others)"  # ROS names cannot contain brackets
 
 _STILL_SECONDS = 3.0  # after this time without a report, rates are 0
@@ -87,14 +87,14 @@ class RelayTraffic:
         """The connections, by relay and the relay's own number. `number` is unique among all relays."""
         self.traffic: dict[tuple[str, str], Traffic] = {}
         self.limited_messages: Counter[tuple[str, str]] = Counter()
-        """The messages that limits dropped, by topic and limit; at most `MOST_RESOURCES` topics."""
+        """The messages that limits dropped, by topic and limit; at most `MAX_RESOURCES` topics."""
         self._limited_topics: set[str] = set()
         self.memory: dict[int, dict[str, int]] = {}
         """The bytes that each relay holds, by kind."""
         self.past: dict[str, Traffic] = {}
         """The traffic of forgotten incarnations, by topic and service, so that counters never decrease.
 
-        At most `MOST_RESOURCES` have their own entry; `OTHERS` has the sum of the rest.
+        At most `MAX_RESOURCES` have their own entry; `OTHERS` has the sum of the rest.
         """
 
     def used(self) -> set[PermissionRow]:
@@ -141,7 +141,7 @@ class RelayTraffic:
 
     def forgotten(self, key: str) -> None:
         for carried in [carried for carried in self.traffic if carried[0] == key]:
-            name = carried[1] if carried[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
+            name = carried[1] if carried[1] in self.past or len(self.past) < MAX_RESOURCES else OTHERS
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
     def received(self, relay: int, message: messages.Message) -> bool:
@@ -268,7 +268,7 @@ class RelayTraffic:
 
     def limited(self, row: messages.LimitedRow, rule: LimitRule | None) -> None:
         topic = row.topic or OTHERS
-        known = topic in self._limited_topics or len(self._limited_topics) < MOST_RESOURCES
+        known = topic in self._limited_topics or len(self._limited_topics) < MAX_RESOURCES
         self._limited_topics.add(name := topic if known else OTHERS)
         self.limited_messages[name, row.part] += row.messages
         whose = {

@@ -24,7 +24,7 @@ from roswire.uris import NodeUri, node_uri
 ANY_TYPE = "*"
 """The type of a topic for subscribers that accept any type."""
 
-_MOST_UNUSED_TYPES = 10_000
+_MAX_UNUSED_TYPES = 10_000
 """The most topics without a node whose types are kept. This limits memory."""
 
 PUBLISHER_PATH = "/publisher/"
@@ -431,7 +431,7 @@ class Registry:
 
     def _remember_unused(self, topic: str) -> None:
         self._unused_types[topic] = None
-        if len(self._unused_types) > _MOST_UNUSED_TYPES:
+        if len(self._unused_types) > _MAX_UNUSED_TYPES:
             oldest = next(iter(self._unused_types))
             del self._unused_types[oldest]
             self._types.pop(oldest, None)

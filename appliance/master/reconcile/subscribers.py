@@ -25,7 +25,7 @@ from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree, same_value, standing_at
 from roswire.xmlrpc import Value
 
-_MOST_PARTS = 1000  # of a change, for a node whose subscriptions are unknown
+_MAX_PARTS = 1000  # of a change, for a node whose subscriptions are unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ class Subscribers:
 
     def _tell_unasked(self, key: str, value: Value, caller_id: str | None, before: Value) -> None:
         """Send what changed, and each part of a namespace, because roscpp caches the parts by their own keys."""
-        changes = [*itertools.islice(_changes_of(key, value, before), _MOST_PARTS)]
+        changes = [*itertools.islice(_changes_of(key, value, before), _MAX_PARTS)]
         for node in [*self.unasked]:
             if node.life in ENDED:
                 self.unasked.discard(node)

@@ -19,7 +19,7 @@ _HEAD = struct.Struct("=IHHIIBBH")  # struct nlmsghdr, struct nfgenmsg
 _ATTRIBUTE = struct.Struct("=HH")
 _TABLE = 1  # the attribute of each message but that of a generation
 _PROGRAM = 3  # the attribute of a generation
-_MOST_BYTES = 1 << 17
+_MAX_BYTES = 1 << 17
 _BUFFER = 1 << 20
 
 
@@ -39,7 +39,7 @@ class RuleWatch:
         found: list[str] = []
         while True:
             try:
-                data = self._socket.recv(_MOST_BYTES)
+                data = self._socket.recv(_MAX_BYTES)
             except BlockingIOError:
                 return found
             except OSError as error:

@@ -11,7 +11,7 @@ from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.context import RelayContext
 
 _ANY = "*"
-_MOST = 8  # claims to try on one publisher, because subscribers can make up any number
+_MAX = 8  # claims to try on one publisher, because subscribers can make up any number
 
 
 class HeaderCandidates:
@@ -49,7 +49,7 @@ class HeaderCandidates:
         """Choose the next fields; return False if all are refused."""
         self._refused.add(_key(self.fields))
         named = (claim for claim in self._claims() if _named(claim, "md5sum"))
-        for claim in (*islice(named, _MOST), {}):
+        for claim in (*islice(named, _MAX), {}):
             fields = {
                 "type": _named(claim, "type") or self._registered() or _ANY,
                 "md5sum": _named(claim, "md5sum") or _ANY,

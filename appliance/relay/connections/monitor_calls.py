@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
 OwnAnswer = OwnServiceAnswered | MonitorCallAnswered | HeldRequestDecided
-MOST, MOST_OF_MONITOR = 64, 4
+MAX, MAX_OF_MONITOR = 64, 4
 """The most calls under way in a relay, and of one monitor, so that no monitor takes the calls of the others."""
 
 
@@ -56,8 +56,8 @@ class ServiceCalls:
     def call(self, wanted: Published) -> None:
         own = sum(call.wanted.monitor == wanted.monitor for call in self._calls.values())
         for number, most, whose in (
-            (own, MOST_OF_MONITOR, wanted.monitor),
-            (len(self._calls), MOST, "all monitors"),
+            (own, MAX_OF_MONITOR, wanted.monitor),
+            (len(self._calls), MAX, "all monitors"),
         ):
             if number >= most:
                 self._failed(wanted, f"{most} calls of {whose} are under way; the call was not made")

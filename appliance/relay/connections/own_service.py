@@ -24,11 +24,11 @@ from roswire.tcpros import HeaderParser, encode_header, encode_service_reply
 # Hold the requests of service clients that need an operator's approval until control has decided.
 #
 # - A request reaches the monitors and the service only after its approval.
-# - Control gets at most `MOST_OF_HOST` requests of a host at once, because one thread answers all hosts.
+# - Control gets at most `MAX_OF_HOST` requests of a host at once, because one thread answers all hosts.
 # - If control ends first, all open requests are refused.
 
 AWAY = "the appliance's control is not running: this call had no effect"
-MOST_OF_HOST = 2
+MAX_OF_HOST = 2
 _SHOWN = 4096
 
 Answered = Callable[[str], None]
@@ -57,7 +57,7 @@ class HeldRequests:
         if self._connected:
             queue = self._queues.setdefault(host, {})
             queue[number] = RequestHeld(number, *caller, type_, digest, body[:_SHOWN], len(body))
-            if len(queue) <= MOST_OF_HOST:
+            if len(queue) <= MAX_OF_HOST:
                 self._send(queue[number])
         else:
             self._loop.after(0, lambda: self.answered(HeldRequestDecided(number, AWAY)))
@@ -66,7 +66,7 @@ class HeldRequests:
     def forget(self, number: int) -> None:
         host, _answered = self._open.pop(number, ("", None))
         queue = self._queues.get(host, {})
-        if number in islice(queue, MOST_OF_HOST):  # its answer will come
+        if number in islice(queue, MAX_OF_HOST):  # its answer will come
             self._open[number] = host, lambda _refused: None
         else:
             queue.pop(number, None)
@@ -77,7 +77,7 @@ class HeldRequests:
             return
         queue = self._queues.get(host, {})
         if queue.pop(answer.number, None) is not None:
-            for wanted in islice(queue.values(), MOST_OF_HOST - 1, MOST_OF_HOST):
+            for wanted in islice(queue.values(), MAX_OF_HOST - 1, MAX_OF_HOST):
                 self._send(wanted)
             if not queue:
                 del self._queues[host]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
 
 _LOOK_SECONDS = 0.002
-_MOST_LOOKS = 500
+_MAX_LOOKS = 500
 _QUEUED = struct.Struct("i")
 
 
@@ -214,7 +214,7 @@ class GuardTrials:
             if queued == 0:
                 row.acknowledged = seconds
                 del left[member]
-        if left and looks < _MOST_LOOKS:
+        if left and looks < _MAX_LOOKS:
             self._loop.after(_LOOK_SECONDS, lambda: self._follow(tested, begun, left, era, looks + 1))
         elif era == self._era:
             self._tell(tested)

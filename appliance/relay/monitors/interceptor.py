@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 # The hosts that get no message of a topic while a monitor withholds it.
 
-_MOST_KNOWN = 1000
+_MAX_KNOWN = 1000
 
 
 class HostMask:
@@ -74,7 +74,7 @@ class HostMask:
                 found = ip_address(host) in ip_network(network)
             except ValueError:
                 found = True
-            if len(self._known) >= _MOST_KNOWN:
+            if len(self._known) >= _MAX_KNOWN:
                 self._known.clear()
             self._known[network, host] = found
         return found

@@ -13,7 +13,7 @@ from rosmop.run.outcomes import SEQ, MessageSender
 # The progress of one batch through the monitors.
 
 _LENGTH = struct.Struct("<I")
-_MOST_TURNS = 64
+_MAX_TURNS = 64
 
 
 class BatchProgress:
@@ -45,7 +45,7 @@ class BatchProgress:
     def turns(self) -> int:
         """Return how many messages to take one by one; the number doubles until some can be taken together."""
         turns = self._turns
-        self._turns = min(2 * turns, _MOST_TURNS)
+        self._turns = min(2 * turns, _MAX_TURNS)
         return turns
 
     def walked(self, position: int, run: int, gone: int) -> None:

@@ -38,7 +38,7 @@ CAUSE = "stopped: "
 _SILENCE = "no message "
 _LINE_NS = 2_000_000_000
 """How long a monitor's last cause explains its next stop; it is printed when it changes, or once a second."""
-_MOST_STOPPING = 1000
+_MAX_STOPPING = 1000
 _PUBLISHERS = 8
 """The most publishers that the report of a stop names."""
 
@@ -314,7 +314,7 @@ class Observer:
     ) -> None:
         events = tuple(outcome.changed_by)
         safe = self._is_safe(_monitor(events[-1]), point.resource, outcome.buffer)
-        if len(self._stopping) >= _MOST_STOPPING:
+        if len(self._stopping) >= _MAX_STOPPING:
             self._stopping.clear()
         self._stopping[events, point] = safe
         explained = safe and _own_cause(outcome, _monitor(events[-1]))

@@ -27,8 +27,8 @@ SHARE = 0.2
 
 _SLICE = 0.002  # seconds of processor time
 _LAST_SLICE = 0.02  # seconds, before other monitors take over their state
-_MOST_WAITING = 2000  # messages
-_MOST_BYTES = 8 << 20
+_MAX_WAITING = 2000  # messages
+_MAX_BYTES = 8 << 20
 
 _TOO_SLOW = (
     f"monitors in shadow mode take more than {SHARE:.0%} of a processor; this one did not see all messages"
@@ -95,7 +95,7 @@ class ShadowMonitors:
         for tapped in self._monitors.tapped:
             if tapped.resource in self._foreign:
                 continue
-            if len(self.waiting) >= _MOST_WAITING or self._bytes + len(tapped.data) > _MOST_BYTES:
+            if len(self.waiting) >= _MAX_WAITING or self._bytes + len(tapped.data) > _MAX_BYTES:
                 self._miss(tapped.shadow, point, _TOO_MANY, observed)
                 continue
             self.waiting.append(_Waiting(tapped, point, observed))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from appliance.relay.transport.pump import BASE, CELLS, HAS_CELLS
 
 MAGIC = b"rosrvMS1"
-MOST_SECTIONS = 100_000
+MAX_SECTIONS = 100_000
 
 _START = 16
 _ROOT = len(MAGIC)
@@ -24,7 +24,7 @@ _HEAD = struct.Struct("<II")  # length of the head, number of sections
 _ROW = struct.Struct("<III")  # for a section: its start in its half, space for `base`, size of `cells`
 _LENGTH = struct.Struct("<I")
 _FLAGS = 16  # bytes before the places of a section: the section's byte, and from byte 8 on the lengths of both bases
-_LEAST_ROOM, _MOST_SPARE = 256, 8192
+_LEAST_ROOM, _MAX_SPARE = 256, 8192
 
 Memory = Any
 """A view of a mapped file, or other memory that is read and written by slices."""
@@ -64,10 +64,10 @@ class StateMemory:
         rows, at = [], _HEAD.size + len(head) + _ROW.size * len(sections)
         for base, cells in sections:
             at = _even(at)
-            room = max(_LEAST_ROOM, _even(len(base) + min(len(base), _MOST_SPARE)))
+            room = max(_LEAST_ROOM, _even(len(base) + min(len(base), _MAX_SPARE)))
             rows.append((at, room, cells))
             at += _size(room, cells)
-        if at > half or len(sections) > MOST_SECTIONS:
+        if at > half or len(sections) > MAX_SECTIONS:
             return False
         memory, into = self._memory, 2 if self._valid == 1 else 1
         first = _START + (into - 1) * half
@@ -161,7 +161,7 @@ def read(memory: Memory) -> StoredState | None:
     view = memoryview(memory)[first : first + half].toreadonly()
     try:
         size, count = _HEAD.unpack_from(view)
-        if count > MOST_SECTIONS:
+        if count > MAX_SECTIONS:
             raise ValueError(f"the memory has {count} sections")
         head = bytes(_part(view, _HEAD.size, size))
         table = _HEAD.size + size

@@ -28,7 +28,7 @@ BURST = 0.5
 
 _FILL_SECONDS = 20e-6  # between two fills, for each holder: a limit with many holders is filled less often
 _FEW_FLOWS = 64
-_MOST_OWING = 4096  # limits without holders whose debt is not paid
+_MAX_OWING = 4096  # limits without holders whose debt is not paid
 
 
 class _Store:
@@ -213,7 +213,7 @@ class RateLimits:
         now = self._clock()
         unheld = [names for names, flow in self.flows.items() if not flow.held]
         owing = [names for names in unheld if not self.flows[names].paid(now)]
-        for names in set(unheld).difference(owing[-_MOST_OWING:]):
+        for names in set(unheld).difference(owing[-_MAX_OWING:]):
             del self.flows[names]
         self._most = max(_FEW_FLOWS, 2 * len(self.flows))
 

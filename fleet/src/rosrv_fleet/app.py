@@ -42,7 +42,7 @@ from rosrv_fleet.tokens import FleetRole
 
 _LONGEST = 16_384
 _WRONG_PER_MINUTE = 30
-_MOST_WRONG = 10_000
+_MAX_WRONG = 10_000
 
 
 def join_router(collector: Collector) -> APIRouter:
@@ -95,7 +95,7 @@ class WrongTokens:
     """The wrong tokens of the last minute, by address or /64 network."""
 
     def __init__(self) -> None:
-        self._sent: deque[tuple[float, str]] = deque(maxlen=_MOST_WRONG)
+        self._sent: deque[tuple[float, str]] = deque(maxlen=_MAX_WRONG)
 
     def require_patience(self, address: str) -> None:
         """Raise `HTTPException` (429) if this address must wait."""

@@ -26,7 +26,7 @@ from rosrv_fleet.config import Limits
 _OTHER_FILES = 256  # open files that are not connections: uploads, the database, workers
 _LEAST_CONNECTIONS = 64
 _LOG_SECONDS = 60.0
-_MOST_PROVEN = 10_000
+_MAX_PROVEN = 10_000
 _OF_EACH_ROBOT = 4  # connections that an appliance opens at once: segments, evidence, presence, bundles
 # Handshakes, or requests: of each proven address, behind which there may be many robots, and of all others together.
 _PROVEN_A_SECOND, _PROVEN_AT_ONCE = 200.0, 256.0
@@ -58,7 +58,7 @@ class Shares:
         left = self._left_of(owner, now, proven=proven)
         if left >= 1.0 and not proven and not self._take_of_all(now):
             return False
-        if len(self._left[proven]) < _MOST_PROVEN or owner in self._left[proven]:
+        if len(self._left[proven]) < _MAX_PROVEN or owner in self._left[proven]:
             self._left[proven][owner] = (now, left - 1.0 if left >= 1.0 else left)
         return left >= 1.0
 
@@ -147,7 +147,7 @@ class ClientConnections:
     def prove(self, owner: str) -> None:
         self._proven.setdefault(owner, set())
         self._proven.move_to_end(owner)
-        if len(self._proven) > _MOST_PROVEN:
+        if len(self._proven) > _MAX_PROVEN:
             self._proven.popitem(last=False)
         self._others_open -= len(self._others.pop(owner, ()))
 

@@ -17,8 +17,8 @@ from appliance.signing.own_certificate import untimely
 
 FIRST = "a"
 """The default name of a robot's first appliance."""
-_MOST_APPLIANCES = 2  # that may connect
-_MOST_KNOWN = 100  # with those that were removed
+_MAX_APPLIANCES = 2  # that may connect
+_MAX_KNOWN = 100  # with those that were removed
 _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
 
 
@@ -125,7 +125,7 @@ def new_robot(name: str, made: RobotAppliance, group: str, appliance: str) -> Ro
 
 
 def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
-    if len(robot.connecting) >= _MOST_APPLIANCES or len(robot.appliances) >= _MOST_KNOWN:
+    if len(robot.connecting) >= _MAX_APPLIANCES or len(robot.appliances) >= _MAX_KNOWN:
         raise EnrolmentError(
             f"{robot.name} has the appliances {', '.join(robot.connecting)}; remove one first:"
             f" rosrv-fleet robot remove {robot.name} --appliance NAME"
@@ -148,7 +148,7 @@ def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
 
 def without_appliance(robot: Robot, appliance: str) -> Robot:
     left = {name: one for name, one in robot.connecting.items() if name != appliance}
-    if len(left) != 1 or len(robot.connecting) != _MOST_APPLIANCES:
+    if len(left) != 1 or len(robot.connecting) != _MAX_APPLIANCES:
         raise EnrolmentError(
             f"{appliance!a} is not one of two appliances of {robot.name}; it has: {', '.join(robot.connecting)}"
         )

@@ -8,8 +8,8 @@ from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import StoreFullError
 
 _SECOND = 1e9
-_MOST = 10_000
-_MOST_MARKS = 1000
+_MAX = 10_000
+_MAX_MARKS = 1000
 
 
 class RobotState(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,7 +47,7 @@ class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
 def health_of(collector: Collector) -> FleetHealth:
     store = collector.store
     marked = {
-        kind: {robot: len(store.marked(kind, robot, _MOST_MARKS)) for robot in store.robots_with(kind)}
+        kind: {robot: len(store.marked(kind, robot, _MAX_MARKS)) for robot in store.robots_with(kind)}
         for kind in ("gaps", "forks")
     }
     robots = [
@@ -61,7 +61,7 @@ def health_of(collector: Collector) -> FleetHealth:
     except StoreFullError as error:
         disk = error.strerror
     trouble = collector.indexer.trouble or collector.robots.trouble or collector.pruner.trouble
-    return FleetHealth(robots=robots, waiting=store.waiting(_MOST), trouble=trouble, disk=disk)
+    return FleetHealth(robots=robots, waiting=store.waiting(_MAX), trouble=trouble, disk=disk)
 
 
 def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotState:

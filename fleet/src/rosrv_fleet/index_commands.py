@@ -134,7 +134,7 @@ def _reported(logs: Iterable[CollectedLog]) -> list[ReportedLog]:
 
 
 report_app = typer.Typer(no_args_is_help=True, help="Print the robots' logbooks.")
-_MOST_WAITING = 1000
+_MAX_WAITING = 1000
 _REPORT_SECONDS = 600.0
 
 
@@ -163,7 +163,7 @@ def search(
     """
     wanted = FILTER.value(context.params)
     collector = make_collector(load_config(config))
-    waiting = collector.store.waiting(_MOST_WAITING)
+    waiting = collector.store.waiting(_MAX_WAITING)
     database = collector.searches.database
     database.open()
     try:
@@ -249,7 +249,7 @@ def _report(config: Path, robot: str | None, since: int | None, until: int) -> M
     database = IndexDatabase(collector.config.database, connections=1, statement_seconds=_REPORT_SECONDS)
     database.open()
     try:
-        waiting = collector.store.waiting(_MOST_WAITING)
+        waiting = collector.store.waiting(_MAX_WAITING)
         return fleet_report(database, robot, since, until, waiting=waiting, version=__version__)
     finally:
         database.close()

@@ -42,7 +42,7 @@ _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, ValueError)
 _UNSTORABLE = (psycopg.DataError, psycopg.IntegrityError, psycopg.errors.ProgramLimitExceeded)
 NOT_INDEXABLE = (*_UNREADABLE, *_UNSTORABLE)
 """The errors of segments that cannot be indexed, but stay stored."""
-_MOST_KILLED = 3  # workers that one segment may cost
+_MAX_KILLED = 3  # workers that one segment may cost
 _PARTITION_LOCK = (
     0x726F7370  # of the transactions that make partitions: the second of two with one name would fail
 )
@@ -148,9 +148,9 @@ class Indexer:
             self._set_aside(place, stamp, str(error).strip().partition("\n")[0])
         except BrokenProcessPool:
             self._killed[place] += 1
-            if self._killed[place] < _MOST_KILLED:
+            if self._killed[place] < _MAX_KILLED:
                 raise
-            self._set_aside(place, stamp, f"{_MOST_KILLED} workers ended while they indexed it")
+            self._set_aside(place, stamp, f"{_MAX_KILLED} workers ended while they indexed it")
         except (psycopg.Error, OSError, CancelledError):  # not the segment's fault
             raise
         except Exception as error:  # noqa: BLE001  a defect, or no memory, must not delay other segments

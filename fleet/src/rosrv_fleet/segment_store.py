@@ -63,10 +63,10 @@ def read_stored(file: Path, type_: type[T]) -> T:
 
 _BUCKET = 1000
 _DIGITS = 18
-_MOST_ATTEMPTS = 100  # to make a marker in a folder that another thread removes when it is empty
-_MOST_LOGS = 1000
-_MOST_BUCKETS = 10_000
-_MOST_FORKS = 16
+_MAX_ATTEMPTS = 100  # to make a marker in a folder that another thread removes when it is empty
+_MAX_LOGS = 1000
+_MAX_BUCKETS = 10_000
+_MAX_FORKS = 16
 _LARGE_BYTES = 4 << 20
 _KINDS = ("pending", "large", "damaged", "gaps", "forks")
 _DAMAGED = (gzip.BadGzipFile, EOFError, zlib.error, ValueError)
@@ -218,10 +218,10 @@ class SegmentStore:
                 " an older copy, begin a new log: stop its appliance, move control/audit.db* of its state directory"
                 " away, and start it"
             )
-        if len(self.numbered(place.robot, place.log, place.number)) >= _MOST_FORKS:
-            raise NotStorableError(f"{_MOST_FORKS} segments have the number {place.number}")
+        if len(self.numbered(place.robot, place.log, place.number)) >= _MAX_FORKS:
+            raise NotStorableError(f"{_MAX_FORKS} segments have the number {place.number}")
         bucket = self.path(place).parent
-        for folder, most, what in ((bucket, _MOST_BUCKETS, "ranges"), (bucket.parent, _MOST_LOGS, "logs")):
+        for folder, most, what in ((bucket, _MAX_BUCKETS, "ranges"), (bucket.parent, _MAX_LOGS, "logs")):
             if not folder.exists() and len(_folders(folder.parent)) >= most:
                 raise NotStorableError(
                     f"{folder.parent} has {most} {what}: remove those that are no longer needed"
@@ -298,7 +298,7 @@ class SegmentStore:
 
     def _touch(self, kind: str, place: SegmentPlace) -> None:
         folder = self._folder / kind / place.robot
-        for _attempt in range(_MOST_ATTEMPTS):
+        for _attempt in range(_MAX_ATTEMPTS):
             if not folder.exists():
                 make_folder(folder)
                 sync(folder.parent)

@@ -16,7 +16,7 @@ from appliance.formats.segments import SegmentError, SegmentHeader, SegmentReade
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import RemovalNote, SegmentPlace, SegmentStore
 
-_MOST_ATTEMPTS = 10  # to prove a log of which retention removes segments at the same time
+_MAX_ATTEMPTS = 10  # to prove a log of which retention removes segments at the same time
 _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
 
 
@@ -69,7 +69,7 @@ def _check_earlier(store: SegmentStore, robot: Robot, proofs: dict[str, LogProof
 
 def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:
     """Prove a log. Repeat it if retention, which writes its note first, has removed segments during the proof."""
-    for _attempt in range(_MOST_ATTEMPTS):
+    for _attempt in range(_MAX_ATTEMPTS):
         note, damage = _removal(store, robot, log)
         proof = _proof_after(note, store, robot, log, segment_bytes)
         if proof.ok or _removal(store, robot, log) == (note, damage):

@@ -7,7 +7,7 @@ from random import Random
 import pytest
 
 import rosmop.certify
-from rosmop.certify.check import _CHECKS, _NO_AUTOMATON, MOST_STEPS, AutomatonTables, certify
+from rosmop.certify.check import _CHECKS, _NO_AUTOMATON, MAX_STEPS, AutomatonTables, certify
 from rosmop.certify.formula_reader import UnsupportedFormulaError, WordReader
 from rosmop.certify.properties import DEFECT, certificate_of, certificates_of
 from rosmop.check.sources import compiled_from
@@ -230,7 +230,7 @@ def test_unproved_properties_have_a_reason(logic: str, formula: str, why: str) -
 
 def test_a_machine_that_is_too_large_is_not_proved() -> None:
     events = [f"e{number}" for number in range(200)]
-    states = MOST_STEPS // len(events) + 10
+    states = MAX_STEPS // len(events) + 10
     formula = " ".join(f"s{number} [ default s{(number + 1) % states} ]" for number in range(states))
     certificate = certificate_of(compile_property("fsm", formula, events, ORIGIN))
     assert (certificate.proved, certificate.wrong) == (False, False)

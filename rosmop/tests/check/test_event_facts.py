@@ -4,7 +4,7 @@ from random import Random
 import pytest
 
 from rosmop.check.sources import compiled_from
-from rosmop.fast.abi import MOST_KEPT
+from rosmop.fast.abi import MAX_KEPT
 from rosmop.fast.build import require_loadable
 from rosmop.fast.serialization import encoded
 from rosmop.run.engine import MonitorSet
@@ -82,7 +82,7 @@ SENDERS = """s() { std::string mine; int n = 0;
 @pytest.mark.parametrize("seed", range(examples(60)))
 def test_senders_are_those_of_a_naive_account(seed: int) -> None:
     random = Random(seed)  # noqa: S311  draws examples, not keys
-    long = "/" + "x" * (MOST_KEPT + 1)
+    long = "/" + "x" * (MAX_KEPT + 1)
     who = {1: ("10.0.0.7", "/a"), 2: ("10.0.0.8", "/evil"), 3: ("", long), 4: ("fe80::1", "/b")}
     compiled = compiled_from({"x.rv": SENDERS}, definitions())
     sets = on_module(compiled), MonitorSet.of(compiled)

@@ -3,7 +3,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rosmop.check.expressions import MOST_NOTED
+from rosmop.check.expressions import MAX_NOTED
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Margin
@@ -93,9 +93,9 @@ def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
 
 
 def test_no_more_is_noted_than_is_bounded() -> None:
-    lines = "\n".join(f"if (x > {number}) {{ n = n + 1; }}" for number in range(MOST_NOTED + 9))
+    lines = "\n".join(f"if (x > {number}) {{ n = n + 1; }}" for number in range(MAX_NOTED + 9))
     text = f"s() {{ int n = 0; event e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{lines}\n}} }}"
     monitors = started(text)
     give(monitors, "<i", 20, 100)
-    assert len({margin.number for margin in monitors.take_margins()}) == MOST_NOTED
-    assert monitors.value("s", "n") == 20 + MOST_NOTED + 9
+    assert len({margin.number for margin in monitors.take_margins()}) == MAX_NOTED
+    assert monitors.value("s", "n") == 20 + MAX_NOTED + 9

@@ -36,7 +36,7 @@ api_limits: {requests_per_second: 500, burst: 2000}
 audit: {reserve_bytes: 1MiB}
 recorder: {enabled: true, memory: 16MiB, disk: 512MiB, before: 20, after: 1, triggers: [drop]}
 """
-MOST_KEYS = 25  # from Now to a policy in force, without signing in and without text
+MAX_KEYS = 25  # from Now to a policy in force, without signing in and without text
 MONITOR = """
 NAME() {
     event said(std::string text) TOPIC std_msgs/String '{data:text}' { return; }
@@ -96,7 +96,7 @@ class Keys:
     def step_to(self, locator: Locator) -> None:
         expect(locator).to_be_visible()
         while not locator.evaluate("element => element === document.activeElement"):
-            assert self.count < MOST_KEYS
+            assert self.count < MAX_KEYS
             self.press("j")
 
 
@@ -144,7 +144,7 @@ def test_an_incident_by_keys(
     keys.press("Enter")
     expect(admin.toast("is in force")).to_be_visible()
     assert appliance.rest().get("/v1/policy").json["text"].count("/rude = 10.9.9.9") == 1
-    assert keys.count <= MOST_KEYS
+    assert keys.count <= MAX_KEYS
 
 
 def test_a_denial_is_granted_by_keys(
@@ -173,7 +173,7 @@ def test_a_denial_is_granted_by_keys(
     keys.press("Enter")
     expect(reader.toast("is in force")).to_be_visible()
     assert attempt(*arguments)[0] == 1
-    assert keys.count <= MOST_KEYS
+    assert keys.count <= MAX_KEYS
     page.get_by_role("button", name="Keep it").click()
     expect(reader.toast("The policy is kept")).to_be_visible()
 

@@ -7,7 +7,7 @@ from tests.support.appliance import Appliance
 from tests.support.waiting import eventually
 from tests.system.console.reader import Reader
 
-MOST_REQUESTS = 10
+MAX_REQUESTS = 10
 MOST_BYTES = 180_000  # on the wire, with the headers
 MODULES = {
     "main.js": (
@@ -39,7 +39,7 @@ def test_a_first_visit_is_small(
         page.goto(reader.url)
         expect(page.get_by_label("Access token")).to_be_visible()
         reader.settle()
-        assert len(reader.asked) < MOST_REQUESTS, reader.asked
+        assert len(reader.asked) < MAX_REQUESTS, reader.asked
         page.get_by_label("Access token").fill(str(appliance.ready["token"]))
         page.keyboard.press("Enter")
         expect(page.get_by_role("heading", level=1, name="Now")).to_be_visible()

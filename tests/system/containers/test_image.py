@@ -21,7 +21,7 @@ TOOLS = re.compile(
 )
 CACHES = ("/var/lib/apt/lists/", "/var/cache/apt/", "/root/.cache/", "/tmp/")
 SECRET = re.compile(rb"-----BEGIN [A-Z ]*PRIVATE KEY-----\s+[A-Za-z0-9+/=\s]{60}")
-MOST_MEGABYTES = (
+MAX_MEGABYTES = (
     420  # for the appliance's image, including the base of the tests (without Debian's own trimming)
 )
 
@@ -157,7 +157,7 @@ def test_the_demonstration_contains_no_part_of_the_appliance(site: Site) -> None
 
 def test_the_image_stays_small(site: Site) -> None:
     whole, base = (int(site.engine.inspect(name)["Size"]) for name in (APPLIANCE, BASE))
-    assert whole - base < MOST_MEGABYTES * 1e6
+    assert whole - base < MAX_MEGABYTES * 1e6
 
 
 def test_the_machines_own_network_is_refused(site: Site) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.base.clock import now
 from appliance.base.engine_thread import Drive, Driver, InCaller, Turn
-from appliance.base.log_output import MOST_WAITING, LogOutput, keep_from_blocking
+from appliance.base.log_output import MAX_WAITING, LogOutput, keep_from_blocking
 
 
 def by_hand(started: list[InCaller]) -> Drive:
@@ -70,7 +70,7 @@ def test_lost_lines_are_counted_and_reported_after_those_that_waited(pipe: tuple
     assert after == "after"
     assert report == f"{1000 - len(kept)} lost"
     assert [int(line) for line in kept] == list(range(len(kept)))
-    assert MOST_WAITING // 1000 <= len(kept) < 1000
+    assert MAX_WAITING // 1000 <= len(kept) < 1000
 
 
 @pytest.mark.parametrize("kind", ["full", "no reader", "closed"])

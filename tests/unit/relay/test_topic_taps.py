@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import LookEnded, LookWanted, MessageSeen
-from appliance.relay.topic_taps import MOST_LOOKS, MOST_MESSAGES
+from appliance.relay.topic_taps import MAX_LOOKS, MAX_MESSAGES
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, HEADER, Peer, World
 
@@ -55,7 +55,7 @@ def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
 
 
 def test_a_topic_without_subscribers_is_tapped(world: World) -> None:
-    world.state(LookWanted(1, "/chatter", MOST_MESSAGES, latched=True))
+    world.state(LookWanted(1, "/chatter", MAX_MESSAGES, latched=True))
     publisher = world.upstream(TOLD)
     publisher.send(encode_frame(text("alone")))
     assert seen(world, "alone").number == 1
@@ -112,10 +112,10 @@ def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None
 
 def test_taps_are_few_and_end_with_control(world: World) -> None:
     publisher, subscriber = subscribed(world)
-    for number in range(MOST_LOOKS + 1):
+    for number in range(MAX_LOOKS + 1):
         world.state(LookWanted(number, "/chatter", 1, latched=True))
     publisher.send(encode_frame(text("word")))
-    world.until(lambda: sum(isinstance(one, MessageSeen) for one in world.told) == MOST_LOOKS)
+    world.until(lambda: sum(isinstance(one, MessageSeen) for one in world.told) == MAX_LOOKS)
     world.gets(subscriber, encode_frame(text("word")))
     world.engine.attach(None)
     world.link.close()

@@ -1,7 +1,7 @@
 import struct
 
 from roswire.definitions import MAX_DEPTH, Definitions
-from roswire.message_view import CUT, MOST_BYTES, MOST_CHARACTERS, MOST_ELEMENTS, read_fields
+from roswire.message_view import CUT, MAX_CHARACTERS, MAX_ELEMENTS, MOST_BYTES, read_fields
 
 DEFINITIONS = Definitions.from_files(
     {
@@ -50,7 +50,7 @@ def test_a_truncated_message_is_read_to_its_end() -> None:
 
 def test_long_values_are_shortened() -> None:
     many = read_fields(DEFINITIONS, "a/Many", struct.pack("<I100i", 100, *range(100)))
-    assert many == {"values": [*range(MOST_ELEMENTS), f"{CUT} {100 - MOST_ELEMENTS} more"]}
+    assert many == {"values": [*range(MAX_ELEMENTS), f"{CUT} {100 - MAX_ELEMENTS} more"]}
     assert read_fields(DEFINITIONS, "a/Inner", inner(float("nan"), "")) == {"x": "nan", "name": ""}
     cut = read_fields(DEFINITIONS, "a/Outer", OUTER[:-9])
     assert cut == {
@@ -61,7 +61,7 @@ def test_long_values_are_shortened() -> None:
     }
     fields = read_fields(DEFINITIONS, "a/Inner", inner(0, "x" * 1000))
     assert fields is not None
-    assert fields["name"] == "x" * MOST_CHARACTERS + f"{CUT} {1000 - MOST_CHARACTERS} more"
+    assert fields["name"] == "x" * MAX_CHARACTERS + f"{CUT} {1000 - MAX_CHARACTERS} more"
 
 
 def test_a_shortened_array_does_not_hide_later_fields() -> None:
@@ -73,9 +73,9 @@ def test_a_shortened_array_does_not_hide_later_fields() -> None:
     assert (
         fields["ranges"]
         == fields["intensities"]
-        == [*range(MOST_ELEMENTS), f"{CUT} {720 - MOST_ELEMENTS} more"]
+        == [*range(MAX_ELEMENTS), f"{CUT} {720 - MAX_ELEMENTS} more"]
     )
-    assert fields["names"] == ["abc"] * MOST_ELEMENTS + [f"{CUT} {100 - MOST_ELEMENTS} more"]
+    assert fields["names"] == ["abc"] * MAX_ELEMENTS + [f"{CUT} {100 - MAX_ELEMENTS} more"]
     assert fields["data"] == "01" * MOST_BYTES + f"{CUT} {5000 - MOST_BYTES} more"
     assert fields["last"] == 7
 
@@ -96,9 +96,9 @@ def test_fields_that_are_too_many_to_name_are_counted() -> None:
 
 def test_large_counts_of_unknown_hosts_take_no_time() -> None:
     empty = read_fields(LONG, "a/Empties", struct.pack("<I", 2**32 - 1) + b"\7")
-    assert empty == {"values": [{}] * MOST_ELEMENTS + [f"{CUT} {2**32 - 1 - MOST_ELEMENTS} more"], "last": 7}
+    assert empty == {"values": [{}] * MAX_ELEMENTS + [f"{CUT} {2**32 - 1 - MAX_ELEMENTS} more"], "last": 7}
     many = read_fields(LONG, "a/Texts", struct.pack("<I", 100_000) + b"\0" * 400_001)
-    assert many == {"values": [""] * MOST_ELEMENTS + [f"{CUT} {100_000 - MOST_ELEMENTS} more"], "last": CUT}
+    assert many == {"values": [""] * MAX_ELEMENTS + [f"{CUT} {100_000 - MAX_ELEMENTS} more"], "last": CUT}
 
 
 def test_only_types_of_bounded_depth_are_read() -> None:

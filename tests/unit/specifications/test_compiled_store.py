@@ -117,7 +117,7 @@ def test_their_number_and_size_are_bounded(folder: Path, monkeypatch: pytest.Mon
         store.find(numbered(0), PartsMade)  # in use
     kept = [number for number in range(20) if store.find(numbered(number), PartsMade)]
     assert kept == [0, *range(13, 20)]
-    monkeypatch.setattr(compiled_store, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(compiled_store, "_MAX_BYTES", 1000)
     store.keep(numbered(20), PartsMade(0, [bytes(400)]))
     assert sum(path.stat().st_size for path in folder.iterdir()) <= 1000
     store.keep(numbered(21), PartsMade(0, [bytes(600)]))

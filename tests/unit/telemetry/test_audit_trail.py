@@ -14,7 +14,7 @@ from appliance.audit.log.record import Severity
 from appliance.policy.model import Decision
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
-from appliance.telemetry.audit_trail import MOST_REQUESTS, NOT_RECORDED, Asker, AuditTrail
+from appliance.telemetry.audit_trail import MAX_REQUESTS, NOT_RECORDED, Asker, AuditTrail
 from tests.support.core import MemoryLog
 
 PACKAGE = Path(appliance.__file__).parent
@@ -151,14 +151,14 @@ def test_a_call_that_waits_for_an_approval_is_not_a_denial(*, held: bool) -> Non
 
 def test_a_flood_of_requests_holds_few_names() -> None:
     one = trail(log_of(), deny=True)
-    for number in range(10 * MOST_REQUESTS):
+    for number in range(10 * MAX_REQUESTS):
         one.happened(
             "decision", "why", decision="deny", host=UNKNOWN, category="publish", resource=f"/{number}"
         )
     assert (
-        len(one.meter.denied_requests.counts()) <= 2 * MOST_REQUESTS
+        len(one.meter.denied_requests.counts()) <= 2 * MAX_REQUESTS
     )  # of two seconds, if the second changed
-    assert sum(one.meter.denied.counts().values()) == 10 * MOST_REQUESTS
+    assert sum(one.meter.denied.counts().values()) == 10 * MAX_REQUESTS
     assert re.match(f"{UNKNOWN} was denied publish /0 and more, [0-9]+ times$", one.meter.most_denied())
 
 

@@ -17,9 +17,9 @@ from appliance.features.standby.witness.protocol import (
 )
 
 LOOK_SECONDS = 0.2  # between two requests of a follower
-_MOST_PENDING = 8
+_MAX_PENDING = 8
 _CONFIDENCE = 0.9  # of the time that an answer has left
-_FLAPS, _MOST_FLAPS = 3, 100  # interruptions that are reported; that are counted
+_FLAPS, _MAX_FLAPS = 3, 100  # interruptions that are reported; that are counted
 
 Answered = NamedTuple("Answered", [("epoch", int), ("holder", str), ("until", float)])
 """The newest answer to a follower: it may admit `holder` (or no appliance, "") until a time of its clock."""
@@ -75,7 +75,7 @@ class WitnessFollower:
     def request(self) -> bytes:
         self._number += 1
         self._pending[self._number] = self._clock()
-        if len(self._pending) > _MOST_PENDING:
+        if len(self._pending) > _MAX_PENDING:
             del self._pending[min(self._pending)]
         body = {
             "boot": self._boot,
@@ -142,7 +142,7 @@ class WitnessFollower:
     def enforce(self, name: str) -> None:
         """Write the rules; after a `WitnessError`, the next `tick` tries again."""
         if self._opened and not name:
-            self._interrupted = [*self._interrupted[1 - _MOST_FLAPS :], self._clock()]
+            self._interrupted = [*self._interrupted[1 - _MAX_FLAPS :], self._clock()]
         elif name:
             if not self._opened and self._used.epoch > self._epoch_admitted and self._interrupted:
                 self._interrupted.pop()  # the pause of a takeover

@@ -22,7 +22,7 @@ from appliance.features.standby.witness.protocol import BATCH, EXPIRY, FREEBIND,
 from appliance.features.standby.witness.settings import WitnessSettings
 
 _CLOCK_BOOTTIME = 7  # runs while the computer sleeps; Python 3.5 does not name it
-_MOST_WAKES = 4096  # that one wait takes
+_MAX_WAKES = 4096  # that one wait takes
 
 
 def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
@@ -85,7 +85,7 @@ class Wake:
     def wait(self, seconds: float) -> None:
         ready, _, _ = select.select([self._reader], [], [], max(0.0, seconds))
         if ready:
-            self._reader.recv(_MOST_WAKES)
+            self._reader.recv(_MAX_WAKES)
 
 
 def _start(run: Callable[[], None]) -> None:

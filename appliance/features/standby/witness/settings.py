@@ -10,7 +10,7 @@ from typing import Any, Dict, NamedTuple, Tuple
 from appliance.features.standby.witness.errors import WitnessError
 from appliance.features.standby.witness.protocol import NAME
 
-_MOST_FOLLOWERS = 32
+_MAX_FOLLOWERS = 32
 
 AppliancePeer = NamedTuple("AppliancePeer", [("address", str), ("key", bytes)])
 
@@ -59,8 +59,8 @@ def settings_of(body: Dict[str, Any]) -> WitnessSettings:
         )
     if len(addresses) != 4 + len(followers):
         raise ValueError("it needs different addresses: the witness, fixed, two appliances, each follower")
-    if len(followers) > _MOST_FOLLOWERS:
-        raise ValueError("it has more than %d followers" % _MOST_FOLLOWERS)
+    if len(followers) > _MAX_FOLLOWERS:
+        raise ValueError("it has more than %d followers" % _MAX_FOLLOWERS)
     if follows_as and list(followers) != [follows_as]:
         raise ValueError("follows_as must be the only follower in it")
     ports = tuple(_ports(text) for text in body["ports"])

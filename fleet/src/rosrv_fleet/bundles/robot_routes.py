@@ -28,21 +28,21 @@ _TARGET_NAME = re.compile(r"[0-9a-f]{64}\.[1-9][0-9]{0,8}\.tar")
 _FOREVER = {"Cache-Control": "public, max-age=31536000, immutable"}
 _HEARTBEAT_SECONDS = 30.0
 _LONGEST_REPORT = 16_384
-_MOST_LISTENERS = 2  # event streams of one robot: the old one may still be open when it connects again
+_MAX_LISTENERS = 2  # event streams of one robot: the old one may still be open when it connects again
 
 Identify = Callable[[Request], Robot | Awaitable[Robot]]
 """Returns the robot with the client's certificate, or raises `HTTPException`."""
 
 
 class EventStreams:
-    """The open event streams, at most `_MOST_LISTENERS` for each robot."""
+    """The open event streams, at most `_MAX_LISTENERS` for each robot."""
 
     def __init__(self, service: BundleService) -> None:
         self._service = service
         self._open: Counter[str] = Counter()
 
     def open(self, robot: str, group: RobotGroup) -> AsyncIterator[bytes]:
-        if self._open[robot] >= _MOST_LISTENERS:
+        if self._open[robot] >= _MAX_LISTENERS:
             raise HTTPException(429, "this robot has too many event streams")
         return self._stream(robot, group)
 
@@ -51,7 +51,7 @@ class EventStreams:
         self._open[robot] += 1
         try:
             yield b": listening\n\n"
-            while self._open[robot] <= _MOST_LISTENERS:  # several may have opened at the same time
+            while self._open[robot] <= _MAX_LISTENERS:  # several may have opened at the same time
                 try:
                     async with asyncio.timeout(_HEARTBEAT_SECONDS):
                         await listener.changed.wait()

@@ -41,8 +41,8 @@ _ROBOTS = (
 _HISTORY = (Column("Number"), Column("Bundle"), Column("State"), Column("Operators"), Column("Reason"))
 _STATES: dict[str, Tone] = {"running": "plain", "done": "good", "stopped": "bad", "reverted": "warn"}
 _BAD = {ConditionKind.UNHEALTHY: "bad", ConditionKind.SILENT: "bad", ConditionKind.IN_FORCE: "good"}
-_MOST_ROBOTS = 50
-_MOST_HISTORY = 20
+_MAX_ROBOTS = 50
+_MAX_HISTORY = 20
 
 
 def groups_page(service: BundleService) -> str:
@@ -133,10 +133,10 @@ def _robots(service: BundleService, group: RobotGroup) -> str:
                 text(found[name].why),
             ),
         )
-        for name in order[:_MOST_ROBOTS]
+        for name in order[:_MAX_ROBOTS]
     )
     more = ""
-    if len(order) > _MOST_ROBOTS:
+    if len(order) > _MAX_ROBOTS:
         every = f"All {counted(len(order), 'robot')} of the group"
         more = f"<p>{link('/', every, group=str(group))}</p>"
     return table("Robots, problems first", _ROBOTS, rows, "No robot is enrolled in this group.") + more
@@ -144,7 +144,7 @@ def _robots(service: BundleService, group: RobotGroup) -> str:
 
 def _history(service: BundleService, group: RobotGroup) -> str:
     try:
-        stored = service.store.history(group, _MOST_HISTORY)
+        stored = service.store.history(group, _MAX_HISTORY)
     except DatabaseError:
         return alert("The history is not available: the database is unreachable.")
     return table("History", _HISTORY, map(_past, stored), "There was no rollout.")

@@ -24,7 +24,7 @@ from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.workers import OutOfTimeError, memory, processor_time
 
 _MEMORY = 256 << 20
-_MOST_SENTENCES = 10
+_MAX_SENTENCES = 10
 _LONGEST_SENTENCE = 300
 _LOG = re.compile("[0-9a-f]{32}")
 _Time = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
@@ -110,6 +110,6 @@ def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceC
 
 
 def _bounded(sentences: list[str]) -> list[str]:
-    first = [printable(sentence[:_LONGEST_SENTENCE]) for sentence in sentences[:_MOST_SENTENCES]]
+    first = [printable(sentence[:_LONGEST_SENTENCE]) for sentence in sentences[:_MAX_SENTENCES]]
     others = len(sentences) - len(first)
     return [*first, *([f"{others} more"] if others else [])]

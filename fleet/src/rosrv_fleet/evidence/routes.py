@@ -24,7 +24,7 @@ from rosrv_fleet.robots import recorded
 from rosrv_fleet.segment_store import StoreFullError
 from rosrv_fleet.tokens import FleetRole
 
-_MOST_UPLOADS = 4
+_MAX_UPLOADS = 4
 _log = structlog.get_logger()
 EvidenceId = Annotated[str, PathParameter(pattern="^[0-9a-f]{64}$")]
 RobotName = Annotated[str, Query(max_length=63)]
@@ -79,13 +79,13 @@ class _Additions:
     def __init__(self, collector: Collector) -> None:
         self._collector = collector
         self._limits = collector.config.evidence
-        self._uploads = asyncio.Semaphore(_MOST_UPLOADS)
+        self._uploads = asyncio.Semaphore(_MAX_UPLOADS)
         self._turn = asyncio.Lock()
 
     async def add(self, request: Request, robot: Robot, who: str) -> tuple[StoredEvidence, bool]:
         """Return the stored bundle, and whether it is new. Raise `HTTPException` or `OSError`."""
         if self._uploads.locked():
-            raise _later(f"{_MOST_UPLOADS} evidence bundles are being added", 60)
+            raise _later(f"{_MAX_UPLOADS} evidence bundles are being added", 60)
         async with self._uploads:
             upload = self._collector.evidence.incoming()
             try:

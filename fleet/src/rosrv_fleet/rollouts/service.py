@@ -168,8 +168,8 @@ _TICK_SECONDS = 1.0
 _PAUSE_SECONDS = 5.0  # after a failure
 _DEAF_SECONDS = 60.0  # robots report every 30 s
 _CLOCK_SECONDS = 60.0  # by which the clocks of the operator and the collector may differ
-_MOST_COUNTED = 1_000_000_000
-_MOST_ATTEMPTS = 10  # to apply an operator's order to a rollout that ticks change at the same time
+_MAX_COUNTED = 1_000_000_000
+_MAX_ATTEMPTS = 10  # to apply an operator's order to a rollout that ticks change at the same time
 
 
 Members = Callable[[], Mapping[str, RobotGroup]]
@@ -422,7 +422,7 @@ class BundleService:
         Try again if a tick has changed the rollout in between, but not if another operator has.
         """
         acts: list[OperatorAct] | None = None
-        for _attempt in range(_MOST_ATTEMPTS):
+        for _attempt in range(_MAX_ATTEMPTS):
             stored = (await asyncio.to_thread(self.store.latest)).get(group)
             if stored is None:
                 raise RolloutRefusedError(f"there was no rollout of {group}")
@@ -483,8 +483,8 @@ def _checked(report: RobotReport, now: float) -> RobotSeen:
             BundlePath.parse(path)
         except TermsError as error:
             raise RolloutRefusedError(f"a bundle of the report is invalid: {error}") from error
-    if not (0 <= report.denials <= _MOST_COUNTED and 0 <= report.failing <= _MOST_COUNTED):
-        raise RolloutRefusedError(f"a number of the report is not between 0 and {_MOST_COUNTED}")
+    if not (0 <= report.denials <= _MAX_COUNTED and 0 <= report.failing <= _MAX_COUNTED):
+        raise RolloutRefusedError(f"a number of the report is not between 0 and {_MAX_COUNTED}")
     fields = msgspec.structs.asdict(report)
     del fields["site"], fields["group"]
     # PostgreSQL stores no NUL in a text.

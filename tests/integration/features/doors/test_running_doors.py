@@ -45,7 +45,7 @@ read default = site agent
 write default = site
 """
 AGENT = "ws://10.77.0.2:9091"
-MOST_KB = 400 << 10
+MAX_KB = 400 << 10
 LARGE = """
 import rospy
 from std_msgs.msg import String
@@ -152,7 +152,7 @@ def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
 
         on_robot(common_robot, work)
         [peak] = re.findall(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-        assert int(peak) < MOST_KB
+        assert int(peak) < MAX_KB
         assert appliance.row("door", "list")["dropped"] > 0
 
 

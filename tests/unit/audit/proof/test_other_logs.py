@@ -17,7 +17,7 @@ from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.cli.audit.verification_text import print_verification
-from appliance.ipsec.signed_checkpoints import MOST_LOGS, CheckpointMemory, CheckpointRefusedError
+from appliance.ipsec.signed_checkpoints import MAX_LOGS, CheckpointMemory, CheckpointRefusedError
 from appliance.signing.signed_logs import acknowledge, remembered_logs, sync_index
 from tests.support.audit import decision, settle
 from tests.support.command import rosrv
@@ -249,12 +249,12 @@ def test_logs_that_are_set_aside_leave_places(tmp_path: Path) -> None:
     def accept(number: int) -> None:
         memory.accept(text.format(f"{number:032x}", "b" * 64, "0" * 64).encode())
 
-    for number in range(MOST_LOGS):
+    for number in range(MAX_LOGS):
         accept(number)
     with pytest.raises(CheckpointRefusedError, match="rosrv audit acknowledge"):
-        accept(MOST_LOGS)
+        accept(MAX_LOGS)
     acknowledge(tmp_path, remembered_logs(tmp_path)[0], 1, 0)
-    accept(MOST_LOGS)
+    accept(MAX_LOGS)
 
 
 def test_the_order_on_the_machine(machine: Machine) -> None:

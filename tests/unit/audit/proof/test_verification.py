@@ -475,7 +475,7 @@ def test_a_checkpoint_made_during_verification_is_not_a_finding(
 
 
 def test_findings_are_limited(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appliance.audit.proof.verification._MOST_FINDINGS", 10)
+    monkeypatch.setattr("appliance.audit.proof.verification._MAX_FINDINGS", 10)
     attack(log, "DELETE FROM record WHERE sequence % 5 = 0 AND sequence <= 150")
     result = verify(log)
     removed = [one for one in result.findings if one.kind is FindingKind.MISSING]
@@ -484,7 +484,7 @@ def test_findings_are_limited(log: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_forged_log_does_not_keep_verification_busy(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appliance.audit.proof.verification._MOST_FINDINGS", 3)
+    monkeypatch.setattr("appliance.audit.proof.verification._MAX_FINDINGS", 3)
     searched: list[int] = []
 
     def search(rows: list[object], _previous: bytes, place: int) -> list[object]:

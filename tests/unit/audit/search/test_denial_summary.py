@@ -66,7 +66,7 @@ def test_the_host_with_the_most_denials_is_first() -> None:
 
 
 def test_decisions_come_before_the_noise_of_a_port_scan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(denial_summary, "_MOST_NAMES", 8)
+    monkeypatch.setattr(denial_summary, "_MAX_NAMES", 8)
     noise = [
         denial(at, reason=f"{word} is not HTTP", event="malformed")
         for word in "abcdefghijkl"
@@ -126,7 +126,7 @@ def test_a_denial_without_a_host_is_listed() -> None:
 
 
 def test_everything_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, most in (("_MOST_HOSTS", 5), ("_MOST_NAMES", 3), ("MOST_RECORDS", 40)):
+    for name, most in (("_MAX_HOSTS", 5), ("_MAX_NAMES", 3), ("MAX_RECORDS", 40)):
         monkeypatch.setattr(denial_summary, name, most)
     many = [denial(second, f"10.0.0.{second % 8}") for second in range(40)]
     found = of(*many, limit=2)

@@ -4,7 +4,7 @@ from appliance.channel.messages import TopicTraffic
 from appliance.control.assembly.monitor_states import published_now
 from appliance.control.operators.queries import by_resource, carried_of, from_zero
 from appliance.master.endpoints import traffic
-from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic
+from appliance.master.endpoints.traffic import MAX_RESOURCES, OTHERS, RelayTraffic
 from appliance.master.graph.registry import Kind, Registry
 from appliance.specifications.live_topics import LiveType
 from tests.support.core import FakeTrail
@@ -24,10 +24,10 @@ def test_counters_begin_at_zero() -> None:
 
 
 def test_names_are_bounded() -> None:
-    sums = by_resource((f"/topic{number}", (1,)) for number in range(MOST_RESOURCES + 500))
-    assert len(sums) == MOST_RESOURCES + 1
+    sums = by_resource((f"/topic{number}", (1,)) for number in range(MAX_RESOURCES + 500))
+    assert len(sums) == MAX_RESOURCES + 1
     assert sums[OTHERS] == [500]
-    assert sum(row[0] for row in sums.values()) == MOST_RESOURCES + 500
+    assert sum(row[0] for row in sums.values()) == MAX_RESOURCES + 500
 
 
 def test_few_topics_have_their_own_histogram() -> None:
@@ -36,7 +36,7 @@ def test_few_topics_have_their_own_histogram() -> None:
 
 
 def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
+    monkeypatch.setattr(traffic, "MAX_RESOURCES", 2)
     registry = Registry()
     for number in range(4):
         registry.add(incarnation("/node", 4000 + number, key=f"k{number}"))

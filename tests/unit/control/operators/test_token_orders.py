@@ -344,7 +344,7 @@ async def test_a_full_disk_keeps_no_use_and_harms_no_request(
 async def test_a_rotation_needs_room_only_for_a_further_token(
     lives: Lives, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(token_orders, "_MOST", 2)
+    monkeypatch.setattr(token_orders, "_MAX", 2)
     tokens = lives.next()
     for name in ("alice", "bob"):
         await tokens.add(TokenAdd(name, "viewer", 600))

@@ -242,7 +242,7 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
 
 
 def test_too_many_files_are_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backup, "MOST_FILES", 5)
+    monkeypatch.setattr(backup, "MAX_FILES", 5)
     with pytest.raises(BackupError, match=r"more than 5 files, .* in api"):
         for number in range(9):
             (state / "api" / str(number)).touch()

@@ -312,7 +312,7 @@ async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path:
 
 
 async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appliance.features.blocks.orders.MOST", 2)
+    monkeypatch.setattr("appliance.features.blocks.orders.MAX", 2)
     async with control(tmp_path) as made:
         await made.block(NODE)
         await made.block(OTHER)

@@ -1,7 +1,7 @@
 from websockets.server import ServerProtocol
 
 from appliance.base import clock
-from appliance.features.doors.door_link import MOST_SHOWN
+from appliance.features.doors.door_link import MAX_SHOWN
 from appliance.features.doors.process import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.session import DoorSession
 from tests.support.idle import idle
@@ -13,7 +13,7 @@ def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
     machine = VirtualClock()
     clients = []
     with clock.using(machine):
-        for number in range(MOST_SHOWN + 10):
+        for number in range(MAX_SHOWN + 10):
             machine.advance(1.0)
             clients.append(CountedClient(session, f"10.0.0.{number}", "", []))
     session.received, session.refusals = 600, 2
@@ -24,4 +24,4 @@ def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
     session.sent += 7
     first = next(shown(reversed(clients)))
     assert (first.peer, first.received, first.sent, first.refusals) == ("10.0.0.0", 55, 7, 0)
-    assert len([*shown(clients)]) == MOST_SHOWN
+    assert len([*shown(clients)]) == MAX_SHOWN

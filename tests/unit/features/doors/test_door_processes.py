@@ -184,7 +184,7 @@ async def test_two_definitions_are_recorded_with_their_nodes_and_hosts(site: Doo
 async def test_the_robots_machine_has_the_first_number_and_no_number_is_used_twice(
     site: DoorSite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("appliance.features.doors.door_processes._MOST_HOSTS", 1)
+    monkeypatch.setattr("appliance.features.doors.door_processes._MAX_HOSTS", 1)
     await site.hears(door_link.HostsWanted(1, ["/gone", "/base", "/guest", "/other", "/guest"]))
     [given] = [one for one in site.sent if isinstance(one, door_link.HostsGiven)]
     assert given.hosts == [-1, 0, 1, 2, 3]

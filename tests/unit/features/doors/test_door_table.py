@@ -6,7 +6,7 @@ from appliance.base import clock
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.doors.door_table import DoorTable, DoorTables, TicketRow
 from appliance.features.doors.door_visits import DoorTickets, left_by_its_maker, new_ticket
-from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.settings import MAX_DOORS, Doors
 from appliance.store.state_file import EndRow, StateStore
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
@@ -71,9 +71,9 @@ def test_a_door_that_would_confuse_is_refused(
 
 def test_doors_are_bounded(tmp_path: Path) -> None:
     table = DoorTable(opened(tmp_path), Doors())
-    for number in range(MOST_DOORS):
+    for number in range(MAX_DOORS):
         table.save(table.planned(f"d{number}", None, ""))
-    assert sorted(row.slot or 0 for row in table.live()) == [*range(MOST_DOORS)]
+    assert sorted(row.slot or 0 for row in table.live()) == [*range(MAX_DOORS)]
     with pytest.raises(SenselessError, match="limit"):
         table.planned("more", None, "")
 

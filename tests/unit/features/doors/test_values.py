@@ -12,7 +12,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from appliance.features.doors.cbor_frames import MOST_DEPTH, MOST_ITEMS, MOST_NUMBERS, json_of_cbor
+from appliance.features.doors.cbor_frames import MAX_ITEMS, MAX_NUMBERS, MOST_DEPTH, json_of_cbor
 from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.values import MessageCodec, ValueLimits, cbor
 from roswire.definitions import MAX_DEPTH, Definitions
@@ -225,7 +225,7 @@ def test_a_hostile_message_takes_neither_time_nor_memory(text: str, data: bytes,
         (b"\x5b" + b"\xff" * 8 + b"a", "ends inside the value"),
         (b"\x81" * (MOST_DEPTH + 1) + b"\0", f"nested deeper than {MOST_DEPTH}"),
         (b"\x81" * 1_000_000, f"nested deeper than {MOST_DEPTH}"),
-        (b"\x9a\x00\x10\x00\x00" + b"\x80" * (1 << 20), f"more than {MOST_ITEMS} values"),
+        (b"\x9a\x00\x10\x00\x00" + b"\x80" * (1 << 20), f"more than {MAX_ITEMS} values"),
         (cbor2.dumps(2**70), "tag 2"),
         (b"\xd8\x23\x61(", "tag 35"),
         (b"\xd8\x1c\x81\xd8\x1d\x00", "tag 28"),
@@ -294,10 +294,10 @@ def test_the_cost_of_a_text_is_an_upper_bound_of_the_memory_that_it_takes(text: 
 
 
 def test_numbers_of_typed_arrays_are_bounded() -> None:
-    array = cbor2.CBORTag(72, bytes(MOST_NUMBERS + 1))
-    with pytest.raises(MessageValueError, match=f"more than {MOST_NUMBERS} numbers"):
+    array = cbor2.CBORTag(72, bytes(MAX_NUMBERS + 1))
+    with pytest.raises(MessageValueError, match=f"more than {MAX_NUMBERS} numbers"):
         json_of_cbor(cbor2.dumps({"op": "publish", "msg": {"data": array}}))
-    assert json_of_cbor(cbor2.dumps({"data": cbor2.CBORTag(64, bytes(MOST_NUMBERS + 1))}))
+    assert json_of_cbor(cbor2.dumps({"data": cbor2.CBORTag(64, bytes(MAX_NUMBERS + 1))}))
 
 
 def test_a_codec_serves_the_deepest_permitted_types() -> None:

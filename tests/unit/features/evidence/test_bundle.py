@@ -224,11 +224,11 @@ def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer:
     place = tmp_path / "x.zip"
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, data in members_of(bundle).items():
-            archive.writestr(member, b"[" * (6 * bundle_verifier.MOST) if member == name else data)
+            archive.writestr(member, b"[" * (6 * bundle_verifier.MAX) if member == name else data)
     tracemalloc.start()
     try:
         assert reviewer.status(place) == 1
-        assert tracemalloc.get_traced_memory()[1] < 4 * bundle_verifier.MOST
+        assert tracemalloc.get_traced_memory()[1] < 4 * bundle_verifier.MAX
     finally:
         tracemalloc.stop()
 
@@ -651,7 +651,7 @@ def test_empty_and_too_large_time_spans_are_rejected(
 ) -> None:
     with pytest.raises(BundleError, match="no record in that period"):
         export(control.log.path, TimeSpan(0, 1), control.ask, NAMES)
-    monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
+    monkeypatch.setattr(bundles, "MAX_RECORDS", 3)
     with pytest.raises(BundleError, match="more than 3 records"):
         export(control.log.path, TimeSpan(0, wall_ns() + 1), control.ask, NAMES)
 

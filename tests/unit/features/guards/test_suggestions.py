@@ -7,7 +7,7 @@ import yaml
 
 from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS, GuardError, text_of
-from appliance.features.guards.robot_graph import MOST_COMMANDS, TopicFacts
+from appliance.features.guards.robot_graph import MAX_COMMANDS, TopicFacts
 from appliance.features.guards.suggestions import NOT_SUGGESTED, advice
 from appliance.features.guards.upgrades import planned
 from rosmop.check.sources import compiled_from
@@ -282,7 +282,7 @@ def test_a_flood_of_topics_is_cut_and_said() -> None:
         for number in range(700)
     ]
     found = advice(graph)
-    assert len({one.topics["command"] for one in found.suggestions}) == MOST_COMMANDS
+    assert len({one.topics["command"] for one in found.suggestions}) == MAX_COMMANDS
     assert "only the first" in found.left_out[-1]
 
 

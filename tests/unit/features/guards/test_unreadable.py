@@ -7,7 +7,7 @@ import pytest
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from rosmop.fast.abi import SetPart
 from rosmop.run.engine import MonitorSet
-from rosmop.run.origins import MOST, Origin
+from rosmop.run.origins import MAX, Origin
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import message
 from tests.support.features.guards.running_guard import (
@@ -183,7 +183,7 @@ def test_a_node_that_is_not_the_first_keeps_the_guard_in_doubt_and_never_takes_i
     assert not source.hears("/b") and source.hears("/a") and source.read("/a") and source.hears("/c")
     for number in range(20):
         source.doubt(f"/{number}")
-    assert len(source.unreadable) == MOST + 1
+    assert len(source.unreadable) == MAX + 1
     assert not any(map(source.read, [f"/{number}" for number in range(20)])) and not source.hears("/a")
 
 
@@ -199,7 +199,7 @@ def test_speakers_are_all_heard_and_all_awaited() -> None:
     for number in range(20):
         source.read(f"/{number}")
     source.begin_again()
-    assert len(source.unreadable) == MOST + 1
+    assert len(source.unreadable) == MAX + 1
     assert all(map(source.read, [f"/{number}" for number in range(20)])) and source.blocks
     source.forget()
     assert source.awaited == [] and source.hears("/z")

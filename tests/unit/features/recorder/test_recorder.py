@@ -17,7 +17,7 @@ from appliance.features.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.features.recorder.recorder_ring import ExcludedStream
 from appliance.features.recorder.recording import RecordingInProgress
 from appliance.features.recorder.recording_answers import Recording, Trigger
-from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
+from appliance.features.recorder.recording_store import MAX_TEMPORARY, RecordingStore
 from appliance.features.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
 from appliance.features.recorder.settings import RecorderRules
 from tests.support.audit import decision, settle
@@ -170,14 +170,14 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
     scene.later(601)
     assert there() == set()
     scene.say()
-    several = {lent(0, scene.clock.now).id for _order in range(MOST_TEMPORARY)}
+    several = {lent(0, scene.clock.now).id for _order in range(MAX_TEMPORARY)}
     busy = asked(0, scene.clock.now)  # a recording that a user is about to open stays
     assert isinstance(busy, recorder_link.RecordingRefused)
     assert (busy.unknown, "half a minute" in busy.reason) == (False, True)
     assert there() == several
     scene.later(31)
     last = lent(scene.clock.now, scene.clock.now)
-    assert (last.id in there(), len(there() & several)) == (True, MOST_TEMPORARY - 1)
+    assert (last.id in there(), len(there() & several)) == (True, MAX_TEMPORARY - 1)
     scene.begin_anew()
     assert there() == set()
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
@@ -487,7 +487,7 @@ def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
 
 
 def test_the_number_of_headers_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("appliance.features.recorder.recording._MOST_HEADERS", 20_000)
+    monkeypatch.setattr("appliance.features.recorder.recording._MAX_HEADERS", 20_000)
     scene.happen()
     scene.later(0.1)
     quiet = scene.stream

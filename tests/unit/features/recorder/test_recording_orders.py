@@ -16,7 +16,7 @@ from appliance.features.recorder import requests as recording_requests
 from appliance.features.recorder.orders import RecordingOrders
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
 from appliance.features.recorder.recording_plan import RecordingPlan
-from appliance.features.recorder.recording_store import MOST_TEMPORARY
+from appliance.features.recorder.recording_store import MAX_TEMPORARY
 from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.view import RecorderState
 from tests.support.core import FakeTrail
@@ -242,7 +242,7 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
     ]
     known = await scene.orders.recordings(recording_requests.RecordingsWanted())
     assert (known.recordings, known.topics, known.before) == ([], ["/*"], 60)
-    for _other in range(MOST_TEMPORARY):
+    for _other in range(MAX_TEMPORARY):
         assert await scene.orders.fetch(recording_requests.RecordingFetch(first.id), "eve") == first
         await scene.orders.of_memory(recording_requests.RecordingOfMemory(since=7), "eve")
     with pytest.raises(UnknownThingError):

@@ -149,7 +149,7 @@ def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
 
 def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control receives all recordings in one message."""
-    monkeypatch.setattr("appliance.features.recorder.recording_store._MOST_DESCRIBED", 1000)
+    monkeypatch.setattr("appliance.features.recorder.recording_store._MAX_DESCRIBED", 1000)
     store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
     for number in range(1, 9):
         put(store, recording(number))

@@ -11,7 +11,7 @@ from appliance.audit.log.record_format import LogEntry
 from appliance.features.recorder.bag_reader import BagReader, MessagePosition
 from appliance.features.recorder.bag_writer import BagMessage, BagWriter
 from appliance.features.recorder.recording_answers import Recording, Sender, Trigger
-from appliance.features.recorder.timeline import MOST_EVENTS, messages_around, timeline
+from appliance.features.recorder.timeline import MAX_EVENTS, messages_around, timeline
 from tests.unit.features.recorder.test_bag_writer import HEADER, SECOND, body
 
 BEGAN = 100 * SECOND
@@ -188,14 +188,14 @@ def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
     decided = writer.connect(RECORDS)
     writer.write(
         BagMessage(decided, BEGAN + number, record(number, decision="deny"))
-        for number in range(3 * MOST_EVENTS)
+        for number in range(3 * MAX_EVENTS)
     )
     writer.close()
-    for asked, first in ((None, 0), (MOST_EVENTS - 1, 0), (2 * MOST_EVENTS, 3 * MOST_EVENTS // 2)):
+    for asked, first in ((None, 0), (MAX_EVENTS - 1, 0), (2 * MAX_EVENTS, 3 * MAX_EVENTS // 2)):
         about = "" if asked is None else f"{asked:020x}"
         found = timeline(RECORDING, tmp_path / "a.bag", record=about)
-        assert [int(event.record, 16) for event in found.events] == list(range(first, first + MOST_EVENTS))
-        assert (found.more_events, sum(found.marks[0].counts)) == (2 * MOST_EVENTS, 3 * MOST_EVENTS)
+        assert [int(event.record, 16) for event in found.events] == list(range(first, first + MAX_EVENTS))
+        assert (found.more_events, sum(found.marks[0].counts)) == (2 * MAX_EVENTS, 3 * MAX_EVENTS)
 
 
 def test_counted_events_are_spread_over_their_time(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import contextlib
 import pytest
 
 from appliance.api.front.problems import ProblemError
-from appliance.features.sso.routes import MOST_AT_ONCE, MOST_WAITING, SignOnPlaces, SignOnRates
+from appliance.features.sso.routes import MAX_AT_ONCE, MAX_WAITING, SignOnPlaces, SignOnRates
 from tests.support.virtual_clock import let_time_pass
 
 pytestmark = pytest.mark.anyio
@@ -50,21 +50,19 @@ async def test_unknown_hosts_keep_no_person_from_signing_in(strangers: int) -> N
 
 async def test_one_address_may_have_all_places_while_no_other_wants_one() -> None:
     places = SignOnPlaces()
-    waited = await asyncio.gather(*(sign_in(places, "10.0.0.9", 1.0) for _ in range(MOST_AT_ONCE)))
+    waited = await asyncio.gather(*(sign_in(places, "10.0.0.9", 1.0) for _ in range(MAX_AT_ONCE)))
     assert max(waited) == 0.0
-    waited = await asyncio.gather(*(sign_in(places, "10.0.0.9", 1.0) for _ in range(3 * MOST_AT_ONCE)))
+    waited = await asyncio.gather(*(sign_in(places, "10.0.0.9", 1.0) for _ in range(3 * MAX_AT_ONCE)))
     assert max(waited) == pytest.approx(2.0)
 
 
 async def test_a_full_queue_loses_one_of_the_address_that_has_most() -> None:
     places = SignOnPlaces()
-    flood = [
-        asyncio.create_task(sign_in(places, "10.9.0.1", 4.0)) for _ in range(MOST_AT_ONCE + MOST_WAITING)
-    ]
+    flood = [asyncio.create_task(sign_in(places, "10.9.0.1", 4.0)) for _ in range(MAX_AT_ONCE + MAX_WAITING)]
     await asyncio.sleep(1)
     assert await sign_in(places, "10.0.0.9") == pytest.approx(3.0)
     with pytest.raises(ProblemError, match="too many people"):
-        await asyncio.gather(*(sign_in(places, "10.9.0.1") for _ in range(MOST_WAITING)))
+        await asyncio.gather(*(sign_in(places, "10.9.0.1") for _ in range(MAX_WAITING)))
     for task in flood:
         task.cancel()
     ended = await asyncio.gather(*flood, return_exceptions=True)

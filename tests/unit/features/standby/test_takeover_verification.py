@@ -233,7 +233,7 @@ def test_the_tail_reaches_beyond_an_unsealed_takeover(tmp_path: Path) -> None:
 def test_the_findings_are_limited(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     pair.forge_b(removing(2))
     assert len(verified(pair.a, pair.b).findings) > 1
-    monkeypatch.setattr("appliance.features.standby.takeover_table._MOST_FINDINGS", 1)
+    monkeypatch.setattr("appliance.features.standby.takeover_table._MAX_FINDINGS", 1)
     assert len(verified(pair.a, pair.b).findings) == 1
 
 

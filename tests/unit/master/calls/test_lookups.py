@@ -33,7 +33,7 @@ async def test_the_state_lists_all_live_registrations() -> None:
 
 
 async def test_types_of_unused_topics_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_MOST_UNUSED_TYPES", 2)
+    monkeypatch.setattr(registry, "_MAX_UNUSED_TYPES", 2)
     world = ControlParts()
     node, known = world.node("/a"), world.registry
     known.register(node, Kind.PUBLICATION, "/kept", "p/Kept")

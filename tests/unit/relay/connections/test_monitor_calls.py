@@ -10,7 +10,7 @@ from appliance.channel.messages import (
     NodePlaced,
     ServicePlaced,
 )
-from appliance.relay.connections.monitor_calls import MOST, MOST_OF_MONITOR, ServiceCalls
+from appliance.relay.connections.monitor_calls import MAX, MAX_OF_MONITOR, ServiceCalls
 from rosmop.run.outcomes import Published
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.unit.relay.contexts import context_of
@@ -73,16 +73,16 @@ def test_each_call_that_does_not_succeed_is_one_fault(
 
 def test_the_number_of_calls_under_way_is_bounded() -> None:
     calls = Calls()
-    for _ in range(MOST_OF_MONITOR + 3):
+    for _ in range(MAX_OF_MONITOR + 3):
         calls.calls.call(wanted())
-    assert (len(calls.reports.sent), calls.faults) == (MOST_OF_MONITOR, 3)
-    for number in range(MOST):
+    assert (len(calls.reports.sent), calls.faults) == (MAX_OF_MONITOR, 3)
+    for number in range(MAX):
         calls.calls.call(wanted(f"other{number}"))
-    assert len(calls.reports.sent) == MOST
+    assert len(calls.reports.sent) == MAX
     calls.loop.run_due()
-    assert calls.faults == 3 + MOST_OF_MONITOR
+    assert calls.faults == 3 + MAX_OF_MONITOR
     calls.calls.call(wanted())
-    assert len(calls.reports.sent) == MOST + 1
+    assert len(calls.reports.sent) == MAX + 1
 
 
 @pytest.fixture(name="world")

@@ -6,7 +6,7 @@ import pytest
 import appliance.relay.connections
 
 _FOLDER = Path(appliance.relay.connections.__file__).parent
-_MOST = 9
+_MAX = 9
 
 
 @pytest.mark.parametrize(
@@ -26,4 +26,4 @@ def test_a_state_is_an_enum_and_few_attributes(file: str, name: str) -> None:
         and ast.unparse(node.value) == "self"
     }
     [enum] = {one for one in state if one.strip("_") == "state"}
-    assert len(state - {enum}) <= _MOST, sorted(state)
+    assert len(state - {enum}) <= _MAX, sorted(state)

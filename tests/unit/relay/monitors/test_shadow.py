@@ -127,7 +127,7 @@ def test_shadow_mode_has_a_bounded_part_of_the_processor(
 
 
 def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shadow, "_MOST_WAITING", 5)
+    monkeypatch.setattr(shadow, "_MAX_WAITING", 5)
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     publisher.send(string("a") * 30)

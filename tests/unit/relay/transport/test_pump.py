@@ -22,7 +22,7 @@ from appliance.relay.transport.pump import (
 pytestmark = pytest.mark.usefixtures("sockets")
 
 READ = select.EPOLLIN
-MOST = 4096  # frames of a step
+MAX = 4096  # frames of a step
 _ROOM = 64
 
 
@@ -151,7 +151,7 @@ def test_disarming_returns_the_incomplete_frame_and_arming_takes_it(pumped: Pump
         struct.pack("<I", LARGE - 3) + b"begin",
         struct.pack("<I", 0xFFFFFFFF),
         frame(bytes(SMALL + 1))[:-1],
-        frame(b"") * (MOST + 1),
+        frame(b"") * (MAX + 1),
         frame(b"small") + struct.pack("<I", LARGE) + b"begin",
     ],
     ids=["large", "largest", "long rest", "too many", "large second"],

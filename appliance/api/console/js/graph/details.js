@@ -12,7 +12,7 @@ import { Link } from "../router.js";
 import { Messages } from "./messages.js";
 import { Rates } from "./rates.js";
 
-const MOST = 60;
+const MAX = 60;
 
 /** @param {{item: any, line: any, denials: any[], shown: {items: Map<string, any>, lines: Map<string, any>}, choose: (key: string | null) => void, open: (key: string) => void}} given `shown`: all that is drawn */
 export function Details({ item, line, denials, shown, choose, open }) {
@@ -34,7 +34,7 @@ function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choo
   if (item.kind === "service")
     return html`<dl class="facts"><dt>Offered by</dt><dd><${Given} value=${row.node} mono /></dd>${path}<dt>Messages</dt><dd>${count(row.messages)}</dd><dt>Clients now</dt><dd>${row.connections.length}</dd></dl>`;
   return html`<dl class="facts"><dt>Type</dt><dd><${Given} value=${row.type} mono /></dd>${path}</dl>
-    <div><h3>${counted(row.publishers.length, "publisher")}</h3><ul class="plain-list">${row.publishers.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.node}><button class="link" onClick=${() => choose(`n${one.node}`)}><${Given} value=${one.node} mono /></button>${" "}
+    <div><h3>${counted(row.publishers.length, "publisher")}</h3><ul class="plain-list">${row.publishers.slice(0, MAX).map((/** @type {any} */ one) => html`<li key=${one.node}><button class="link" onClick=${() => choose(`n${one.node}`)}><${Given} value=${one.node} mono /></button>${" "}
       <span class="muted small">${rate(one.messages_per_second)} messages/s, ${bytes(one.bytes_per_second)}/s, ${count(one.messages)} in all${one.dropped ? `, ${count(one.dropped)} dropped` : ""}</span></li>`)}</ul></div>
     <${Names} title="Subscribers" names=${row.subscribers} letter="n" choose=${choose} />
     ${row.mediated && row.publishers.length > 0 && html`<${Rates} key=${row.name} topic=${row} /><${Messages} key=${`m${row.name}`} topic=${row.name} />`}`;
@@ -42,8 +42,8 @@ function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choo
 
 function Names(/** @type {{title: string, names: string[], letter: string, choose: (key: string) => void}} */ { title, names, letter, choose }) {
   if (!names.length) return null;
-  return html`<div><h3>${title} <span class="muted">${names.length}</span></h3><ul class="plain-list">${names.slice(0, MOST).map((name) => html`<li key=${name}><button class="link" onClick=${() => choose(letter + name)}><${Given} value=${name} mono /></button></li>`)}
-    ${names.length > MOST && html`<li class="muted">and ${names.length - MOST} more</li>`}</ul></div>`;
+  return html`<div><h3>${title} <span class="muted">${names.length}</span></h3><ul class="plain-list">${names.slice(0, MAX).map((name) => html`<li key=${name}><button class="link" onClick=${() => choose(letter + name)}><${Given} value=${name} mono /></button></li>`)}
+    ${names.length > MAX && html`<li class="muted">and ${names.length - MAX} more</li>`}</ul></div>`;
 }
 
 function Group(/** @type {{item: any, shown: {items: Map<string, any>, lines: Map<string, any>}, choose: (key: string) => void, open: (key: string) => void}} */ { item, shown, choose, open }) {
@@ -53,7 +53,7 @@ function Group(/** @type {{item: any, shown: {items: Map<string, any>, lines: Ma
     <${Ends} title="Gets messages from" ends=${ends("to", "from", "flow")} choose=${choose} /><${Ends} title="Sends messages to" ends=${ends("from", "to", "flow")} choose=${choose} />
     <${Ends} title="Others denied here" ends=${ends("to", "from", "denied")} choose=${choose} /><${Ends} title="Denied at" ends=${ends("from", "to", "denied")} choose=${choose} />
     <h3>In it</h3>
-    <ul class="plain-list">${item.members.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.key}><${Given} value=${one.name} mono /></li>`)}${item.members.length > MOST && html`<li class="muted">and ${item.members.length - MOST} more</li>`}</ul>`;
+    <ul class="plain-list">${item.members.slice(0, MAX).map((/** @type {any} */ one) => html`<li key=${one.key}><${Given} value=${one.name} mono /></li>`)}${item.members.length > MAX && html`<li class="muted">and ${item.members.length - MAX} more</li>`}</ul>`;
 }
 
 function Ends(/** @type {{title: string, ends: {line: any, end: any}[], choose: (key: string) => void}} */ { title, ends, choose }) {

@@ -20,7 +20,7 @@ import { modelOf } from "./model.js";
 const NARROW = matchMedia("(max-width: 620px)"); // as in graph.css
 /** The frame of the drawing, about as large as graph.css makes it. @returns {import("./arrange.js").Frame} */
 const FRAME = () => (NARROW.matches ? { narrow: true, w: innerWidth - 36, h: innerHeight * 0.62 } : { narrow: false, w: innerWidth - (innerWidth > 860 ? 280 : 36), h: Math.max(420, innerHeight - 236) });
-const MOST = 42; // items of a kind to draw without groups
+const MAX = 42; // items of a kind to draw without groups
 const RECENT_HOURS = 1;
 
 export function GraphView() {
@@ -50,8 +50,8 @@ export function GraphView() {
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted, shownHost, counts), search) : null), [graph, recent, wanted, search, shownHost, counts]);
   const ready = model !== null && layout.loaded && denials !== null;
-  const shown = useMemo(() => (model && ready ? collapse(model, opened, by, MOST, shownHost) : null), [model, opened, by, ready]);
-  const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MOST, shownHost) : shown), [shown]);
+  const shown = useMemo(() => (model && ready ? collapse(model, opened, by, MAX, shownHost) : null), [model, opened, by, ready]);
+  const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MAX, shownHost) : shown), [shown]);
   const { spots, arranged, frame } = useSpots(shown, closed, round, `${search}|${JSON.stringify(wanted)}|${by}`, FRAME());
   const present = (graph?.nodes ?? []).filter((/** @type {any} */ one) => one.state !== "lost");
   const head = html`<div class="head graph-head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}

@@ -12,7 +12,7 @@ import { Link } from "../router.js";
 
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
 const SEEN = "rosrv.reviewed";
-const MOST = 8;
+const MAX = 8;
 const ORDER = ["alarm", "warning", "notice"];
 
 /** The page about an alarm, by its kind or subject. @param {import("../live.js").Alarm} alarm */
@@ -39,9 +39,9 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
     ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? null
       : html`<ul class="alarm-list">${alarms.toSorted((one, other) => ORDER.indexOf(one.severity) - ORDER.indexOf(other.severity)).map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${placeOf(one)} class="alarm-text"><${Told} text=${inOwnZone(one.text)} /></${Link}><${CopyCommand} text=${one.text} /></li>`)}
-        ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} tone=${isNow(one.time, now) ? "deny" : ""} />
+        ${open.slice(0, MAX).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} tone=${isNow(one.time, now) ? "deny" : ""} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}
-        ${open.length > MOST && html`<li class="alarm"><${Link} to="/console/audit?severity=alarm&since=1d">${open.length - MOST} more in the last day</${Link}></li>`}</ul>`}</section>`;
+        ${open.length > MAX && html`<li class="alarm"><${Link} to="/console/audit?severity=alarm&since=1d">${open.length - MAX} more in the last day</${Link}></li>`}</ul>`}</section>`;
 }
 
 /** An alarm's text with the names of its hosts; a command at its end stays as it can be typed. */

@@ -4,7 +4,7 @@ import { html } from "../html.js";
 import { plain } from "../words.js";
 
 const AROUND = 3;
-const MOST = 4000; // lines of a text to compare
+const MAX = 4000; // lines of a text to compare
 
 /** @typedef {{kind: "same" | "added" | "removed", text: string, old: number | null, now: number | null}} DiffLine */
 
@@ -40,8 +40,8 @@ function Line(/** @type {{line: DiffLine}} */ { line }) {
 
 /** @param {string} old @param {string} now @returns {DiffLine[]} */
 export function difference(old, now) {
-  const a = old.split("\n").slice(0, MOST);
-  const b = now.split("\n").slice(0, MOST);
+  const a = old.split("\n").slice(0, MAX);
+  const b = now.split("\n").slice(0, MAX);
   let head = 0;
   while (head < a.length && head < b.length && a[head] === b[head]) head += 1;
   let tail = 0;

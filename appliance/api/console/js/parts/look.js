@@ -7,7 +7,7 @@ import { get } from "../rest.js";
 export const SECONDS = 60; // the query ends automatically after it
 const EACH = { messages: 20, seconds: 2 };
 const PAUSE = 500; // milliseconds between queries of a topic
-const MOST = 1200; // messages that are kept of a topic
+const MAX = 1200; // messages that are kept of a topic
 
 /**
  * `seen`: the messages of each topic, oldest first; messages are missed before one that is the `first` of a query. `turn` begins and ends the query.
@@ -48,7 +48,7 @@ async function follow(topic, until, signal, heard) {
 
 function recent(/** @type {any[]} */ messages) {
   const newest = Math.max(...messages.map((one) => one.time)) / 1e9;
-  return messages.filter((one) => one.time / 1e9 > newest - 2 * SECONDS).slice(-MOST);
+  return messages.filter((one) => one.time / 1e9 > newest - 2 * SECONDS).slice(-MAX);
 }
 
 const pause = (/** @type {number} */ milliseconds) => new Promise((done) => setTimeout(done, milliseconds));

@@ -1,15 +1,15 @@
 /** The numeric fields of a message in JSON. NaN and infinity are null there. */
 
-const MOST_FIELDS = 300;
-const MOST_ELEMENTS = 8; // of an array that are offered; a path may name any
+const MAX_FIELDS = 300;
+const MAX_ELEMENTS = 8; // of an array that are offered; a path may name any
 
 /** The paths of the numeric fields, such as `pose.position.x` or `ranges[0]`. @param {any} message @returns {string[]} */
 export function numericFields(message) {
   const found = /** @type {string[]} */ ([]);
   const walk = (/** @type {any} */ value, /** @type {string} */ path) => {
-    if (found.length >= MOST_FIELDS) return;
+    if (found.length >= MAX_FIELDS) return;
     if (value === null || typeof value === "number" || typeof value === "boolean") found.push(path);
-    else if (Array.isArray(value)) value.slice(0, MOST_ELEMENTS).forEach((one, index) => walk(one, `${path}[${index}]`));
+    else if (Array.isArray(value)) value.slice(0, MAX_ELEMENTS).forEach((one, index) => walk(one, `${path}[${index}]`));
     else if (typeof value === "object") for (const [name, one] of Object.entries(value)) walk(one, path ? `${path}.${name}` : name);
   };
   walk(message, "");
