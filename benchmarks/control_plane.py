@@ -70,7 +70,7 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
         return [request("setParam", me, key, 42, keep=keep), request("getParam", me, key, keep=keep)]
     method = operation.split()[1]
     params = [[me, f"{key}_{one}", one][: 2 if method == "getParam" else 3] for one in range(20)]
-    parts = [{"methodName": method, "params": one} for one in params]
+    parts = [{"methodName": method, "params": param} for param in params]
     return [request("system.multicall", parts, keep=keep)]
 
 

@@ -35,7 +35,7 @@ def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence
         f"diagnostic_msgs/KeyValue "
         f"'{{{', '.join(f'{_FIELDS[values.index(one)]}:{one}' for one in values if one in over)}}}' {{ }}"
         for event, values in events.items()
-        if any(one in over for one in values)
+        if any(value in over for value in values)
     ]
     head = f"{name}({', '.join(f'std::string {one}' for one in over)}) {{"
     return "\n".join([head, *lines, f"ptltl: {formula}", "@violation { }", "}"])

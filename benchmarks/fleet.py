@@ -257,7 +257,7 @@ class _Searches:
         with self._lock:
             found, self._times = self._times, defaultdict(list)
             failed, self._failed = self._failed, 0
-        return {**found, "all": [one for times in found.values() for one in times]}, failed
+        return {**found, "all": [moment for times in found.values() for moment in times]}, failed
 
     def end(self) -> None:
         self._ended.set()

@@ -195,7 +195,7 @@ def measured(row: Row, guards: list[Running]) -> tuple[list[float], str]:
                 if index == 0:
                     results.append(outcome.result)
     idle = overhead()
-    return [statistics.median(each) / 1e3 - idle for each in times], statistics.mode(results)
+    return [statistics.median(moment) / 1e3 - idle for moment in times], statistics.mode(results)
 
 
 def overhead() -> float:
@@ -245,7 +245,7 @@ def deployed(rays: int, scans: int) -> int:
             *topics,
         ]
         took = session.start(command).wait_for(event="measured", timeout=120 + scans)["took"]
-        faults = {one.name: one.faults for one in appliance.ask(MonitorsWanted()).monitors}
+        faults = {monitor.name: monitor.faults for monitor in appliance.ask(MonitorsWanted()).monitors}
     for topic in topics:
         came = [one for one in took[topic] if one is not None]
         ratio = statistics.median(came) / statistics.median(took["/none"])

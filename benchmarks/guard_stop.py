@@ -110,7 +110,7 @@ def main() -> None:
         sys.exit(drive(given.drive) > 0)
     with busy_programs(1 if given.busy else 0):
         rows = lateness(given.trials, given.silent)
-    late = [one for one in rows if one is not None]
+    late = [row for row in rows if row is not None]
     cuts = statistics.quantiles(late, n=100)
     soon = sum(one <= ALLOWED for one in late)
     print(f"{len(late)} of {len(rows)} stopped, {soon} within {ALLOWED:g} ms of `silent`")

@@ -238,7 +238,7 @@ def again(nodes: int, starts: int, *, rospy: bool) -> int:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             launches.append(Launches(session, masters, folder, nodes, rospy=rospy))
         for number in range(starts):
-            (theirs, their_time), (ours, our_time) = (one.start() for one in launches)
+            (theirs, their_time), (ours, our_time) = (launch.start() for launch in launches)
             if not math.isfinite(theirs):
                 raise TimeoutError(f"start {number + 1}: the plain master's robot is not up: measure again")
             ratios.append(ours / theirs)

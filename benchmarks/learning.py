@@ -305,7 +305,7 @@ def judge(count: int, faults: int, seed: int) -> Judged:
     half = count // 2
     learnt = learn(drives[:half], KNOWN, 0.3, run_here(drives[:half], KNOWN))
     tests = drives[half:]
-    quiet = {each.name: alarms(learnt, each.rows) for each in tests}
+    quiet = {test.name: alarms(learnt, test.rows) for test in tests}
     chance = random.Random(seed)
     flagged: Counter[str] = Counter()
     missed = []
@@ -317,7 +317,7 @@ def judge(count: int, faults: int, seed: int) -> Judged:
             flagged[kind] += 1
         else:
             missed.append(what)
-    hours = sum(each.ended - each.began for each in tests) / SECOND / 3600
+    hours = sum(test.ended - test.began for test in tests) / SECOND / 3600
     return Judged(learnt, hours, [alarm for rows in quiet.values() for alarm in rows], flagged, missed)
 
 
@@ -331,7 +331,7 @@ def main() -> None:
     judged = judge(options.drives, options.faults, options.seed)
     if options.rv is not None:
         options.rv.write_text(judged.learnt.text)
-    widened = sum(1 for each in judged.learnt.candidates if each.widened)
+    widened = sum(1 for candidate in judged.learnt.candidates if candidate.widened)
     print(
         json.dumps(
             {

@@ -168,11 +168,11 @@ def running_site() -> Iterator[tuple[StandbySite, Process]]:
         disk = stack.enter_context(small_disk(home / "robot", "1m"))
         lab = stack.enter_context(Lab("rosrv-rig"))
         site = stack.enter_context(StandbySite(lab, home, lease_folder=disk))
-        for one in site.appliances.values():
-            member = load_membership(path_of(one.state))
+        for appliance in site.appliances.values():
+            member = load_membership(path_of(appliance.state))
             assert member is not None
-            stack.enter_context(small_disk(one.state, "400m", "mode=0711"))
-            save_membership(path_of(one.state), member)
+            stack.enter_context(small_disk(appliance.state, "400m", "mode=0711"))
+            save_membership(path_of(appliance.state), member)
         site.start_witness()
         site.start("a")
         site.until_active("a")
@@ -190,8 +190,8 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
     robot.lost_nothing()
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
     wanted = standby_requests.StandbyWanted()
-    for one in site.appliances.values():
-        eventually(partial(lambda it: not it.ask(wanted).troubles, one), site.story)
+    for appliance in site.appliances.values():
+        eventually(partial(lambda it: not it.ask(wanted).troubles, appliance), site.story)
 
 
 def one(

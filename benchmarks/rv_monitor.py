@@ -85,7 +85,7 @@ def _shown(tree: Any) -> str:
         return str(operands[0])
     if kind == "^":
         return f"({' '.join([_shown(operands[0])] * operands[1])})" if operands[1] else "epsilon"
-    texts = [_shown(one) for one in operands]
+    texts = [_shown(operand) for operand in operands]
     sign = _WORDS.get(kind, "" if kind == "cat" else kind)
     if kind in ("*", "+"):
         return f"({texts[0]}{sign})"

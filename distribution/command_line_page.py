@@ -62,8 +62,8 @@ def _name(flags: str) -> str:
 def _commands(name: str, application: typer.Typer) -> Iterator[_Command]:
     for words, command, context in commands((name,), application):
         if not hasattr(command, "list_commands"):
-            records = (one.get_help_record(context) for one in command.get_params(context))
-            options = tuple((one[0], " ".join(one[1].split())) for one in records if one)
+            records = (param.get_help_record(context) for param in command.get_params(context))
+            options = tuple((record[0], " ".join(record[1].split())) for record in records if record)
             usage = " ".join(command.collect_usage_pieces(context))
             yield _Command(" ".join(words), _markdown(command.help or ""), usage, options)
 
@@ -87,7 +87,7 @@ def _markdown(text: str) -> str:
     paragraphs = (
         _code(one) if one.startswith("\b\n") else " ".join(one.split()) for one in text.strip().split("\n\n")
     )
-    return "\n\n".join(re.sub(r"^(Examples?): (.*)", r"\1: `\2`", one) for one in paragraphs)
+    return "\n\n".join(re.sub(r"^(Examples?): (.*)", r"\1: `\2`", paragraph) for paragraph in paragraphs)
 
 
 def _code(paragraph: str) -> str:

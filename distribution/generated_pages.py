@@ -413,7 +413,7 @@ def _called(node: ast.Call) -> str:
 def _event(node: ast.Call) -> ast.expr | None:
     """Return the expression for the event of a call that records one."""
     called = _called(node)
-    named = {one.arg: one.value for one in node.keywords if one.arg is not None}
+    named = {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg is not None}
     if called in ("AuditRecord", "WriteRecord") and "event" in named:
         return named["event"]
     records = called in ("happened", "_own", "_make", "AuditRecord", "WriteRecord", "_record") and node.args
@@ -434,11 +434,11 @@ def _helper(node: ast.Call, scope: _Scope) -> Iterator[_Helper]:
 
 def _fields(node: ast.Call, scope: _Scope) -> Iterator[str]:
     """Yield the fields of `detail` in a call of `happened`, or in the `partial` of it that is called."""
-    for one in node.keywords:
-        if one.arg in (None, "more"):
-            yield from _keys(one.value, scope)
-        elif one.arg not in _FIELDS:
-            yield one.arg
+    for keyword in node.keywords:
+        if keyword.arg in (None, "more"):
+            yield from _keys(keyword.value, scope)
+        elif keyword.arg not in _FIELDS:
+            yield keyword.arg
     if isinstance(node.func, ast.Name):
         made = [one for one in _values_of(node.func.id, scope) if isinstance(one, ast.Call)]
         yield from (field for one in made for field in _fields(one, scope))
@@ -498,20 +498,20 @@ def _use(
     node: ast.Call, place: str, scope: _Scope, helpers: Mapping[str, _Helper], module: Sequence[ast.AST]
 ) -> Iterator[EventUse]:
     called, event = _called(node), _event(node)
-    named = {one.arg: one.value for one in node.keywords if one.arg is not None}
+    named = {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg is not None}
     fields = [*_fields(node, scope)] if called == "happened" else [_UNKNOWN]
     helper = helpers.get(called)
     if helper is not None and (not isinstance(helper.event, int) or len(node.args) > helper.event):
         known = {one.arg for one in (*helper.function.args.args, *helper.function.args.kwonlyargs)}
         passed = [
             field
-            for one in node.keywords
-            if one.arg not in known
-            for field in (_keys(one.value, scope) if one.arg is None else [one.arg])
+            for keyword in node.keywords
+            if keyword.arg not in known
+            for field in (_keys(keyword.value, scope) if keyword.arg is None else [keyword.arg])
         ]
         called, event = "happened", node.args[helper.event] if isinstance(helper.event, int) else helper.event
         fields = [one for name in helper.fields for one in (passed if name == _PASSED else [name])]
-    fields = [one for one in fields if one not in {*_FIELDS, _PASSED}]
+    fields = [field for field in fields if field not in {*_FIELDS, _PASSED}]
     if event is None:
         return
     for name in _events_of(event, scope, module):
@@ -536,7 +536,7 @@ def _severities(node: ast.Call, called: str, event: str) -> frozenset[str]:
         for one in ast.walk(node)
         if isinstance(one, ast.Attribute) and getattr(one.value, "id", "") == "Severity" and one.attr in known
     }
-    plain = not any(one.arg == "severity" for one in node.keywords)
+    plain = not any(keyword.arg == "severity" for keyword in node.keywords)
     usual = SEVERITIES.get(event, Severity.INFO).value
     return frozenset(found or ({usual} if called == "happened" and plain else set()))
 
@@ -548,7 +548,7 @@ def audit_events_markdown() -> str:
     for use in uses():
         if use.event in EVENTS:
             severities[use.event] |= use.severities
-            fields[use.event] += [one for one in use.fields if one not in fields[use.event]]
+            fields[use.event] += [field for field in use.fields if field not in fields[use.event]]
             read.add(use.event)
     unread = [
         name for name in EVENTS if name not in ELSEWHERE and (name not in read or _UNKNOWN in fields[name])

@@ -147,7 +147,7 @@ def _console(tree: ImageFiles) -> Iterator[Component]:
     for text in tree.matching(_MANIFEST):
         packages = [package for file in json.loads(text)["files"].values() for package in file["packages"]]
         for name, version, licence in sorted(
-            {(one["name"], one["version"], one["licence"]) for one in packages}
+            {(package["name"], package["version"], package["licence"]) for package in packages}
         ):
             namespace, _, last = name.rpartition("/")
             yield _part(PackageURL("npm", namespace or None, last, version), [licence])

@@ -136,7 +136,7 @@ def _presets() -> Iterator[str]:
 
 
 def _named(tests: tuple[str, ...]) -> str:
-    return " ".join(f"`{one}`" for one in tests)
+    return " ".join(f"`{test}`" for test in tests)
 
 
 def _proofs() -> dict[str, tuple[str, str]]:

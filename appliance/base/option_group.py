@@ -52,7 +52,7 @@ class GroupedCommand(TyperCommand):
         **settings: Any,
     ) -> None:
         super().__init__(name, params=[*before, *params, *after], **settings)
-        self._own = [one.name for one in params]
+        self._own = [param.name for param in params]
 
     def invoke(self, ctx: "Context") -> object:
         assert self.callback is not None  # noqa: S101  typer gives each verb one

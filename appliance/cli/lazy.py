@@ -200,7 +200,7 @@ def _no_type(ctx: "Context") -> None:
 
 def _metavar(option: TyperOption, kind: str) -> str | None:
     """Return the word for an option's value, one for each kind of value; None keeps typer's."""
-    name = next(one for one in option.opts if one.startswith("--"))
+    name = next(opt for opt in option.opts if opt.startswith("--"))
     if name in _METAVARS and kind == "<str>":
         return _METAVARS[name]
     words = {

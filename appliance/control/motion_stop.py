@@ -25,10 +25,10 @@ def published_before(store: StateStore, concerns: Callable[[Address, str], bool]
     nodes, registrations = store.load_registry()
     hosts = {node.key: node.host for node in nodes if not node.own}
     return {
-        (host, one.resource)
-        for one in registrations
-        if one.kind == Kind.PUBLICATION and (host := hosts.get(one.key)) is not None
-        if concerns(address_of(host), one.resource)
+        (host, registration.resource)
+        for registration in registrations
+        if registration.kind == Kind.PUBLICATION and (host := hosts.get(registration.key)) is not None
+        if concerns(address_of(host), registration.resource)
     }
 
 

@@ -134,7 +134,7 @@ class CheckpointMemory:
             os.close(descriptor)
 
     def _room_for_another(self) -> None:
-        kept = [one for one in remembered_logs(self._directory) if not one.is_set_aside]
+        kept = [log for log in remembered_logs(self._directory) if not log.is_set_aside]
         if len(kept) >= MAX_LOGS:
             raise CheckpointRefusedError(
                 f"{MAX_LOGS} logs were signed before; set old ones aside: rosrv audit acknowledge"

@@ -184,15 +184,15 @@ def _of_nodes(
         return []
     listeners = [one for one in sockets if one.listens]
     owners = owners_of(one.inode for one in (*connections, *listeners))
-    ports = {one.port: owners[one.inode].pid for one in listeners if one.inode in owners}
+    ports = {listener.port: owners[listener.inode].pid for listener in listeners if listener.inode in owners}
 
     def pid(one: TcpSocket) -> int:
         owner = owners.get(one.inode)
         return ports.get(one.port, 0) if owner is None else owner.pid
 
-    found = {pid(one) for one in connections}.intersection(ports.values())
+    found = {pid(connection) for connection in connections}.intersection(ports.values())
     nodes = {one for one in found if is_node(NodeSockets(one, frozenset(), ""), known)}
-    return [one for one in connections if pid(one) in nodes]
+    return [connection for connection in connections if pid(connection) in nodes]
 
 
 def close_port(namespace: Namespace, link: str, port: int) -> None:

@@ -85,7 +85,7 @@ class AuthorityGroup:
         """Return the rank of a host's node (0 is the highest), or None. A node counts before all nodes of its host."""
         for wanted in (node, ""):
             for rank, members in enumerate(self.ranks):
-                if any(one.node == wanted and not one.hosts.isdisjoint(atoms) for one in members):
+                if any(member.node == wanted and not member.hosts.isdisjoint(atoms) for member in members):
                     return rank
         return None
 
@@ -95,7 +95,7 @@ class AuthorityGroup:
     def claim(self, atoms: frozenset[Atom]) -> Claim | None:
         """Return the best claim of a host. In a group with a rank, hosts with a rank may take it, by moving."""
         if self.ranks:
-            ranked = any(not one.hosts.isdisjoint(atoms) for members in self.ranks for one in members)
+            ranked = any(not member.hosts.isdisjoint(atoms) for members in self.ranks for member in members)
             return Claim.TAKE if ranked else None
         claims = {claim for claim, hosts in self.hosts if not hosts.isdisjoint(atoms)}
         return next((claim for claim in (Claim.OVERRIDE, Claim.TAKE, Claim.ASK) if claim in claims), None)

@@ -179,7 +179,7 @@ class HostGroups:
             self._findings.error(word, f"{quoted(word.text)} is not {form}")
         elif name not in self._warned_hosts:
             self._warned_hosts.add(name)
-            guess = meant(name, [one for one in self._hosts if one.startswith(DOOR) is door])
+            guess = meant(name, [host for host in self._hosts if host.startswith(DOOR) is door])
             text = f"no host {quoted(name)} is enrolled: host:{name} matches no host until it is{guess}"
             if door:
                 text = f"there is no door {quoted(name.removeprefix(DOOR))}: {name} matches no host until it is added"

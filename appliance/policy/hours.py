@@ -123,11 +123,11 @@ def closed_times(times: Times, now: float | None, passed: Mapping[float, bool]) 
 
 def changes_of(times: Times, now: float) -> set[float]:
     hours = _hours_at(times, now)
-    return {change for one in times.values() for change in one.changes(hours[one.hours])}
+    return {change for moment in times.values() for change in moment.changes(hours[moment.hours])}
 
 
 def _hours_at(times: Times, now: float) -> dict[Hours | None, HoursNow]:
-    some = {one.hours for one in times.values()}
+    some = {moment.hours for moment in times.values()}
     return {hours: _ALWAYS if hours is None else hours.at(now) for hours in some}
 
 

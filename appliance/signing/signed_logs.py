@@ -125,7 +125,7 @@ def read_index(folder: Path, opened: Open = plainly) -> list[IndexedLog]:
 
 def sync_index(folder: Path) -> None:
     """List logs that an earlier version signed, or the last one before a crash. Raises `OSError`, `ValueError`."""
-    index = [IndexedLog(one.log, one.begun) for one in remembered_logs(folder)]
+    index = [IndexedLog(log.log, log.begun) for log in remembered_logs(folder)]
     if index != read_index(folder):
         write_whole(folder / INDEX, msgspec.json.encode(index), 0o600)
 
@@ -139,13 +139,13 @@ def acknowledge(folder: Path, found: RememberedLog, time: int, by: int) -> None:
 def others(logs: list[RememberedLog], present: str) -> list[OtherLog]:
     return [
         OtherLog(
-            one.log,
-            one.last,
-            one.hash,
-            one.acknowledgement.time if one.is_set_aside and one.acknowledgement else None,
+            log.log,
+            log.last,
+            log.hash,
+            log.acknowledgement.time if log.is_set_aside and log.acknowledgement else None,
         )
-        for one in logs
-        if one.log != present
+        for log in logs
+        if log.log != present
     ]
 
 

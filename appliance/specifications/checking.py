@@ -74,9 +74,9 @@ def contents(
         }
         for messages in (True, False)
     )
-    called = {one.specification: set[str]() for one in monitors.compiled.calls}
-    for one in monitors.compiled.calls:
-        called[one.specification].add(one.topic)
+    called = {call.specification: set[str]() for call in monitors.compiled.calls}
+    for call in monitors.compiled.calls:
+        called[call.specification].add(call.topic)
     services = {name: own | called.get(name, set()) for name, own in services.items()}
     types = dict(monitors.topics) | dict(monitors.publications)
     return Contents(
@@ -88,21 +88,21 @@ def contents(
         types,
         {name: definitions.full_text(name) for name in types.values()},
         tuple(map(frozenset, monitors.compiled.groups(monitors.names))),
-        {one.code.file: monitors.published_by(one.code.file) for one in monitors.monitors},
+        {monitor.code.file: monitors.published_by(monitor.code.file) for monitor in monitors.monitors},
         certificates,
         _bounded(data),
         _places(monitors),
         {one.name: unbuilt[one.code.file] for one in monitors.monitors if one.code.file in unbuilt},
         {
-            one.name: StateOwner(
-                monitors.identity(one.code).hex(),
-                frozenset(one.held_channels) if monitors.holds_if_lost(one.code) else frozenset(),
-                str(one.code.position),
+            monitor.name: StateOwner(
+                monitors.identity(monitor.code).hex(),
+                frozenset(monitor.held_channels) if monitors.holds_if_lost(monitor.code) else frozenset(),
+                str(monitor.code.position),
             )
-            for one in monitors.monitors
+            for monitor in monitors.monitors
         },
         givens={name: found for name in monitors.names if (found := tuple(_givens(monitors, name)))},
-        switches={one.name: one.code.switch for one in monitors.monitors if one.code.switch},
+        switches={monitor.name: monitor.code.switch for monitor in monitors.monitors if monitor.code.switch},
     )
 
 

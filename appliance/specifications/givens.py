@@ -60,7 +60,7 @@ class Givens:
 
     def dropped(self, checked: CheckedSpecifications) -> list[DroppedValue]:
         kept = self.in_force(checked)
-        own = {monitor: {one.name: one.value for one in rows} for monitor, rows in checked.givens.items()}
+        own = {monitor: {row.name: row.value for row in rows} for monitor, rows in checked.givens.items()}
         return [
             DroppedValue(monitor, name, value, own.get(monitor, {}).get(name, _NOT_DECLARED))
             for monitor, values in self.said.items()

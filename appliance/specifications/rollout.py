@@ -444,7 +444,7 @@ def parts_wanted(
     if of_file is None:
         of_file = _of(Allocation(relays).plan(revision.checked))
     names = dict.fromkeys(_names(revision, relay, of_file) for relay in range(relays))
-    return [one for one in names if one.monitors]
+    return [name for name in names if name.monitors]
 
 
 def _of(plan: AllocationPlan) -> Callable[[str], int]:

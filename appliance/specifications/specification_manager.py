@@ -599,7 +599,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self.changing(request.expected):
             name = request.name
             self._all_known([name])
-            present = {one.name: one.value for one in self.givens.states(self.checked, name)}
+            present = {state.name: state.value for state in self.givens.states(self.checked, name)}
             new = parsed(self.checked.givens.get(name, ()), name, request.values)
             changed = [one for one, value in new.items() if value != present[one]]
             if changed:
@@ -643,9 +643,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         for name, to in coming.put.items():
             self._say_switched(name, to, order.who, ", as it was loaded", earlier=before.states.get(name))
         for name, values in coming.given.items():
-            own = {one.name: one.default for one in self.givens.states(self.checked, name)}
-            own |= {one.name: one.value for one in before.givens.states(before.checked, name)}
-            self._record_given(name, {one: own[one] for one in values}, order.who)
+            own = {state.name: state.default for state in self.givens.states(self.checked, name)}
+            own |= {state.name: state.value for state in before.givens.states(before.checked, name)}
+            self._record_given(name, {value: own[value] for value in values}, order.who)
         if due:
             await self.store.settled()
         await self.rollout.all_taken()
@@ -808,7 +808,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._change_records.switched(name, to, who, why, earlier=earlier, until=until)
 
     def _record_given(self, name: str, before: Mapping[str, messages.GivenValue], who: str) -> None:
-        states = {one.name: one for one in self.givens.states(self.checked, name)}
+        states = {state.name: state for state in self.givens.states(self.checked, name)}
         self._change_records.given(name, states, before, who)
 
     # --- messages of relays ---

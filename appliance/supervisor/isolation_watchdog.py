@@ -214,8 +214,8 @@ class IsolationWatchdog:
         if not watches:
             return
         loop = asyncio.get_running_loop()
-        for one in watches:
-            loop.add_reader(one.fileno(), self._hear, one)
+        for watch in watches:
+            loop.add_reader(watch.fileno(), self._hear, watch)
         try:
             while True:
                 try:
@@ -227,9 +227,9 @@ class IsolationWatchdog:
                     self._changed.clear()
                     await self._restore()
         finally:
-            for one in watches:
-                loop.remove_reader(one.fileno())
-                one.close()
+            for watch in watches:
+                loop.remove_reader(watch.fileno())
+                watch.close()
 
     def _hear(self, watch: RuleWatch) -> None:
         if programs := watch.changes():

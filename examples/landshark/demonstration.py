@@ -178,7 +178,7 @@ class Show:
 
         def find(found: list[Record]) -> Record | None:
             denials = [one for one in found if one["event"] != "denials folded"]
-            self.last_sequence = max((one["sequence"] for one in denials), default=before)
+            self.last_sequence = max((denial["sequence"] for denial in denials), default=before)
             matching = [
                 one
                 for one in denials

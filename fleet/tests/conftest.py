@@ -13,7 +13,7 @@ from tests.support.examples import examples
 settings.register_profile("no clock", deadline=None, max_examples=examples(100))
 settings.load_profile("no clock")
 
-_SIGNS = any(one.name == "rosrv-appliance" for one in distributions())
+_SIGNS = any(distribution.name == "rosrv-appliance" for distribution in distributions())
 _REASON = "needs the appliance: pip install 'rosrv-fleet[signing]', or the environment of `make setup`"
 
 

@@ -58,7 +58,7 @@ def _read(path: Path) -> Rows:
 
 def _join(files: list[Path], again: Path | None, to: Path) -> int:
     try:
-        rows, left_out = joined([_read(one) for one in files], present_digests())
+        rows, left_out = joined([_read(file) for file in files], present_digests())
         if again:
             rows = corrected(rows, _read(again))
     except ValueError as error:
@@ -130,7 +130,7 @@ def main(arguments: list[str]) -> int:
     if to := chosen.rows or chosen.json:
         date = datetime.datetime.now(datetime.UTC).date().isoformat()
         _write(to, continued(before, rows_of(summaries, firsts, _commit(), date)))
-    return 1 if any(one.broken for one in summaries.values()) else 0
+    return 1 if any(summary.broken for summary in summaries.values()) else 0
 
 
 if __name__ == "__main__":

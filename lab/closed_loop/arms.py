@@ -43,7 +43,7 @@ _STEP = 0.0025
 
 def _texts(names: Sequence[str]) -> bytes:
     parts = [name.encode() for name in names]
-    return struct.pack("<I", len(parts)) + b"".join(struct.pack("<I", len(one)) + one for one in parts)
+    return struct.pack("<I", len(parts)) + b"".join(struct.pack("<I", len(part)) + part for part in parts)
 
 
 def _numbers(values: Sequence[float]) -> bytes:
@@ -58,10 +58,10 @@ def trajectory(sent: Sent, began: float, kind: str) -> bytes:
     """Return the message; the world has begun at this second."""
     seconds, rest = (0, 0) if sent.stamp is None else _time(began + sent.stamp)
     data = struct.pack("<4I", 0, seconds, rest, 0) + _texts(sent.names) + struct.pack("<I", len(sent.points))
-    for one in sent.points:
-        for values in (one.positions, one.velocities, one.accelerations, ()):
+    for point in sent.points:
+        for values in (point.positions, point.velocities, point.accelerations, ()):
             data += _numbers(values)
-        data += struct.pack("<ii", *_time(one.at))
+        data += struct.pack("<ii", *_time(point.at))
     return data if kind == TRAJECTORY else bytes(16) + bytes(12) + data + bytes(16)
 
 
@@ -275,8 +275,8 @@ class JointsWorld(World):
         data = trajectory(sent, self.began, self.kind)
         topic = self.guard.topics[COMMAND]
         passed, messages = self.guard.tell(topic, data, self.now, node or self.commander)
-        for one in messages:
-            self.receive(*one)
+        for message in messages:
+            self.receive(*message)
         passes = passed == data
         self.trace("  it passes" if passes else "  it is stopped")
         if honest and self.live and self.sender not in NOT_PROMISED and self.now > 1000:
@@ -320,11 +320,11 @@ class JointsWorld(World):
             v, a = (r.choice((0.1, 0.5, 1.0)) * most for most in (self.fastest, self.growth))
             made = [
                 replace(
-                    one,
+                    point,
                     velocities=tuple(r.uniform(-v, v) for _ in JOINTS),
                     accelerations=tuple(r.uniform(-a, a) for _ in JOINTS) if "acc" in self.curved else (),
                 )
-                for one in points[1:]
+                for point in points[1:]
             ]
             made = [points[0], *made]  # the way to the first point is straight
             if fits(*extremes(made)):

@@ -134,7 +134,7 @@ class Controller:
             return True
         now = self.updated(now) + self.period
         begin = now if stamp is None else stamp
-        left = [one for one in points if begin + one.at > now]
+        left = [point for point in points if begin + point.at > now]
         if (
             not left
             or any(one.at >= other.at for one, other in pairwise(points))

@@ -141,7 +141,7 @@ class SensorWorld(EvidenceWorld):
             case "infinite":
                 numbers = [r.choice((math.inf, -math.inf)) for _value in range(count)]
             case "some":
-                numbers = [one if r.random() < 0.4 else math.nan for one in numbers]
+                numbers = [number if r.random() < 0.4 else math.nan for number in numbers]
         if self.fault == "cut":
             self.say("by", values(self.by, self.now, numbers)[:14], whole=False)
             self.seeing, self.shown = False, []

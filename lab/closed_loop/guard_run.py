@@ -17,7 +17,7 @@ MS = 10**6
 
 @functools.cache
 def parameters_of(preset: str) -> frozenset[str]:
-    return frozenset(one.name for one in preset_named(preset).parameters)
+    return frozenset(parameter.name for parameter in preset_named(preset).parameters)
 
 
 @dataclass(frozen=True)

@@ -398,7 +398,7 @@ class SeparationWorld(DrivenWorld):
             nonlocal arrived
             if self.fault == "dead":
                 return
-            discs = [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
+            discs = [(person.x, person.y, PERSON_RADIUS) for person in self.persons]
             x, y, turned = self.base.seen_from
             found = geometry.ranges(x, y, self.angles + turned, self.walls, discs)
             found[found > self.far] = np.inf

@@ -113,7 +113,7 @@ class _Accompanied:
         for topic, data in side.once.items():
             world.after(1, lambda topic=topic, data=data: self._tell(topic, data))  # type: ignore[misc]  # bound now
         world.every(lambda: 50, self._say, first=2)
-        loads = {one.name for one in preset_named(self._preset).parameters if one.loads}
+        loads = {parameter.name for parameter in preset_named(self._preset).parameters if parameter.loads}
         given = {name: value for name, value in side.values.items() if name not in loads}
         world.trace(
             f"beside it {self._name}: {self._preset}, without evidence from {self._lost[0]} to {self._lost[1]}"

@@ -405,7 +405,7 @@ def _fast(world: "JointsWorld", points: list[Point]) -> Damaged:
     last = points[-1]
     return JOINTS, [
         *points,
-        Point(last.at + 0.01, tuple(0.5 * one - 0.4 * world.most for one in last.positions)),
+        Point(last.at + 0.01, tuple(0.5 * position - 0.4 * world.most for position in last.positions)),
     ]
 
 
@@ -427,7 +427,7 @@ def _bending(world: "JointsWorld", points: list[Point]) -> Damaged:
     found = world.bent(points, beyond)
     if beyond(*extremes(found)):
         return JOINTS, found
-    out = tuple(math.copysign(world.fastest, one) for one in last.positions)
+    out = tuple(math.copysign(world.fastest, position) for position in last.positions)
     home = tuple(-one for one in out)
     long = 8 * world.most / world.fastest + 0.1
     return JOINTS, [

@@ -113,9 +113,9 @@ class Summary:
         self.acts[report.act] += 1
         self.honest += report.honest
         self.clearance = min(self.clearance, report.clearance)
-        for one in report.violations:
-            self.violations[one.law] += 1
-            self.broken.append((seed, str(one)))
+        for violation in report.violations:
+            self.violations[violation.law] += 1
+            self.broken.append((seed, str(violation)))
 
     def join(self, other: "Summary") -> None:
         self.worlds += other.worlds

@@ -183,7 +183,7 @@ class ZoneWorld(SeparationWorld):
         hidden = found < self.own
         inside = np.zeros(found.shape, bool)
         x0, y0, turned = self.base.seen_from
-        discs = [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
+        discs = [(person.x, person.y, PERSON_RADIUS) for person in self.persons]
         for walls, persons in [([wall], []) for wall in self.walls] + [([], [disc]) for disc in discs]:
             away = geometry.ranges(x0, y0, self.angles + turned, walls, persons)
             seen = (away < self.far) & (away > max(self.near, self.own)) & ~hidden

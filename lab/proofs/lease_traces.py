@@ -63,16 +63,16 @@ class TraceBounds:
 
 def lease_accepts(folder: Path, events: Sequence[str], names: tuple[str, str] = ("a", "b")) -> bool:
     fields = [_fields(line, names) for line in events]
-    numbers = [one["number"] for one in fields if "number" in one]
+    numbers = [field["number"] for field in fields if "number" in field]
     if len(numbers) != len(set(numbers)):
         return False
-    epochs = [int(one["epoch"]) for one in fields if "epoch" in one]
-    grants = [int(one["epoch"]) for one in fields if one["event"] == "granted"]
+    epochs = [int(field["epoch"]) for field in fields if "epoch" in field]
+    grants = [int(field["epoch"]) for field in fields if field["event"] == "granted"]
     first = max(0, min(grants) - 1) if grants else 0
     last = max([first, *epochs])
     if last > _MAX_EPOCHS:
         raise ValueError(f"epoch {last} is too large; give a trace with epochs up to {_MAX_EPOCHS}")
-    return accepts(folder, TraceBounds(first, last), [_step(one, names) for one in fields])
+    return accepts(folder, TraceBounds(first, last), [_step(field, names) for field in fields])
 
 
 def _fields(line: str, names: tuple[str, str]) -> dict[str, str]:

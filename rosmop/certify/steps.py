@@ -133,7 +133,7 @@ class ExpectedTopic:
                 ]
                 rows.append(PropertyStep(places.get((number, place)), code.property, index, handled))
             self.steps.append(rows)
-        self.properties = {one.number: one for rows in self.steps for one in rows if one.number is not None}
+        self.properties = {row.number: row for rows in self.steps for row in rows if row.number is not None}
         self._begun = {
             number: begun_in(one, _initial(one.compiled)) for number, one in self.properties.items()
         }
@@ -278,24 +278,24 @@ def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
         rows = [one for one in topic.steps[event] if one.number is not None]
         yield StepCase({}), None, False
         yield StepCase({function: ELSEWHERE}), None, False
-        for one in rows:
-            for now in _times(one):
-                yield StepCase(happens, now), one.number, True
+        for row in rows:
+            for now in _times(row):
+                yield StepCase(happens, now), row.number, True
             for other in rows:
-                beside = _handling(other) if other is not one else None
+                beside = _handling(other) if other is not row else None
                 if beside is not None:
                     dropping = happens | _answers(other, DROPPED)
-                    yield StepCase(dropping, beside=beside), one.number, True
-                    yield StepCase(happens | _answers(one, DROPPED), beside=beside), one.number, True
-            yield StepCase(happens, until=BEGAN), one.number, True
-            yield StepCase(happens, frames=3), one.number, True
-            yield StepCase(happens, counted=0), one.number, True
-            for bits in (DROPPED, RESET, DROPPED | RESET, ELSEWHERE) if one.handlers else ():
-                script = happens | _answers(one, bits)
-                yield StepCase(script), one.number, True
+                    yield StepCase(dropping, beside=beside), row.number, True
+                    yield StepCase(happens | _answers(row, DROPPED), beside=beside), row.number, True
+            yield StepCase(happens, until=BEGAN), row.number, True
+            yield StepCase(happens, frames=3), row.number, True
+            yield StepCase(happens, counted=0), row.number, True
+            for bits in (DROPPED, RESET, DROPPED | RESET, ELSEWHERE) if row.handlers else ():
+                script = happens | _answers(row, bits)
+                yield StepCase(script), row.number, True
                 if bits == DROPPED:
-                    yield StepCase(script, frames=3), one.number, True
-                    yield StepCase(script, told=1 << event), one.number, True
+                    yield StepCase(script, frames=3), row.number, True
+                    yield StepCase(script, told=1 << event), row.number, True
         yield StepCase(happens), None, False
         if topic.drops[event]:
             for number in (None, *topic.properties):
@@ -327,7 +327,7 @@ def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
 def _handling(one: PropertyStep) -> tuple[int, int] | None:
     if one.number is None or not isinstance(one.compiled, FiniteProperty):
         return None
-    handled, automaton = {each.category for each in one.handlers}, one.compiled.automaton
+    handled, automaton = {handler.category for handler in one.handlers}, one.compiled.automaton
     for state, targets in enumerate(automaton.table):
         if not handled.isdisjoint(automaton.verdicts[targets[one.event]]):
             return one.number, state
@@ -337,9 +337,9 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
     bits |= HAPPENED | CHANGED
     return {
-        each.function: bits if each.drops else bits & ~DROPPED
-        for each in one.handlers
-        if each.verdict is not None
+        handler.function: bits if handler.drops else bits & ~DROPPED
+        for handler in one.handlers
+        if handler.verdict is not None
     }
 
 

@@ -201,7 +201,7 @@ def is_tainted(value: AbstractValue) -> bool:
 
 
 def why_of(values: Iterable[AbstractValue]) -> Places:
-    return frozenset[Place]().union(*(one.why for one in values))
+    return frozenset[Place]().union(*(value.why for value in values))
 
 
 def shared_of(inputs: frozenset[str]) -> frozenset[str]:

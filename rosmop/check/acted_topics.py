@@ -38,7 +38,7 @@ def acted_topics(
     """
     channels = {event.channel for event in code.events if event.channel is not None}
     acted: set[str | None] = {None}
-    acted |= {one.topic for one in code.safes} | {one.topic for one in code.withholdings}
+    acted |= {safe.topic for safe in code.safes} | {withholding.topic for withholding in code.withholdings}
     acted |= {*published}
     acted |= {event.channel for event in code.events if _acts(functions[event.function])}
     for declared in code.properties:
@@ -53,7 +53,7 @@ def acted_topics(
 
 def written_topics(specification: tree.Specification) -> tuple[str, ...]:
     """Return the channels on which the text of a specification that cannot be compiled may act, and perhaps more."""
-    helpers = {one.name for one in specification.functions if _takes_references(one)}
+    helpers = {function.name for function in specification.functions if _takes_references(function)}
     acting = any(
         isinstance(node, _DROPS)
         for declared in specification.properties
@@ -87,7 +87,7 @@ def _channels(specification: tree.Specification) -> Iterator[tuple[tree.EventDef
 
 
 def _takes_references(function: tree.FunctionDefinition) -> bool:
-    return any(one.type.reference and not one.type.constant for one in function.parameters)
+    return any(parameter.type.reference and not parameter.type.constant for parameter in function.parameters)
 
 
 def _may_act(event: tree.EventDefinition, helpers: set[str]) -> bool:

@@ -69,7 +69,7 @@ def compile_event(
 
 
 def _lists_nodes(names: SpecificationNames, function: nodes.Function) -> bool:
-    lists = any(one.type == _NAMES for one in names.variables.values())
+    lists = any(variable.type == _NAMES for variable in names.variables.values())
     return lists and any(isinstance(one, nodes.SenderName) for one in nodes.walk(function.body))
 
 

@@ -525,7 +525,7 @@ class FlowAnalysis:
         if name in ("a_put", "a_slot", "l_append"):
             return self._put(node, state)
         arguments = [self.value(argument, state) for argument in node.arguments]
-        inputs = frozenset[str]().union(*(one.inputs for one in arguments))
+        inputs = frozenset[str]().union(*(argument.inputs for argument in arguments))
         if name == "l_element":
             index = arguments[1].known
             return arguments[0].part(index if isinstance(index, int) else ANY, node.type)
@@ -542,7 +542,7 @@ class FlowAnalysis:
         self, node: nodes.Call, word: str, arguments: Sequence[AbstractValue], inputs: frozenset[str]
     ) -> AbstractValue:
         """Return the result of a function of `<math.h>` of floating-point numbers."""
-        plain, nan = word.removesuffix("f"), any(one.is_nan for one in arguments)
+        plain, nan = word.removesuffix("f"), any(argument.is_nan for argument in arguments)
         if word in _TESTS:
             return self._test(word, arguments[0], shared_of(inputs))
         if plain in ("min", "max", "fmin", "fmax"):
@@ -560,7 +560,7 @@ class FlowAnalysis:
             return AbstractValue(NAN, why_of(one for one in arguments if one.is_nan), inputs=inputs)
         if plain == "fabs" and arguments[0].is_number:
             return arguments[0]._replace(known=abs(arguments[0].known))
-        return AbstractValue(may_be_nan=any(one.may_be_nan for one in arguments), inputs=inputs)
+        return AbstractValue(may_be_nan=any(argument.may_be_nan for argument in arguments), inputs=inputs)
 
     def _test(self, word: str, value: AbstractValue, inputs: frozenset[str]) -> AbstractValue:
         if value.is_nan:
@@ -624,7 +624,7 @@ class FlowAnalysis:
 
     def _invoke(self, node: nodes.Invoke, state: PathState) -> AbstractValue:
         arguments = [self.value(argument, state) for argument in node.arguments]
-        inputs = frozenset[str]().union(*(one.inputs for one in arguments))
+        inputs = frozenset[str]().union(*(argument.inputs for argument in arguments))
         function = self._functions.get(node.function)
         if function is None or self._depth >= _DEPTH:
             return AbstractValue(inputs=inputs)
@@ -637,12 +637,12 @@ class FlowAnalysis:
     ) -> AbstractValue:
         """Return the result of a function of the library, whose own comparisons are not reported."""
         if function.same_as:  # `sin` and others, of numbers only
-            nan = any(one.is_nan for one in arguments)
+            nan = any(argument.is_nan for argument in arguments)
             return AbstractValue(NAN if nan else UNKNOWN, why_of(arguments) if nan else EMPTY, inputs=inputs)
         self.compared |= inputs
         if not any(map(is_tainted, arguments)):
             return AbstractValue(inputs=inputs)
-        plain = tuple(one._replace(inputs=EMPTY) for one in arguments)
+        plain = tuple(argument._replace(inputs=EMPTY) for argument in arguments)
         aside = FlowAnalysis(self._functions, {}, None, work=self._work)
         aside._depth = self._depth
         found, why = aside._called(function, plain, EMPTY, PathState()), why_of(arguments)

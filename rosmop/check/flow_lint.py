@@ -240,7 +240,7 @@ class SpecificationFlow:
         found: Places = frozenset()
         delta = start
         if not start:
-            events = [one for one in self.events if one.channel == source.channel]
+            events = [event for event in self.events if event.channel == source.channel]
             found, after = self._judged(events, source, {})
             if found and source.path and not self._bounds(events, source):
                 found = frozenset()
@@ -272,8 +272,8 @@ class SpecificationFlow:
         return self._followed[key]
 
     def _batch(self, number: int, events: Sequence[_Event]) -> _Batch:
-        facts = (self._work.facts_of_function(one.function, self._forms) for one in events)
-        return _Batch(number, events, frozenset[str]().union(*(one.shared for one in facts)))
+        facts = (self._work.facts_of_function(event.function, self._forms) for event in events)
+        return _Batch(number, events, frozenset[str]().union(*(fact.shared for fact in facts)))
 
     def _judged(
         self, events: Sequence[_Event], source: _Source | None, values: Mapping[str, AbstractValue]
@@ -401,7 +401,7 @@ class SpecificationFlow:
         places = [(one.code, "function", "return a `bool` and drop in the action") for one in self._helpers]
         handlers = [name for code in self.code.properties for name in code.handlers.values()]
         places += [(name, "handler", "write `DROP;`") for name in handlers]
-        timers = [one.code.function for one in self.events if one.code.period_ns is not None]
+        timers = [event.code.function for event in self.events if event.code.period_ns is not None]
         places += [(name, "timer", "write `STOP;`") for name in timers]
         for name, what, advice in places:
             function = self._forms[name]
@@ -472,19 +472,19 @@ class SpecificationFlow:
             if any(name not in state.values for state in stopped):
                 yield shown(other.code.name)
         for code in self.code.properties:
-            handlers = (self._forms[one] for one in code.handlers.values())
-            if any(_suppresses(one) and name not in one.shared for one in handlers):
+            handlers = (self._forms[handler] for handler in code.handlers.values())
+            if any(_suppresses(handler) and name not in handler.shared for handler in handlers):
                 yield "a handler"
 
     def may_suppress(self, topic: str) -> bool:
         """Whether it may stop or drop messages of a topic."""
-        events = [one for one in self.events if one.code.topic == topic and one.code.part is None]
+        events = [event for event in self.events if event.code.topic == topic and event.code.part is None]
         stops = any(safe.topic == topic for safe in self.code.safes) and any(
-            one.sent() for one in self.events
+            event.sent() for event in self.events
         )
         handlers = [self._forms[name] for code in self.code.properties for name in code.handlers.values()]
         handled = bool(events) and any(map(_suppresses, handlers))
-        return stops or handled or any(one.suppressed() for one in events)
+        return stops or handled or any(event.suppressed() for event in events)
 
     def named(self, variable: str) -> str:
         return shown(self._variables[variable])

@@ -115,7 +115,7 @@ def given_topics(
 
 def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
     """Return the identity of a state, which belongs to the text and to the topics that replace defaults."""
-    changed = [(one.name, one.topic) for one in topics if one.topic != one.default]
+    changed = [(topic.name, topic.topic) for topic in topics if topic.topic != topic.default]
     return sha256(identity + repr(changed).encode()).digest() if changed else identity
 
 

@@ -209,7 +209,7 @@ def written(
         writer.budgets,
         {raw: writer.constants[raw] for raw in writer.strings},
         writer.references,
-        {topic: [one.number for one in walks[topic].handlers()] for topic in feeds},
+        {topic: [handler.number for handler in walks[topic].handlers()] for topic in feeds},
         len(writer.written),
         refused,
         writer.left,

@@ -38,7 +38,7 @@ def certified(compiled: Compiled) -> CertifiedSet:
 
 def require_loadable(data: bytes) -> None:
     """Build and load the module as a relay does. Raises the errors of `parts_of`."""
-    names = tuple(one.name for one in _set(data).specifications)
+    names = tuple(specification.name for specification in _set(data).specifications)
     for part in parts_of(data, [(names, ())]):
         compiled, fast = loaded(part)
         MonitorSet.of(compiled, fast=fast)
@@ -77,7 +77,7 @@ def _defects(whole: Compiled, names: Collection[str]) -> list[Diagnostic]:
 
 
 def _defect(whole: Compiled, names: Collection[str], error: Exception) -> list[Diagnostic]:
-    first = next(one for one in whole.specifications if one.name in names)
+    first = next(specification for specification in whole.specifications if specification.name in names)
     how = "differs from its automata" if isinstance(error, StepDiffersError) else "cannot be run"
     return [Diagnostic(first.position, "error", f"the code of {first.name} {how}: {error}; {DEFECT}")]
 

@@ -57,12 +57,12 @@ _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 def encoded(compiled: Compiled) -> bytes:
     definitions = compiled.messages.definitions
-    reached = {name for one in compiled.specifications for name in one.reached}
-    reached |= {one.type for one in compiled.publications}
+    reached = {name for specification in compiled.specifications for name in specification.reached}
+    reached |= {publication.type for publication in compiled.publications}
     services = {
         event.service_type for one in compiled.specifications for event in one.events if event.service_type
     }
-    services |= {one.type for one in compiled.calls}
+    services |= {call.type for call in compiled.calls}
     used = _Used(
         {name: definitions.message(name) for name in sorted(reached)},
         {name: definitions.service(name) for name in sorted(services)},

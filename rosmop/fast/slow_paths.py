@@ -39,7 +39,7 @@ def slow_paths(compiled: Compiled) -> list[SlowPath]:
         if error is not None:
             found[SlowPath(channel, "", _position(compiled, channel, error), error.reason)] = None
             continue
-        sliced = [one for one in specifications if one.slicing is not None]
+        sliced = [specification for specification in specifications if specification.slicing is not None]
         for one in sliced:
             found[SlowPath(channel, "", one.position, "has a parametric specification")] = None
         for one in specifications if not sliced else ():

@@ -246,7 +246,7 @@ class Compiled:
     def alone(self, names: Collection[str]) -> "Compiled":
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
-        safes = tuple(one.safes for one in part.specifications)
+        safes = tuple(specification.safes for specification in part.specifications)
         sites = sorted(nodes.sites_of((*functions.values(), safes)))
         numbers = {-1: -1} | {site: number for number, site in enumerate(sites)}
         return replace(
@@ -262,12 +262,12 @@ class Compiled:
         )
 
     def groups(self, names: Collection[str]) -> list[set[str]]:
-        uses = {one.name: one.uses for one in self.specifications}
+        uses = {specification.name: specification.uses for specification in self.specifications}
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
     def without(self, names: Collection[str]) -> "Compiled":
         gone = {name for group in self.groups(names) for name in group}
-        return self.part({one.name for one in self.specifications} - gone)
+        return self.part({specification.name for specification in self.specifications} - gone)
 
     def part(self, names: Collection[str]) -> "Compiled":
         """`names` must include all specifications that share variables with one of them."""
@@ -275,7 +275,7 @@ class Compiled:
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),
             publications=tuple(one for one in self.publications if one.specification in names),
-            calls=tuple(one for one in self.calls if one.specification in names),
+            calls=tuple(call for call in self.calls if call.specification in names),
         )
 
     def is_stamped(self, message_type: str | None) -> bool:

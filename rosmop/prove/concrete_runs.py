@@ -104,8 +104,8 @@ class ConcreteRuns:
         self._before = bytes(self._memory[: module.frames])
         self._interpreter = MonitorSet.of(compiled).interpreter
         for stage in range(3):
-            for one in compiled.specifications:
-                self._interpreter.function(one.start[stage])()
+            for specification in compiled.specifications:
+                self._interpreter.function(specification.start[stage])()
         self._cells = [
             (name, address, kind, cells.texts.get(address, 0))
             for cells in module.cells

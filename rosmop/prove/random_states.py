@@ -45,8 +45,8 @@ class _Constants:
     def __init__(self, numbers: Sequence[float], texts: Sequence[bytes], bounds: Sequence[float]) -> None:
         self.texts = texts
         self.floats = [*_FLOATS, *numbers, *bounds]
-        self.literals = [one for one in numbers if abs(one) < _TAME] or [0.0]
-        self.integers = [int(one) for one in self.literals if one == int(one)] or [0]
+        self.literals = [number for number in numbers if abs(number) < _TAME] or [0.0]
+        self.integers = [int(literal) for literal in self.literals if literal == int(literal)] or [0]
         self.longest = max((int(one) for one in self.floats if one in _LONG), default=0)
 
 
@@ -67,7 +67,7 @@ class RandomStates:
         self._random = Random(_SEED)  # noqa: S311  draws examples, not keys
         self._compiled, self._kind, self._values = compiled, event.kind, ValueCodec(compiled.messages)
         self._kinds = {name: kind for own in module.cells for name, (_, kind) in own.variables.items()}
-        givens = [given for one in compiled.specifications for given in one.givens]
+        givens = [given for specification in compiled.specifications for given in specification.givens]
         self._givens = {given.code: given.default for given in givens if given.code in self._kinds}
         self._throttles = [*module.throttles]
         bounds = [float(one) for given in givens for one in (given.default, *(given.bounds or ()))]

@@ -174,14 +174,14 @@ class MonitorSet:
         (`slice_quota.py`).
         """
         shadowed = {name for shadow in shadows for name in shadow.names}
-        self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
+        self.names: tuple[str, ...] = tuple(specification.name for specification in compiled.specifications)
         compiled = compiled.part(frozenset(self.names).difference(shadowed)) if shadowed else compiled
         self.shadows = shadows
         self.tapped: list[ShadowCopy] = []
         self._tapped_ways: frozenset[str] = frozenset()
         self.warnings: tuple[Diagnostic, ...] = compiled.warnings
         self.compiled = compiled
-        contexts = {one.context: one.name for one in compiled.specifications}
+        contexts = {specification.context: specification.name for specification in compiled.specifications}
         self.interpreter = Interpreter(
             compiled.functions, compiled.sites, compiled.types, contexts, compiled.messages
         )
@@ -986,8 +986,8 @@ def _stopping(compiled: Compiled) -> Iterator[str]:
     for code in compiled.specifications:
         for event in code.events:
             parts = [*nodes.walk(compiled.functions[event.function])]
-            writes = any(isinstance(one, nodes.WriteBack) and one.writes for one in parts)
-            if not writes and any(isinstance(one, nodes.StopMessage) for one in parts):
+            writes = any(isinstance(part, nodes.WriteBack) and part.writes for part in parts)
+            if not writes and any(isinstance(part, nodes.StopMessage) for part in parts):
                 yield f"{code.name}.{event.name}"
 
 

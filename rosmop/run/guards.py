@@ -77,7 +77,7 @@ def _places(code: SpecificationCode, compiled: Compiled, acts: set[str]) -> set[
     """
     mine = {name for name in acts if compiled.functions[name].context == code.context}
     events = {event.function: event.channel for event in code.events}
-    withheld = {one.topic for one in code.withholdings}
+    withheld = {withholding.topic for withholding in code.withholdings}
     if mine <= events.keys():
         return {events[name] for name in mine} | withheld
     timed = any(one.property.timed for one in code.properties)

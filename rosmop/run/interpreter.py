@@ -299,8 +299,8 @@ class _Maker:
         name, values, body = node.name, self.value(node.values), self.block(node.body)
 
         def run(v: Variables) -> str | None:
-            for each in values(v):
-                v[name] = each
+            for value in values(v):
+                v[name] = value
                 end = body(v)
                 if end is not None and end is not _CONTINUE:
                     return end if end is _LEAVE else None

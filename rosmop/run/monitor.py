@@ -237,7 +237,7 @@ class MonitorInstance:
     @property
     def blocks(self) -> bool:
         """Whether it cannot judge, and so holds its topics, until an operator resumes it or until nodes speak."""
-        return self.held or (bool(self.sources) and any(one.blocks for one in self.sources.values()))
+        return self.held or (bool(self.sources) and any(source.blocks for source in self.sources.values()))
 
     def touch(self) -> None:
         if self.group is not None:

@@ -140,7 +140,7 @@ def _done(monitors: MonitorSet, step: Step, *, judged: bool) -> tuple[MonitorSet
             outcomes = [process(topic, bytearray(body_of(kind, words[1:])), nanoseconds(time))]
         case (time,):
             outcomes = monitors.advance(nanoseconds(time))
-    return monitors, [line for one in outcomes for line in lines_of(one, monitors, kind)]
+    return monitors, [line for outcome in outcomes for line in lines_of(outcome, monitors, kind)]
 
 
 def body_of(kind: str, given: Sequence[str]) -> bytes:
@@ -203,8 +203,8 @@ def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str
     head += f" ({outcome.reason})" if outcome.reason else ""
     lines += [head] * bool(kind or outcome.timer)
     lines += [
-        f"    {one.monitor} {one.property + 1} {one.logic}{bound(one)}: {one.category}"
-        for one in outcome.verdicts
+        f"    {verdict.monitor} {verdict.property + 1} {verdict.logic}{bound(verdict)}: {verdict.category}"
+        for verdict in outcome.verdicts
     ]
     lines += [f"    {one.level} {one.monitor}: {one.text}" for one in outcome.log]
     lines += [
@@ -214,9 +214,9 @@ def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str
         for one in outcome.published
     ]
     return lines + [
-        f"    fault of {one.monitor} at {one.position.line}:{one.position.column}: {one.text}"
-        f" {' '.join(f'{name}={value}' for name, value in one.values.items())}".rstrip()
-        for one in outcome.faults
+        f"    fault of {fault.monitor} at {fault.position.line}:{fault.position.column}: {fault.text}"
+        f" {' '.join(f'{name}={value}' for name, value in fault.values.items())}".rstrip()
+        for fault in outcome.faults
     ]
 
 

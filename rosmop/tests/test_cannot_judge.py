@@ -66,7 +66,7 @@ def test_other_faults_drop_only_their_message(text: str) -> None:
     zero = message("geometry_msgs/Twist")
     assert not monitors.process("/cmd_vel", zero, 1).began_holding
     assert not monitors.process("/scan", HUGE, 2).began_holding
-    assert [one.held for one in monitors.monitors] == [False]
+    assert [monitor.held for monitor in monitors.monitors] == [False]
 
 
 def test_a_timer_that_faults_stops_the_robot() -> None:

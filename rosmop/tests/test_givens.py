@@ -88,12 +88,12 @@ def test_a_topic_renames_events_safe_messages_and_publications() -> None:
     all_topics = ({"cap": topics, "lid": {"command": "/x"}} for topics in given)
     sets = [compiled_from({"x.rv": CAP}, definitions(), topics=topics) for topics in all_topics]
     codes = [one.specifications[0] for one in sets]
-    assert [one.events[0].topic for one in codes] == ["/cmd_vel", "/base/cmd", "/cmd_vel", "/cmd_vel"]
-    assert [one.safes[0].topic for one in codes] == ["/cmd_vel", "/base/cmd", "/cmd_vel", "/cmd_vel"]
-    assert [{one.topic for one in each.publications} for each in sets] == [
+    assert [code.events[0].topic for code in codes] == ["/cmd_vel", "/base/cmd", "/cmd_vel", "/cmd_vel"]
+    assert [code.safes[0].topic for code in codes] == ["/cmd_vel", "/base/cmd", "/cmd_vel", "/cmd_vel"]
+    assert [{publication.topic for publication in each.publications} for each in sets] == [
         {"/cmd_vel", "/o"}, {"/base/cmd", "/o"}, {"/cmd_vel", "/o"}, {"/cmd_vel", "/p"},
     ]  # fmt: skip
-    identities = [one.identity for one in codes]
+    identities = [code.identity for code in codes]
     assert identities[0] == identities[2] and len({*identities}) == 3
 
 
@@ -123,7 +123,7 @@ REFUSED = [
 def test_invalid_givens_are_refused(given: str, why: str) -> None:
     body = given if "} {" in given else f"{given} }} {{"
     errors = refused(f"s() given {{ {body} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
-    assert any(why in one.text for one in errors), errors
+    assert any(why in error.text for error in errors), errors
 
 
 def test_another_specification_reads_a_given_constant() -> None:

@@ -151,7 +151,7 @@ def check_refusal(
             claims.add((int(files["wxyz".index(finding.position.file)].split("(")[0][1:]), answer))
     assert claims
     for _ in range(10):
-        naive = Naive([Phase(one.forbidden, one.due, one.echoes) for one in phases])
+        naive = Naive([Phase(phase.forbidden, phase.due, phase.echoes) for phase in phases])
         time = 1
         for _ in range(random.randint(1, 12)):
             time += random.randint(0, 3)
@@ -177,7 +177,7 @@ def compare(random: Random, traces: int) -> tuple[int, int]:
         for _ in range(10):
             monitors = MonitorSet.of(compiled)
             monitors.start(0)
-            naive = Naive([Phase(one.forbidden, one.due, one.echoes) for one in phases])
+            naive = Naive([Phase(phase.forbidden, phase.due, phase.echoes) for phase in phases])
             time, got, given = 1, list[tuple[int, str]](), 0
             for _ in range(random.randint(1, 12)):
                 time += random.randint(0, 3)
@@ -251,7 +251,7 @@ def test_specifications_without_a_place_in_the_order_stay_where_they_are() -> No
         monitors = load(order, **texts)  # type: ignore[arg-type]  # names
         assert "".join(monitors.names) == expected
     warnings = load("order p < q;", y=texts["p"], z=texts["q"]).warnings
-    rivals = [one for one in warnings if "the last word" in one.text]
+    rivals = [warning for warning in warnings if "the last word" in warning.text]
     assert rivals == []
 
 

@@ -33,9 +33,9 @@ def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> 
     for number, (topic, body) in enumerate(traffic):
         time = number * step_ns
         check_same(monitors.judge(topic, bytearray(body), time), other.process(topic, bytearray(body), time))
-    for one in monitors.compiled.specifications:
-        for variable in one.variables:
-            known, found = (each.value(one.name, variable) for each in (monitors, other))
+    for specification in monitors.compiled.specifications:
+        for variable in specification.variables:
+            known, found = (each.value(specification.name, variable) for each in (monitors, other))
             assert repr(known) == repr(found)  # a NaN equals a NaN here
     assert state_of(monitors) == state_of(other)
 

@@ -54,9 +54,9 @@ def compiled(*names: str) -> Compiled:
 def story(outcome: Outcome, names: set[str]) -> Iterator[object]:
     for earlier in outcome.before:
         yield from story(earlier, names)
-    yield [one for one in outcome.events if one.partition(".")[0] in names]
-    yield [one for one in outcome.verdicts if one.monitor in names]
-    yield [(one.position, one.text, one.values) for one in outcome.faults if one.monitor in names]
+    yield [event for event in outcome.events if event.partition(".")[0] in names]
+    yield [verdict for verdict in outcome.verdicts if verdict.monitor in names]
+    yield [(fault.position, fault.text, fault.values) for fault in outcome.faults if fault.monitor in names]
     yield [one for one in outcome.log if one.monitor in names]
     yield [
         (one._replace(site=0), outcome.sites[one.site].position)
@@ -96,7 +96,7 @@ def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
         whole = compiled_from(texts, definitions())
     except SpecificationError:
         return  # the random text is not a valid specification
-    for names in whole.groups([one.name for one in whole.specifications]):
+    for names in whole.groups([specification.name for specification in whole.specifications]):
         part = encoded_part(part_of(whole, names, ()))
         sent = decoded_part(part)
         assert encoded_part(sent) == part
@@ -116,7 +116,7 @@ def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
 def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
     part = part_of(compiled("a", "b"), ["a", "b"], ["b"])
     assert list(part.module.feeds) == ["/a"]
-    assert {one.name for one in part.compiled.specifications} == {"a", "b"}
+    assert {specification.name for specification in part.compiled.specifications} == {"a", "b"}
 
 
 @pytest.mark.parametrize("wrong", [b"", b"\x7fELF", b"\0asm\1\0\0\0"])

@@ -26,7 +26,7 @@ def test_a_cap_limits_what_a_mux_publishes() -> None:
 def test_published_messages_step_properties_and_are_dropped() -> None:
     monitors = load(MUX, y=COUNT)
     outcomes = [monitors.process("/joy", FAST, time) for time in (1, 2, 3)]
-    assert [speeds(one) for one in outcomes] == [[9.0], [], [9.0]]
+    assert [speeds(outcome) for outcome in outcomes] == [[9.0], [], [9.0]]
     assert [one.verdicts[0].category for one in outcomes[1].judged.values()] == ["match"]
     assert monitors.value("count", "n") == 3
 

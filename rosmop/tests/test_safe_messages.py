@@ -104,7 +104,7 @@ def test_time_that_one_monitor_used_up_is_given_again() -> None:
     monitors = load(FAULTY[1][0], y=guard(head="other()"))
     monitors.limit_time(itertools.count(step=0.001).__next__, 0.05)
     outcome = monitors.process("/cmd_vel", bytearray(command()), 1)
-    assert ["processor time" in one.text for one in outcome.faults] == [True]
+    assert ["processor time" in fault.text for fault in outcome.faults] == [True]
     assert bytes(outcome.buffer) == SAFE_BYTES
 
 
@@ -287,7 +287,7 @@ def test_the_module_and_the_interpreter_know_alike_which_messages_are_altered(ho
         both.check([plain(count) for count in counts], time=time)
         told += len(both.lines)
         changed = {"a stop": {7, 8, 9}, "a change": {7, 8, 9}, "a change of some": {7, 9}}[how]
-        assert sum(one.monitor == "b" for one in both.lines) == sum(count in changed for count in counts)
+        assert sum(line.monitor == "b" for line in both.lines) == sum(count in changed for count in counts)
     assert told
 
 

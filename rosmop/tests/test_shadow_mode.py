@@ -93,9 +93,9 @@ class Both:
 
     def story(self, outcome: Outcome) -> list[object]:
         before = [told for earlier in outcome.before for told in self.story(earlier)]
-        did: list[object] = [one for one in outcome.events if one.startswith(f"{self.shadowed}.")]
-        did += [one for one in outcome.verdicts if one.monitor == self.shadowed]
-        did += [(one.position, one.text) for one in outcome.faults if one.monitor == self.shadowed]
+        did: list[object] = [event for event in outcome.events if event.startswith(f"{self.shadowed}.")]
+        did += [verdict for verdict in outcome.verdicts if verdict.monitor == self.shadowed]
+        did += [(fault.position, fault.text) for fault in outcome.faults if fault.monitor == self.shadowed]
         did += [one for one in outcome.log if one.monitor == self.shadowed]
         did += [
             (one._replace(site=0), outcome.sites[one.site].position)
@@ -246,7 +246,7 @@ def test_specifications_that_share_variables_are_in_shadow_mode_together() -> No
         shadowed=["b"],
     )
     assert [one.name for one in monitors.shadowed] == ["a", "b"]
-    assert [one.name for one in monitors.monitors] == ["c"]
+    assert [monitor.name for monitor in monitors.monitors] == ["c"]
     for data in (1, 2, 3):
         monitors.process("/n", number(data), data)
     assert [one.give().dropped_by for one in monitors.tapped] == ["", "b", "a"]

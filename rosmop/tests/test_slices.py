@@ -53,7 +53,7 @@ class Made:
     actions: dict[str, str]
 
     def text(self, binding: bool) -> str:
-        head = ", ".join(f"{FIELDS[one][0]} {one}" for one in self.parameters)
+        head = ", ".join(f"{FIELDS[parameter][0]} {parameter}" for parameter in self.parameters)
         lines = [f"s({head if binding else ''}) {{ int n = 0;"]
         for event, bound in self.binds.items():
             own = ", ".join(f"{FIELDS[one][0]} {one}" for one in bound)
@@ -215,7 +215,7 @@ def test_an_event_that_did_not_happen_in_a_slice_does_not_explain_it(look: str, 
         outcome = monitors.process(topic, sent, place, MessageSender(place + 1))
         if topic == "/end":
             said = "match" if given == 1 else "fail"
-            assert [(one.category, one.why) for one in outcome.verdicts] == [(said, None)]
+            assert [(verdict.category, verdict.why) for verdict in outcome.verdicts] == [(said, None)]
 
 
 GOALS = """
@@ -356,8 +356,8 @@ def test_one_message_may_concern_all_slices() -> None:
     for number in range(200):
         monitors.process("/goal", text(str(number)), 1)
     outcome = monitors.process("/stop", b"", 2)
-    assert [each.binding["id"] for each in outcome.verdicts] == [str(number) for number in range(200)]
-    assert [each.why is not None for each in outcome.verdicts] == [True] * EXPLAINED + [False] * (
+    assert [verdict.binding["id"] for verdict in outcome.verdicts] == [str(number) for number in range(200)]
+    assert [verdict.why is not None for verdict in outcome.verdicts] == [True] * EXPLAINED + [False] * (
         200 - EXPLAINED
     )
     assert outcome.events == ("goals.stop",)

@@ -50,7 +50,7 @@ def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
     monitors = begun(ACTING, 100)
     assert not send(monitors, "/goal", "r", ROBOT).faults
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
-    assert [bool(one.faults) for one in outcomes] == [False] * 49 + [True] * 951
+    assert [bool(outcome.faults) for outcome in outcomes] == [False] * 49 + [True] * 951
     assert outcomes[-1].result == "dropped"
     assert outcomes[-1].faults[0].values == {"id": "g999"}
     for number in range(20):
@@ -63,8 +63,8 @@ def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
     monitors = begun(OBSERVING, 100)
     send(monitors, "/goal", "r", ROBOT)
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
-    assert not any(one.faults or one.result == "dropped" for one in outcomes)
-    assert [line.text for one in outcomes for line in one.log] == [
+    assert not any(outcome.faults or outcome.result == "dropped" for outcome in outcomes)
+    assert [line.text for outcome in outcomes for line in outcome.log] == [
         "1 of its oldest slices were removed to make room for new ones of the same host; the limit is 100 slices"
     ]
     assert live(monitors) == 50

@@ -271,7 +271,7 @@ def test_a_slice_lives_while_its_timer_may_act() -> None:
     for number in range(4):
         monitors.process("/result", text(str(number)), 2 * SECOND)
     stops = [one for outcome in monitors.advance(70 * SECOND) for one in outcome.published]
-    assert [one.topic for one in stops] == ["/stop"]
+    assert [stop.topic for stop in stops] == ["/stop"]
 
 
 def test_deadlines_name_the_events_of_their_own_slice() -> None:
@@ -351,6 +351,6 @@ def test_a_remedy_is_published_for_each_binding() -> None:
         monitors.process("/goal", text(str(number)), number * SECOND)
     monitors.process("/result", text("1"), 5 * SECOND)
     outcomes = passed(monitors, 100 * SECOND)
-    assert [(each.time // SECOND, len(each.published)) for each in outcomes] == [(30, 1), (32, 1)]
+    assert [(outcome.time // SECOND, len(outcome.published)) for outcome in outcomes] == [(30, 1), (32, 1)]
     assert monitors.monitors[0].slices is not None
     assert monitors.monitors[0].slices.live == 0

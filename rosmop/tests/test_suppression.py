@@ -264,7 +264,7 @@ def test_explanations_name_no_event_that_was_dropped() -> None:
         passed(monitors, [(SECOND, "a"), (2 * SECOND, "b"), (3 * SECOND, "b")])
         (verdict,) = monitors.process("/b", b"", 4 * SECOND).verdicts
         assert verdict.why is not None
-        assert [each.time // SECOND for each in verdict.why.events] == [1, 4]
+        assert [event.time // SECOND for event in verdict.why.events] == [1, 4]
 
 
 def _formulas(random: Random) -> Iterator[str]:

@@ -134,7 +134,7 @@ WRONG = [
 @pytest.mark.parametrize(("given", "event", "settings", "why"), WRONG)
 def test_a_wrong_type_or_value_is_refused(given: str, event: str, settings: str, why: str) -> None:
     errors = refused(f"preset s 1 as s {{ {settings} }} s() given {{ {given} }} {{ event {event} {{ }} }}")
-    assert any(why in one.text for one in errors), errors
+    assert any(why in error.text for error in errors), errors
 
 
 def test_each_kind_of_value_of_a_preset_statement_is_checked_at_its_place() -> None:
@@ -144,7 +144,7 @@ def test_each_kind_of_value_of_a_preset_statement_is_checked_at_its_place() -> N
     for name, value in product("tudibcjhs", ("", "x", "1e999", "0x1", "/ //", "1 // one", "nan", "-", '"')):
         text = f"preset s 1 as s {{\n  {name} = {value};\n}} s() given {{ {given} }} {{ event e(x) t {{ }} }}"
         errors = refused(text)
-        assert errors and {(one.position.line, one.position.column) for one in errors} == {(2, 3)}, (
+        assert errors and {(error.position.line, error.position.column) for error in errors} == {(2, 3)}, (
             name,
             value,
         )
@@ -155,7 +155,7 @@ def test_a_specification_cancels_the_goals_of_one_action() -> None:
     errors = refused(f"""preset s 1 as s {{ t = /a/goal {action}; u = /b/goal {action}; }}
         s() given {{ topic t : Command = /t; topic u : Command = /u; }} {{
         safe {{ }} on t every 1s; safe {{ }} on u every 1s; event e() t {{ STOP; }} event f() u {{ STOP; }} }}""")
-    assert any("cancels the goals of one action" in one.text for one in errors)
+    assert any("cancels the goals of one action" in error.text for error in errors)
 
 
 def test_a_preset_statement_needs_its_specification() -> None:
@@ -206,7 +206,7 @@ def test_a_role_has_the_values_of_all_that_it_extends() -> None:
     code = "s() given { topic t : Own = /t; } { event e(px, v, w) t { } }"
     kind = "preset s 1 as s { t = /t nav_msgs/Odometry; }"
     [event] = parse(f"{kind} {roles_with('Position')} {code}", "x.rv").specifications[0].events
-    assert [one.name for one in event.parameters] == ["px"]
+    assert [parameter.name for parameter in event.parameters] == ["px"]
     assert any("circle of roles" in one.text for one in refused(f"{roles_with('Own')} {code}"))
 
 
@@ -218,7 +218,7 @@ def test_each_row_of_a_role_has_its_values(role: str) -> None:
         given = f"topic t : {role} = /t; double lat0 = 0 in 0..1; double lon0 = 0 in 0..1; int button = 0 in 0..9;"
         own = roles()[role]
         values = (*(roles()[own.base].parameters if own.base else ()), *own.parameters)
-        names = ", ".join(one.name for one in values)
+        names = ", ".join(value.name for value in values)
         text = f"preset s 1 as s {{ t = /t {name}; }} s() given {{ {given} }} {{ event e({names}) t {{ }} }}"
         [code] = compiled_from({"x.rv": text}, definitions(), lints=False).specifications
         assert code.events[0].type == name

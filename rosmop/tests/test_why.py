@@ -196,7 +196,7 @@ def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
                     said += [history.explain(one) for one in history.expire(run)]
                 categories = history.step(run, event, now, MessageSender(7, number, SEQ))
                 if number % 7 == 0:
-                    said += [history.explain(one) for one in categories]
+                    said += [history.explain(category) for category in categories]
                 told.append(said)
             assert told[0] == told[1]
             compared += len(told[0])
@@ -220,7 +220,7 @@ def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
             assert explanation.since is None
             assert explanation.fewest
             assert gives(made, before, explanation.events, target, category)
-            numbers = [one.sender.number for one in explanation.events]
+            numbers = [event.sender.number for event in explanation.events]
             assert numbers == sorted(set(numbers))
             for place in range(len(numbers)):
                 fewer = [*explanation.events[:place], *explanation.events[place + 1 :]]
@@ -364,7 +364,7 @@ def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
     [verdict] = outcome.verdicts
     assert verdict.binding == {"id": 1}
     assert verdict.why is not None
-    assert [one.sender.source for one in verdict.why.events] == [1, 4]
+    assert [event.sender.source for event in verdict.why.events] == [1, 4]
 
 
 def test_compared_values_and_the_statement_that_dropped() -> None:

@@ -122,7 +122,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
         if not version.isdigit() or len(version) > 9:
             self.refuse(version, f"`{version[:20]}` is not a version; write a whole number")
         number = int(version) if version.isdigit() else 0
-        values = tuple(one for one in settings if one is not None)
+        values = tuple(setting for setting in settings if setting is not None)
         return tree.PresetStatement(
             self.at(meta),
             str(preset),
@@ -194,8 +194,8 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
             known.position,
             known,
             tuple(givens),
-            tuple(one for one in children if isinstance(one, tree.EventDefinition | tree.TypedEvent)),
-            tuple(one for one in children if isinstance(one, tree.SafeDeclaration | tree.TypedSafe)),
+            tuple(child for child in children if isinstance(child, tree.EventDefinition | tree.TypedEvent)),
+            tuple(child for child in children if isinstance(child, tree.SafeDeclaration | tree.TypedSafe)),
         )
 
     def function(

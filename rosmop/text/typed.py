@@ -68,10 +68,10 @@ def _unknown_presets(typed: tree.TypedFile) -> Iterable[Diagnostic]:
 
 def _repeated_roles(typed: tree.TypedFile) -> Iterable[Diagnostic]:
     seen = set()
-    for one in typed.roles:
-        if one.name in seen:
-            yield Diagnostic(one.position, "error", f"there is another role {shown(one.name)} in this file")
-        seen.add(one.name)
+    for role in typed.roles:
+        if role.name in seen:
+            yield Diagnostic(role.position, "error", f"there is another role {shown(role.name)} in this file")
+        seen.add(role.name)
 
 
 @dataclass
@@ -269,7 +269,7 @@ class _Maker:
         self.tables.append(tree.Declaration(at, kind, (tree.Declarator(at, name, items, is_array=True),)))
 
     def _withhold(self, node: tree.WithholdDeclaration) -> tree.WithholdDeclaration:
-        names = [one for one in node.networks if isinstance(one, tree.Name)]
+        names = [network for network in node.networks if isinstance(network, tree.Name)]
         if not names:
             return node
         networks = self.hosts.get(names[0].parts[0])
@@ -298,10 +298,10 @@ class _Maker:
         if chosen is None:
             return None
         row, role, at = chosen.row, chosen.role, node.position
-        types = {one.name: one.type for one in role.parameters} | {
-            one.name: one.type for one in row.parameters
+        types = {parameter.name: parameter.type for parameter in role.parameters} | {
+            parameter.name: parameter.type for parameter in row.parameters
         }
-        names = [one.parts[0] for one in node.names]
+        names = [name.parts[0] for name in node.names]
         for one in node.names:
             if one.parts[0] not in types:
                 known = nearest(one.parts[0], [parameter.name for parameter in role.parameters])
@@ -326,7 +326,7 @@ class _Maker:
                 for name in lacking
                 if name not in doubles
             ]
-        self._check_condition(node, chosen, {one.name for one in parameters})
+        self._check_condition(node, chosen, {parameter.name for parameter in parameters})
         if self.findings:
             return None
         trigger = tree.MessageTrigger(at, node.topic, chosen.type, at, None, _moved(pattern, at), node.when)
@@ -334,7 +334,7 @@ class _Maker:
         return tree.EventDefinition(at, node.modifiers, node.name, _moved(parameters, at), trigger, action)
 
     def _check_condition(self, node: tree.TypedEvent, chosen: _Chosen, fields: Collection[str]) -> None:
-        names = {one.parts[0] for one in node.names} - {*fields}
+        names = {name.parts[0] for name in node.names} - {*fields}
         for part in tree.walk(node.when):
             if isinstance(part, tree.Name) and part.parts[0] in names:
                 text = f"{shown(part.parts[0])} is not a field of {chosen.type}: test it in the action, not in `when`"
@@ -372,7 +372,7 @@ def _cancelling(known: tree.Specification, topic: str, name: str) -> tree.Specif
     )
     cancelled = tree.TopicDeclaration(at, _CANCEL, name.removesuffix(_GOAL) + "/cancel")
     givens = tuple(
-        part for one in known.givens for part in ((one, cancelled) if one.name == topic else (one,))
+        part for given in known.givens for part in ((given, cancelled) if given.name == topic else (given,))
     )
     known = replace(known, events=events, givens=givens, declarations=(everything, *known.declarations))
     return _stopping(known, cancel)
@@ -391,8 +391,8 @@ def _with_values_of_roles(known: tree.Specification, topics: Iterable[_Chosen]) 
     """Give variables of the type `Role::value` the type that the value has in the chosen row."""
     types: dict[tuple[str, ...], tree.TypeName] = {}
     for chosen in topics:
-        for one in (*chosen.role.parameters, *chosen.row.parameters):
-            types[chosen.role.name, one.name] = _of_variable(one.type)
+        for parameter in (*chosen.role.parameters, *chosen.row.parameters):
+            types[chosen.role.name, parameter.name] = _of_variable(parameter.type)
     if not types:
         return known
     return _changed(known, lambda part: types.get(part.name) if isinstance(part, tree.TypeName) else None)

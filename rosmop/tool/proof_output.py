@@ -15,6 +15,6 @@ def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:
             )
         else:
             say(f"{found.event} on {found.topic}: {found.answer}", "red" if found.differs else "")
-    if not as_json and any(one.givens for one in monitors.compiled.specifications):
+    if not as_json and any(specification.givens for specification in monitors.compiled.specifications):
         say("each proof holds for all values of given constants, not only for the defaults")
     return different

@@ -126,7 +126,7 @@ class NodeApi:
     def _request_topic(self, topic: str, protocols: list[Value]) -> Value:
         if topic not in self._node.publishers:
             return [0, f"this node does not publish {topic[:200]}", 0]
-        if not any(isinstance(one, list) and one[:1] == ["TCPROS"] for one in protocols):
+        if not any(isinstance(protocol, list) and protocol[:1] == ["TCPROS"] for protocol in protocols):
             return [0, "this node offers TCPROS only", 0]
         return [1, "", ["TCPROS", *self._node.tcpros]]
 

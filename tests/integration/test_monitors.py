@@ -125,7 +125,7 @@ def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     def observed() -> bool:
         records = appliance.audit("--event", "shadow observed", resource="/chatter")
         return {"drop", "change", "log"} <= {
-            one["detail"]["shadow"] and one["detail"]["would"] for one in records
+            record["detail"]["shadow"] and record["detail"]["would"] for record in records
         }
 
     eventually(observed, "records of a drop, a change and a line in shadow mode")

@@ -84,7 +84,7 @@ def test_every_way_requires_the_signature_of_a_policy(started: Appliance) -> Non
     state = eventually(lambda: in_force(appliance), appliance.story)
     assert (state["revision"], state["signature"], state["site_keys"]) == (3, signed(OPEN_POLICY), [LINE])
     records = appliance.audit("--event", "policy loaded", "--oldest-first")
-    assert [one["detail"]["signed_by"] for one in records] == [NAME] * 3
+    assert [record["detail"]["signed_by"] for record in records] == [NAME] * 3
 
 
 def test_every_way_requires_the_signature_of_a_specification(started: Appliance) -> None:
@@ -108,4 +108,4 @@ def test_every_way_requires_the_signature_of_a_specification(started: Appliance)
     shown = appliance.rest().get("/v1/monitors?texts=1").json
     assert (shown["signatures"], shown["site_keys"]) == (signatures, [LINE])
     records = appliance.audit("--event", "specifications loaded", "--oldest-first")
-    assert [one["detail"]["signed_by"] for one in records] == [[NAME], [], [NAME], [NAME]]
+    assert [record["detail"]["signed_by"] for record in records] == [[NAME], [], [NAME], [NAME]]

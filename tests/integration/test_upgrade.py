@@ -168,7 +168,7 @@ def test_doors_hosts_and_blocks_survive(upgraded: Upgraded) -> None:
     assert {one["name"]: (one["address"], one["port"], one["source"], len(one["tickets"])) for one in doors} == {
         "alice": ("198.19.240.2", None, "", 1), "agent-1": ("198.19.240.3", 9091, "10.0.0.7/32", 0),
     }  # fmt: skip
-    hosts = {one["name"]: one for one in rest.get("/v1/hosts").json["hosts"]}
+    hosts = {host["name"]: host for host in rest.get("/v1/hosts").json["hosts"]}
     assert {name: (one["address"], one["revoked"] is None) for name, one in hosts.items()} == {
         "robot2": ("10.78.0.2", True), "away": ("10.78.0.3", False), "robot3": ("10.78.0.4", True),
     }  # fmt: skip

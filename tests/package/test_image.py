@@ -95,7 +95,7 @@ def run(engine: Engine, *command: str, text: str = "") -> str:
 
 
 def of(parts: list[dict[str, Any]], kind: str) -> set[tuple[str, str]]:
-    return {(one["name"], one["version"]) for one in parts if one["purl"].startswith(f"pkg:{kind}/")}
+    return {(part["name"], part["version"]) for part in parts if part["purl"].startswith(f"pkg:{kind}/")}
 
 
 def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[dict[str, Any]]) -> None:
@@ -122,8 +122,8 @@ def test_every_file_belongs_to_a_part(engine: Engine, unpacked: Path) -> None:
 
 
 def test_every_part_has_a_licence(parts: list[dict[str, Any]]) -> None:
-    assert [one["name"] for one in parts if not one.get("licenses")] == []
-    unread = [one["name"] for one in parts if "see /usr/share/doc" in json.dumps(one["licenses"])]
+    assert [part["name"] for part in parts if not part.get("licenses")] == []
+    unread = [part["name"] for part in parts if "see /usr/share/doc" in json.dumps(part["licenses"])]
     assert len(unread) < 10, unread
 
 

@@ -55,7 +55,7 @@ class FleetAlerts:
         found = {rule.name: rule for rule in self._rules}
         samples = [("up", {"job": "rosrv-fleet"}, float(metrics is not None))]
         for family in metrics or ():
-            samples += [(one.name, one.labels, one.value) for one in family.samples]
+            samples += [(sample.name, sample.labels, sample.value) for sample in family.samples]
         true = {
             Alert(rule.name, labels.get("robot", ""))
             for rule in self._rules

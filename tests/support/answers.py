@@ -14,7 +14,7 @@ def example(kind: type[A], **given: Any) -> A:
 
 
 def _fields(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
-    known = {one.encode_name: one for one in msgspec.structs.fields(kind)}
+    known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
     assert given.keys() <= known.keys(), f"{kind.__name__} has no {given.keys() - known.keys()}"
     return {name: _value(one.type, given[name]) for name, one in known.items() if name in given} | {
         name: _empty(one.type) for name, one in known.items() if name not in given and one.required
@@ -44,7 +44,7 @@ def _empty(kind: Any) -> Any:
     if origin is Literal:
         return words[0]
     if origin is tuple:
-        return [_empty(one) for one in words]
+        return [_empty(word) for word in words]
     return _fields(kind, {}) if _is_struct(kind) else _EMPTY[origin or kind]
 
 

@@ -145,7 +145,7 @@ class Deliveries(Delivery):
     def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
         self._published[incarnation.key, topic] = publishers
         if removed := self._removed.pop((incarnation.key, topic), None):
-            without: list[Value] = [one for one in publishers if one not in removed]
+            without: list[Value] = [publisher for publisher in publishers if publisher not in removed]
             self.push(incarnation, NodeCall("publisherUpdate", (topic, without)))
         self.push(incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
 
@@ -230,7 +230,7 @@ class HiddenMaster(XmlRpcClient):
             kind = _TABLES.get(method.removeprefix(beginning))
             if kind is not None and method.startswith(beginning):
                 self._note((method, params))
-                return self._change(beginning, kind, *(str(one) for one in params))
+                return self._change(beginning, kind, *(str(param) for param in params))
         return self._answer(method, params)
 
     def _answer(self, method: str, params: tuple[Value, ...]) -> Answer:

@@ -286,7 +286,7 @@ class Conversation:
     def _shown(self, seen: Seen) -> str:
         match seen:
             case Told(node, call):
-                values = " ".join(self._value(one) for one in call.parameters)
+                values = " ".join(self._value(parameter) for parameter in call.parameters)
                 return f"tell {self._names[node.key]} {call.method} {values}"
             case Ended(what, node):
                 return f"{what} {self._names[node.key]}"
@@ -342,7 +342,7 @@ def conversations_of(text: str) -> ConversationFile:
         name, _, rules = part.partition("\n")
         name, _, base = name.partition(" like ")
         policies[name] = policies.get(base, "") + re.sub(r"(?m)^    ", "", f"{rules}\n")
-    titled = dict(one.strip().split("\n", 1) for one in conversations)
+    titled = dict(conversation.strip().split("\n", 1) for conversation in conversations)
     return ConversationFile(text.startswith("only answers\n"), policies, titled)
 
 

@@ -33,4 +33,4 @@ def stream(lines: Iterable[str], *, breaks: bool = False) -> httpx.Response:
 
 def page(records: Iterable[str], cursor: str | None = None) -> httpx.Response:
     """Return an answer with a page of the audit log, whose records are JSON."""
-    return httpx.Response(200, json={"records": [json.loads(one) for one in records], "cursor": cursor})
+    return httpx.Response(200, json={"records": [json.loads(record) for record in records], "cursor": cursor})

@@ -152,7 +152,7 @@ class RestWorld:
         ]  # fmt: skip
 
     def sent(self, kind: type[R]) -> list[R]:
-        made = [one.request for one in self._ends[0].messages if isinstance(one, RequestMade)]
+        made = [message.request for message in self._ends[0].messages if isinstance(message, RequestMade)]
         return [one for one in made if isinstance(one, kind)]
 
     def close(self) -> None:

@@ -63,7 +63,7 @@ class Site:
 
     def state(self) -> dict[str, Any]:
         if isinstance(self.master, PlainMaster):
-            of_master: dict[str, Any] = {"running": [one.running for one in self.master.processes]}
+            of_master: dict[str, Any] = {"running": [process.running for process in self.master.processes]}
         else:
             status, tokens = self.master.ask(StatusWanted()), self.master.ask(TokenList()).tokens
             of_master = {

@@ -151,10 +151,10 @@ class StreamCollector(_Collector):
                 listener.shutdown(socket.SHUT_RDWR)
             listener.close()
         connections, self._connections = self._connections, []
-        for one in connections:
+        for connection in connections:
             with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
+                connection.shutdown(socket.SHUT_RDWR)
+            connection.close()
 
     def _accept(self, listener: socket.socket) -> None:
         while True:

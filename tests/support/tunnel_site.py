@@ -170,7 +170,7 @@ def left_behind(host: Host) -> dict[str, str]:
         "iptables": "ROSRV" if "ROSRV" in iptables else "",
         "routes": told("ip", "route", "show", "table", "220"),
         "interfaces": " ".join(
-            one for one in interfaces.links(host.namespace) if one not in ("lo", INTERFACE)
+            link for link in interfaces.links(host.namespace) if link not in ("lo", INTERFACE)
         ),
         "addresses": OWN if OWN in " ".join(interfaces.addresses(host.namespace)) else "",
     }

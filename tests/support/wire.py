@@ -101,7 +101,7 @@ class Capture:
     def wait_for(self, wanted: Callable[[Frame], bool], *, since: int = 0, timeout: float = LIMIT) -> Frame:
         with self._changed:
             found = self._changed.wait_for(
-                lambda: next((one for one in self.frames[since:] if wanted(one)), None), timeout
+                lambda: next((frame for frame in self.frames[since:] if wanted(frame)), None), timeout
             )
         assert found is not None, f"no such frame among {len(self.frames) - since}"
         return found

@@ -174,9 +174,9 @@ def test_the_appliance_runs_from_a_checkout(checkout: Checkout) -> None:
 
             eventually(
                 lambda: all(
-                    one["sandbox"] and not one["restarts"]
-                    for one in status()["processes"]
-                    if one["role"] != "supervisor"
+                    process["sandbox"] and not process["restarts"]
+                    for process in status()["processes"]
+                    if process["role"] != "supervisor"
                 ),
                 up.story,
             )

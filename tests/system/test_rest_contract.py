@@ -69,7 +69,7 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
     assert done.returncode == 0, shown(done.stdout + done.stderr)
     assert [phase for phase in PHASES if f"✅ {phase}" not in done.stdout] == [], shown(done.stdout)
     rows = appliance.status()["processes"]
-    assert [one["restarts"] for one in rows if one["role"] in ("control", "api")] == [0, 0]
+    assert [row["restarts"] for row in rows if row["role"] in ("control", "api")] == [0, 0]
     assert rest.get("/v1/status").status == 200
 
 

@@ -64,7 +64,7 @@ class Keeper:
 
     def sequences(self) -> set[int]:
         messages = [parse(line.encode()) for line in self.lines()]
-        return {int(one.fields["sequence"]) for one in messages if "rosrv@32473" in one.elements}
+        return {int(message.fields["sequence"]) for message in messages if "rosrv@32473" in message.elements}
 
 
 def _connects(address: str, port: int) -> str:

@@ -79,7 +79,7 @@ def test_each_cache_says_what_becomes_of_a_failure() -> None:
         for file in (ROOT / folder).rglob("*.py")
         if LANGUAGE_TESTS not in file.parents
     ]
-    found = {one for file in files for one in caches(file)}
+    found = {cache for file in files for cache in caches(file)}
     assert found == FAILURES.keys()
 
 

@@ -28,10 +28,10 @@ def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
     for name in ("compose.yaml", "compose.host.yaml", "compose.local.yaml"):
         assert name in BESIDE
         services = yaml.safe_load((ROOT / name).read_text())["services"].values()
-        mounts = [mount.split(":")[0] for one in services for mount in one.get("volumes", [])]
+        mounts = [mount.split(":")[0] for service in services for mount in service.get("volumes", [])]
         beside = {mount.removeprefix("./") for mount in mounts if mount.startswith(".")}
         assert beside <= set(BESIDE), name
-        assert not any("env_file" in one or "secrets" in one for one in services), name
+        assert not any("env_file" in service or "secrets" in service for service in services), name
 
 
 def test_the_next_archive_of_a_site_uses_the_same_volume(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_every_path_without_a_token_is_the_row_of_an_entrance() -> None:
 
 
 def test_every_route_of_the_collector_is_known() -> None:
-    found = {one.removeprefix("fleet/src/rosrv_fleet/") for one in files(_ROUTES, "fleet/src/rosrv_fleet")}
+    found = {file.removeprefix("fleet/src/rosrv_fleet/") for file in files(_ROUTES, "fleet/src/rosrv_fleet")}
     assert found == {*entrances.COLLECTOR_ROUTES}
 
 
@@ -116,8 +116,8 @@ def test_the_rows_name_entrances_of_the_table() -> None:
         entrances.WITHOUT_TOKEN,
         entrances.HOOKS,
     )
-    assert {name for one in rows for name in named(one)} | {"collector"} <= CELLS.keys()
-    used = {name for one in rows for name in named(one)}
+    assert {name for row in rows for name in named(row)} | {"collector"} <= CELLS.keys()
+    used = {name for row in rows for name in named(row)}
     assert CELLS.keys() == used, "a row of the table is no entrance any longer"
 
 

@@ -197,7 +197,7 @@ def test_options_that_pages_name_alone_exist() -> None:
             }
     named = {name for page in WITH_LINKS[:-1] for name in re.findall(r"`(--[a-z][a-z-]*)", page.read_text())}
     folders = ("appliance/features/standby", "benchmarks", "tests/support", "tests/world")
-    scripts = "".join(file.read_text() for one in folders for file in (ROOT / one).rglob("*.py"))
+    scripts = "".join(file.read_text() for folder in folders for file in (ROOT / folder).rglob("*.py"))
     missing = {name for name in named - options if f'"{name}"' not in scripts}
     assert missing == OTHERS.keys()
 
@@ -240,7 +240,7 @@ def _is_setting(variable: str) -> bool:
 
 
 def _exists(call: str, options: dict[str, set[str]]) -> bool:
-    name = max((one for one in options if f"{call} ".startswith(f"{one} ")), key=len, default=None)
+    name = max((option for option in options if f"{call} ".startswith(f"{option} ")), key=len, default=None)
     given = re.findall(r"(?<=[ \[])--[a-z-]+", re.sub(" #.*", "", call))
     return name is not None and options[name].issuperset(given)
 

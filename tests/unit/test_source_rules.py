@@ -152,7 +152,7 @@ def printed(source: Source) -> Iterator[tuple[int, str]]:
             case ast.Constant(value=str(text)):
                 pass
             case ast.JoinedStr(values=values):
-                text = "\0".join(str(one.value) for one in values if isinstance(one, ast.Constant))
+                text = "\0".join(str(value.value) for value in values if isinstance(value, ast.Constant))
             case _:
                 continue
         if " " in text:
@@ -170,8 +170,8 @@ def quoted(seen: Sequence[Seen]) -> Iterator[str]:
     assert (len(messages) > 25, len(ends)) == (True, 3)
     program = "\n".join(one.what for one in seen)
     for page_name, one in [
-        *(("troubleshooting", each) for each in messages),
-        *(("reference/tunnels", each) for each in ends),
+        *(("troubleshooting", message) for message in messages),
+        *(("reference/tunnels", end) for end in ends),
     ]:
         if one not in program:
             yield f"docs/{page_name}.md: {one!r} is in no string of the appliance: quote what it prints"
@@ -297,5 +297,5 @@ def applies(rule: Rule, path: str) -> bool:
 
 def findings(rule: Rule, *texts: str) -> list[str]:
     sources = [parsed(f"example{number}.py", text) for number, text in enumerate(texts)]
-    seen = [Seen(one.path, line, what) for one in sources for line, what in rule.see(one)]
+    seen = [Seen(source.path, line, what) for source in sources for line, what in rule.see(source)]
     return [finding for finding in rule.judge(seen) if "example" in finding]

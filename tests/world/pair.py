@@ -87,7 +87,7 @@ class PairWorld(World):
             return False
         ours = ends & set(ADDRESSES.values())
         between = ends <= {*ADDRESSES.values(), WITNESS, "127.0.0.1"}
-        return between or all(self.robot.admits(one) for one in ours)
+        return between or all(self.robot.admits(our) for our in ours)
 
     # --- promises ---
 
@@ -117,7 +117,7 @@ class PairWorld(World):
         return found
 
     async def settled(self) -> None:
-        active = [one for one in self.appliances if one.active]
+        active = [appliance for appliance in self.appliances if appliance.active]
         if len(active) != 1 or not active[0].ready:
             raise BrokenPromiseError(f"{len(active)} appliances are active after all faults have ended")
         while (found := await self._check_policy(active[0])) is None:
@@ -147,7 +147,7 @@ class PairWorld(World):
         self.say(f"{sorted(pair)} {'are cut off' if pair in self.network.cut else 'reach each other'}")
 
     def is_cut_off(self) -> None:
-        host = self.random.choice([one.host for one in self.nodes] or [WITNESS])
+        host = self.random.choice([node.host for node in self.nodes] or [WITNESS])
         if host != WITNESS:
             pairs = {frozenset((host, address)) for address in ADDRESSES.values()}
             self.network.cut ^= pairs

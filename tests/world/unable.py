@@ -64,7 +64,7 @@ class UnableWorld(PairWorld):
 
     async def _says(self) -> None:
         """The standby reports that the active appliance does not serve: that one perhaps answers no call."""
-        [standby] = [one for one in self.appliances if not one.active]
+        [standby] = [appliance for appliance in self.appliances if not appliance.active]
         administration, _process = standby.admin.administration  # type: ignore[attr-defined]  # as `_AdminServer` sets it
         answer: Any = await administration.carry_out(standby_requests.StandbyWanted(), who="operator")
         if "keeps the lease" not in answer.body.not_serving:
@@ -82,7 +82,7 @@ class UnableWorld(PairWorld):
         return (
             self.reason == reason
             and self.harmed
-            and any(one.active for one in self.appliances if one.address == here)
+            and any(appliance.active for appliance in self.appliances if appliance.address == here)
         )
 
     def _statvfs(self, _folder: Path) -> SimpleNamespace:

@@ -368,7 +368,7 @@ class World:
     # --- events ---
 
     def _living(self) -> Node | None:
-        there = [one for one in self.nodes if one.alive]
+        there = [node for node in self.nodes if node.alive]
         return self.random.choice(there) if there else None
 
     def starts(self) -> None:

@@ -233,7 +233,7 @@ def _apart(before: str, after: str) -> bool:
 
 
 def _declared(tokens: list[_Token]) -> str | None:
-    words = [one.text for one in tokens]
+    words = [token.text for token in tokens]
     if words[:1] == ["async"]:
         words = words[1:] if words[1:2] == ["function"] else []
     if len(words) > 1 and words[0] in ("const", "class", "function") and re.fullmatch(r"[\w$]+", words[1]):

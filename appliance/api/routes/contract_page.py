@@ -59,11 +59,11 @@ def _operation(method: str, path: str, operation: _Json, document: _Json) -> Ite
     yield f"<p>{escape(operation.get('description') or operation.get('summary', ''))}</p>"
     if parameters := operation.get("parameters"):
         yield "<table><thead><tr><th>Parameter</th><th>In</th><th>Meaning</th></tr></thead><tbody>"
-        for one in parameters:
-            words = one.get("description") or one["schema"].get("description", "")
-            need = " (required)" if one.get("required") else ""
-            yield f"<tr><td><code>{escape(one['name'])}</code>{need}</td>"
-            yield f"<td>{one['in']}</td><td>{escape(words)}</td></tr>"
+        for parameter in parameters:
+            words = parameter.get("description") or parameter["schema"].get("description", "")
+            need = " (required)" if parameter.get("required") else ""
+            yield f"<tr><td><code>{escape(parameter['name'])}</code>{need}</td>"
+            yield f"<td>{parameter['in']}</td><td>{escape(words)}</td></tr>"
         yield "</tbody></table>"
     yield from _content("Body", operation.get("requestBody", {}).get("content", {}), document)
     for status, response in operation["responses"].items():

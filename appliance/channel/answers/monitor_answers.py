@@ -170,7 +170,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 def findings_of(texts: Iterable[str]) -> list[Finding]:
     """Return the findings in texts about specifications; those without a place are left out."""
-    found = ((one, _PLACE.search(one)) for one in texts)
+    found = ((text, _PLACE.search(text)) for text in texts)
     return [
         Finding(one[: at.start()], int(at[1]), int(at[2]), at[3], one[at.end() :]) for one, at in found if at
     ]

@@ -153,9 +153,9 @@ def _on_loopback(state: CheckedRobot, nodes: Iterable[SurveyedNode]) -> list[str
     its names may have an address that the appliance can call.
     """
     bound: dict[int, set[str]] = {}
-    for one in state.sockets:
-        if one.listens:
-            bound.setdefault(one.port, set()).add(one.local_address)
+    for socket in state.sockets:
+        if socket.listens:
+            bound.setdefault(socket.port, set()).add(socket.local_address)
     found, callable_ports = dict[str, int](), set[int]()
     for node in nodes:
         with suppress(ValueError):
@@ -220,7 +220,7 @@ def _policy(state: CheckedRobot, inventory: GraphInventory) -> Iterator[CheckLin
 
 def _cuts(state: CheckedRobot, inventory: GraphInventory) -> CheckLine:
     ports = _service_ports(inventory)
-    established = [one for one in state.sockets if one.established]
+    established = [socket for socket in state.sockets if socket.established]
     master = sum(one.port == state.port for one in established)
     links = {
         row for node in inventory.nodes for row in node.connections if row.connected and row.direction == "i"

@@ -72,7 +72,7 @@ def robot_state(state: Path, settings: Settings | None, *, seconds: float = 20.0
 
 
 def _node_ports(host: Namespace, sockets: Iterable[TcpSocket], master_port: int) -> frozenset[int]:
-    found = node_sockets(host, {one.port for one in sockets if one.listens}, master_port)
+    found = node_sockets(host, {socket.port for socket in sockets if socket.listens}, master_port)
     return frozenset(port for port, process in found.items() if is_node(process))
 
 

@@ -149,7 +149,7 @@ class ApprovalOrders:
 
     async def listed(self, _request: requests.ApprovalsWanted) -> requests.Approvals:
         return requests.Approvals(
-            [self._shown(one) for one in sorted(self._table.entries(), key=lambda e: e.number)]
+            [self._shown(entry) for entry in sorted(self._table.entries(), key=lambda e: e.number)]
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
@@ -241,7 +241,7 @@ class ApprovalOrders:
 
     def _approvers(self) -> dict[str, str]:
         """Return the names of all who may approve now, by the ids of their tokens and sessions."""
-        found = {one.id: one.name for one in self._bearers() if may(one.role, "operator")}
+        found = {bearer.id: bearer.name for bearer in self._bearers() if may(bearer.role, "operator")}
         return found | {OPERATOR: OPERATOR}
 
     def _ended(self, entry: ApprovalEntry, approvers: Mapping[str, str]) -> str:

@@ -47,9 +47,9 @@ def show_held_calls(appliance: Appliance, line: Callable[[Approval], tuple[str, 
                 if not away:
                     note(f"{printable(str(error))}; trying again")
                 rows, away = [], True
-            for one in changes(known, rows):
-                _announce(appliance, one, line)
-            known = {one.number: one for one in rows}
+            for change in changes(known, rows):
+                _announce(appliance, change, line)
+            known = {row.number: row for row in rows}
             sys.stdout.flush()
             pause.wait(_EVERY_SECONDS)
     except KeyboardInterrupt:
@@ -59,10 +59,10 @@ def show_held_calls(appliance: Appliance, line: Callable[[Approval], tuple[str, 
 def changes(known: dict[int, Approval], rows: Iterable[Approval]) -> Iterator[Approval]:
     """Return new and changed approvals, and those that ended, with no time left."""
     left = dict(known)
-    for one in rows:
-        before = left.pop(one.number, None)
-        if before is None or (before.state, before.who) != (one.state, one.who):
-            yield one
+    for row in rows:
+        before = left.pop(row.number, None)
+        if before is None or (before.state, before.who) != (row.state, row.who):
+            yield row
     yield from (msgspec.structs.replace(one, left_seconds=0.0) for one in left.values())
 
 
@@ -131,8 +131,8 @@ def refuse(
 
 def _list(appliance: Appliance) -> None:
     rows = appliance.answer_or_exit(ApprovalsWanted()).approvals
-    for one in rows:
-        _say(appliance, one)
+    for row in rows:
+        _say(appliance, row)
     if not rows and not appliance.as_json:
         say("no call waits for an approval")
 

@@ -53,8 +53,8 @@ def status(
         names = ", ".join(one.group for one in body.groups)
         say(f"[Authority] has no group {group!r}; its groups: {names}" if names else _NO_GROUPS)
         raise typer.Exit(1)
-    for one in rows:
-        _show(appliance, one)
+    for row in rows:
+        _show(appliance, row)
 
 
 @speaks

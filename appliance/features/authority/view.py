@@ -37,7 +37,7 @@ class AuthorityState(msgspec.Struct, frozen=True):
 
 
 def _publishers(group: UnheardGroup) -> str:
-    named = [f"{one.host} ({one.nodes[0]}) to {one.topic}" for one in group.hosts[:_MAX_NAMED]]
+    named = [f"{host.host} ({host.nodes[0]}) to {host.topic}" for host in group.hosts[:_MAX_NAMED]]
     more = len(group.hosts) - _MAX_NAMED
     return ", ".join(named) + (f" and {more} more" if more > 0 else "")
 

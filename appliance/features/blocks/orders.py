@@ -192,7 +192,7 @@ class BlockOrders:
             raise SenselessError(str(error)) from None
         if len(networks) > 1 or networks[0].num_addresses > 1:
             some = ", ".join(
-                str(one).removesuffix("/32").removesuffix("/128") for one in networks[:_MAX_NAMED]
+                str(network).removesuffix("/32").removesuffix("/128") for network in networks[:_MAX_NAMED]
             )
             raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
         return plain_address(str(networks[0].network_address))

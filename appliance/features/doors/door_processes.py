@@ -117,7 +117,7 @@ class DoorProcesses:
             refusals=counts.refusals,
             refused_connections=counts.refused,
             restarts=slot.restarts,
-            restarts_lately=sum(now - one < LATELY_SECONDS for one in slot.deaths),
+            restarts_lately=sum(now - death < LATELY_SECONDS for death in slot.deaths),
         )
 
     def start(self) -> None:
@@ -244,7 +244,7 @@ class DoorProcesses:
     def uses_of(self, host: Address) -> Iterator[str]:
         """Yield the connections of a host to each door."""
         for row in self._table.live():
-            count = sum(one.peer == str(host) for one in self._slots[row.slot or 0].clients)
+            count = sum(client.peer == str(host) for client in self._slots[row.slot or 0].clients)
             if count:
                 yield f"{counted(count, 'connection')} to the door {row.name}"
 

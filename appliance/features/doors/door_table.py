@@ -155,7 +155,7 @@ class DoorTable:
             )
         if name in self._rows and self._rows[name].removed is None:
             raise SenselessError(f"there is a door {name} already: choose another name, or remove it first")
-        twin = next((one for one in self._rows if one != name and node_name(one) == node_name(name)), None)
+        twin = next((row for row in self._rows if row != name and node_name(row) == node_name(name)), None)
         if twin is not None:
             raise SenselessError(
                 f"{name} differs from {twin} only in - and _, which is the same name in ROS: choose another name"

@@ -118,7 +118,7 @@ class DoorVisits:
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
-        row = TICKET_FORM.find(text, {one.row.id: one.row for one in self._visits.values()})
+        row = TICKET_FORM.find(text, {visit.row.id: visit.row for visit in self._visits.values()})
         return None if row is None or row.door != door or not self._may_open(self._visits[row.id]) else row
 
     def opened(self, ticket: str) -> None:
@@ -134,7 +134,7 @@ class DoorVisits:
         self._visits = {ticket: one for ticket, one in self._visits.items() if one.row.door != door}
 
     def present(self, door: str) -> list[TicketRow]:
-        return [one.row for one in self._visits.values() if one.row.door == door and not one.replaced]
+        return [visit.row for visit in self._visits.values() if visit.row.door == door and not visit.replaced]
 
     def ended(self) -> list[tuple[TicketRow, bool]]:
         """Remove and return the visits that have ended, and whether a newer one replaced them."""

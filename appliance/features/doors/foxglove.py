@@ -144,20 +144,20 @@ class Foxglove:
 
     def _subscribe(self, operation: FoxgloveSubscribe) -> list[DoorRequest]:
         requests: list[DoorRequest] = []
-        for one in operation.subscriptions:
-            seen = self._topics.get(one.channelId)
+        for subscription in operation.subscriptions:
+            seen = self._topics.get(subscription.channelId)
             if seen is None:
-                self._refuse(f"the channel {one.channelId} is not announced")
-            elif one.id in self._subscriptions:
-                self._refuse(f"the subscription {one.id} exists; unsubscribe it first")
+                self._refuse(f"the channel {subscription.channelId} is not announced")
+            elif subscription.id in self._subscriptions:
+                self._refuse(f"the subscription {subscription.id} exists; unsubscribe it first")
             elif len(self._subscriptions) >= self._limits.subscriptions:
                 self._refuse(
                     f"{len(self._subscriptions)} subscriptions; at most {self._limits.subscriptions}"
                 )
             else:
-                self._subscriptions[one.id] = one.channelId
-                self._by_topic.setdefault(seen.topic, set()).add(one.id)
-                self.queue.configure(one.id, depth=None, interval=0.0)
+                self._subscriptions[subscription.id] = subscription.channelId
+                self._by_topic.setdefault(seen.topic, set()).add(subscription.id)
+                self.queue.configure(subscription.id, depth=None, interval=0.0)
                 requests.append(SubscribeTopic(seen.topic, seen.type))
         return requests
 
@@ -178,9 +178,9 @@ class Foxglove:
 
     def _advertise(self, operation: FoxgloveAdvertise) -> list[DoorRequest]:
         requests: list[DoorRequest] = []
-        for one in operation.channels:
+        for channel in operation.channels:
             try:
-                requests.append(self._advertise_channel(one))
+                requests.append(self._advertise_channel(channel))
             except PeerError as error:
                 self._refuse(str(error))
         return requests
@@ -349,16 +349,16 @@ class Foxglove:
         first, self._seen = self._seen is None, seen
         announced: list[SeenTopic | SeenService] = [*seen.topics, *seen.services]
         self._ids = {one: self._ids.get(one) or self._new_id() for one in announced}
-        topics = {self._ids[one]: one for one in seen.topics}
-        services = {self._ids[one]: one for one in seen.services}
-        if gone := [one for one in self._topics if one not in topics]:
+        topics = {self._ids[topic]: topic for topic in seen.topics}
+        services = {self._ids[service]: service for service in seen.services}
+        if gone := [topic for topic in self._topics if topic not in topics]:
             self._tell("unadvertise", channelIds=gone)
-        new = [one for one in topics if one not in self._topics]
+        new = [topic for topic in topics if topic not in self._topics]
         if new or first:
             self._tell("advertise", channels=[channel_fields(one, topics[one]) for one in new])
-        if gone := [one for one in self._services if one not in services]:
+        if gone := [service for service in self._services if service not in services]:
             self._tell("unadvertiseServices", serviceIds=gone)
-        if new := [one for one in services if one not in self._services]:
+        if new := [service for service in services if service not in self._services]:
             self._tell("advertiseServices", services=[service_fields(one, services[one]) for one in new])
         ended = [
             request

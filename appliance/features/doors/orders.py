@@ -336,16 +336,16 @@ class DoorOrders:
         }
         return [
             door_requests.ConnectedClient(
-                address=one.peer[:64],
-                since=one.since,
-                protocol=one.protocol[:32],
-                ticket=one.ticket[:12],
-                who=makers.get(one.ticket, ""),
-                received=one.received,
-                sent=one.sent,
-                refused=one.refusals,
+                address=client.peer[:64],
+                since=client.since,
+                protocol=client.protocol[:32],
+                ticket=client.ticket[:12],
+                who=makers.get(client.ticket, ""),
+                received=client.received,
+                sent=client.sent,
+                refused=client.refusals,
             )
-            for one in self._processes.clients(row)
+            for client in self._processes.clients(row)
         ]
 
 

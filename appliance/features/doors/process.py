@@ -154,7 +154,7 @@ class CountedClient:
 
 
 def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
-    oldest_first = sorted((one.shown() for one in clients), key=lambda one: one.since)
+    oldest_first = sorted((client.shown() for client in clients), key=lambda one: one.since)
     yield from oldest_first[:MAX_SHOWN]
 
 

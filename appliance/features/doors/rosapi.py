@@ -247,10 +247,10 @@ class Rosapi:
     async def _message_details(self, given: _Arguments) -> Mapping[str, Json]:
         if self._types.has_message(given.type):
             return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}
-        seen = [one for one in (await self._outlook.look()).topics if one.type == given.type]
+        seen = [topic for topic in (await self._outlook.look()).topics if topic.type == given.type]
         versions = {one.fingerprint: one for one in seen}
         if len(versions) > 1:
-            words = " and ".join(f"{one.topic} ({one.md5sum})" for one in versions.values())
+            words = " and ".join(f"{version.topic} ({version.md5sum})" for version in versions.values())
             raise ProtocolError(f"{quoted(given.type)} has several definitions: {words}")
         for one in seen:
             return {"typedefs": typedefs(Definitions.from_full_text(one.type, one.definition), one.type)}
@@ -322,8 +322,8 @@ def typedefs(definitions: Definitions, name: str) -> list[Mapping[str, Json]]:
             return
         message = definitions.message(kind)
         found[kind] = _typedef(message)
-        for one in message.fields:
-            add(one.type)
+        for field in message.fields:
+            add(field.type)
 
     definitions.layout(name)  # raises if a type contains itself
     add(name)
@@ -341,8 +341,8 @@ def _typedef(message: MessageDefinition) -> Mapping[str, Json]:
             "[]" if field.is_array else _EXAMPLES.get(field.type, "0" if _is_number(field.type) else "{}")
             for field in fields
         ],
-        "constnames": [one.name for one in constants],
-        "constvalues": [str(one.value) for one in constants],
+        "constnames": [constant.name for constant in constants],
+        "constvalues": [str(constant.value) for constant in constants],
     }
 
 

@@ -215,8 +215,8 @@ class Rosbridge:
 
     def _configure(self, spelling: str, subscription: _Subscription) -> None:
         """Use the lowest rate, shortest length and strongest compression of all subscriptions, as rosbridge does."""
-        seconds = min(one[0] for one in subscription.clients.values())
-        length = min(one[1] for one in subscription.clients.values())
+        seconds = min(client[0] for client in subscription.clients.values())
+        length = min(client[1] for client in subscription.clients.values())
         subscription.compression = max((one[2] for one in subscription.clients.values()), key=_STRENGTH.index)
         self.queue.configure(spelling, depth=length or None, interval=seconds)
 

@@ -61,21 +61,21 @@ _METRICS: Mapping[str, Metric] = {
 
 
 def _alarms(state: DoorsState) -> Iterator[Trouble]:
-    down = [f"{one.name} ({one.trouble})" for one in state.doors if one.trouble]
+    down = [f"{door.name} ({door.trouble})" for door in state.doors if door.trouble]
     if down:
         yield Trouble("doors-down", f"doors do not serve: {_listed(down)}; see rosrv door list")
     dying = [
-        f"{one.name} ({counted(one.restarts_lately, 'time')})"
-        for one in state.doors
-        if one.restarts_lately >= _MANY_RESTARTS
+        f"{door.name} ({counted(door.restarts_lately, 'time')})"
+        for door in state.doors
+        if door.restarts_lately >= _MANY_RESTARTS
     ]
     if dying:
         text = f"processes of doors keep ending, in the last ten minutes of {_listed(dying)}"
         yield Trouble("doors-restarting", f"{text}; see rosrv audit search --event 'door failed' --since 10m")
     full = [
-        f"{one.name} ({one.connections} of {one.limit})"
-        for one in state.doors
-        if one.full_seconds >= _FULL_SECONDS
+        f"{door.name} ({door.connections} of {door.limit})"
+        for door in state.doors
+        if door.full_seconds >= _FULL_SECONDS
     ]
     if full:
         text = f"doors have been at their limit of connections for a minute: {_listed(full)}"
@@ -91,15 +91,15 @@ def _listed(names: list[str]) -> str:
 
 
 def _samples(state: DoorsState) -> dict[str, Samples]:
-    doors = [msgspec.structs.asdict(one) for one in state.doors]
+    doors = [msgspec.structs.asdict(door) for door in state.doors]
     return {
-        metric.name: [((one["name"],), one[field]) for one in doors] for field, metric in _METRICS.items()
+        metric.name: [((door["name"],), door[field]) for door in doors] for field, metric in _METRICS.items()
     }
 
 
 def _line(state: DoorsState) -> tuple[str, str]:
-    connected = sum(one.connections for one in state.doors)
-    down = [one.name for one in state.doors if one.trouble]
+    connected = sum(door.connections for door in state.doors)
+    down = [door.name for door in state.doors if door.trouble]
     words = [
         f"{len(state.doors)} {'door' if len(state.doors) == 1 else 'doors'}",
         f"{connected} {'connection' if connected == 1 else 'connections'}",

@@ -169,7 +169,7 @@ class DriverChecks:
         )
 
     def _pids(self) -> list[int]:
-        return [one.pid for one in self._processes() if one.role.startswith("relay")]
+        return [process.pid for process in self._processes() if process.role.startswith("relay")]
 
     def _text(self, request: DriverCheckBegin) -> str:
         values = {"longest": f"{request.seconds:g}", "patience": f"{request.patience:g}"}

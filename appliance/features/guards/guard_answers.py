@@ -132,7 +132,7 @@ class ProofTest(msgspec.Struct, frozen=True):
     def proved(self) -> bool:
         """Whether the copy acted, and the stop was acknowledged by each driver, unless none was to be sent."""
         drivers = [one for one in self.reached if one.driver]
-        arrived = bool(drivers) and all(one.acknowledged is not None for one in drivers)
+        arrived = bool(drivers) and all(driver.acknowledged is not None for driver in drivers)
         return self.outcome in _ACTS_ON and (arrived or bool(self.not_sent))
 
 

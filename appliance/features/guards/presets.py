@@ -144,10 +144,10 @@ class Preset:
         return {given.name: types_of_roles()[role] for role, given in self._given if role}
 
     def parameter(self, name: str) -> Parameter:
-        for one in self.parameters:
-            if one.name == name:
-                return one
-        known = ", ".join(one.name for one in self.parameters) or "it has none"
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        known = ", ".join(parameter.name for parameter in self.parameters) or "it has none"
         raise GuardError(f"{self.name} has no parameter {name!r}; use one of: {known}")
 
 

@@ -116,12 +116,12 @@ class ProofTests:
         if preset == "withhold":
             return "this guard sends no stop"
         facts = facts_of(self._graph.present())
-        topic = next((one for one in facts if one.name == command), None)
+        topic = next((fact for fact in facts if fact.name == command), None)
         if topic is None:
             raise SenselessError(f"no node publishes or subscribes to {command}: there is no driver to reach")
         robots = RobotGraph(tuple(facts))
         sources = robots.sources(topic, (_ODOMETRY,)) if kind in VELOCITIES else []
-        odometry = [one.name for one in sources][:_MAX_ODOMETRY]
+        odometry = [source.name for source in sources][:_MAX_ODOMETRY]
         watched = [command, *odometry]
         seen = dict(zip(watched, await asyncio.gather(*map(self._watch, watched)), strict=True))
         if kind not in VELOCITIES:
@@ -131,7 +131,7 @@ class ProofTests:
                 )
             return f"no topic says that what {kind} moves stands still"
         for name, messages in seen.items():
-            moving = next((one for one in messages if not _speed(one.fields) <= _STANDING), None)
+            moving = next((message for message in messages if not _speed(message.fields) <= _STANDING), None)
             if moving is not None and name == command:
                 raise SenselessError(
                     f"{self._sender([moving])} drives on {command}: test it when the robot stands still"
@@ -161,7 +161,7 @@ class ProofTests:
     def _reached(self, found: GuardTested, command: str) -> Iterator[StopReached]:
         facts = facts_of(self._graph.present())
         drivers = {
-            node for one in facts if one.name == command for node in RobotGraph(tuple(facts)).ends(one)
+            node for fact in facts if fact.name == command for node in RobotGraph(tuple(facts)).ends(fact)
         }
         for one in found.reached:
             yield StopReached(one.node, one.host, one.node in drivers, one.accepted, one.acknowledged)

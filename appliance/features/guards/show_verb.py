@@ -39,9 +39,9 @@ def show(
     Example: rosrv guard show fence
     """
     guards = appliance.ask_or_exit(GuardsWanted(presets=False)).guards
-    row = next((one for one in guards if one.name == name), None)
+    row = next((guard for guard in guards if guard.name == name), None)
     if row is None:
-        known = ", ".join(one.name for one in guards) or "none is loaded"
+        known = ", ".join(guard.name for guard in guards) or "none is loaded"
         raise refused([f"no guard is named {name}; there are: {known}"])
     found = appliance.ask_or_exit(admin.MonitorValuesWanted(name))
     if appliance.as_json:

@@ -390,7 +390,7 @@ def _inside(corners: list[tuple[float, float]]) -> tuple[float, float]:
         crossings = [
             a for a, b in edges if (a[1] > y) != (b[1] > y) and x < a[0] + (y - a[1]) * (b[0] - a[0]) / (b[1] - a[1])
         ]  # fmt: skip
-        return min(_distance(x, y, *one) for one in edges) if len(crossings) % 2 else -1.0
+        return min(_distance(x, y, *edge) for edge in edges) if len(crossings) % 2 else -1.0
 
     return max(grid, key=lambda point: room(*point))
 
@@ -408,19 +408,19 @@ def encoded(definitions: Definitions, kind: str, fields: Fields) -> bytes:
     Raises `DefinitionError` for an unknown type.
     """
     data = bytearray()
-    for one in definitions.message(kind).fields:
-        value = fields.get(one.name)
-        if not one.is_array:
-            data += _value(definitions, one.type, value)
+    for field in definitions.message(kind).fields:
+        value = fields.get(field.name)
+        if not field.is_array:
+            data += _value(definitions, field.type, value)
             continue
-        items = [None] * (one.length or 0) if value is None else value
-        if one.length is None:
+        items = [None] * (field.length or 0) if value is None else value
+        if field.length is None:
             data += struct.pack("<I", len(items))
-        if one.type in PRIMITIVES and value is not None and one.type not in ("time", "duration"):
-            data += struct.pack(f"<{len(items)}{PRIMITIVES[one.type][0]}", *items)
+        if field.type in PRIMITIVES and value is not None and field.type not in ("time", "duration"):
+            data += struct.pack(f"<{len(items)}{PRIMITIVES[field.type][0]}", *items)
             continue
         for item in items:
-            data += _value(definitions, one.type, item)
+            data += _value(definitions, field.type, item)
     return bytes(data)
 
 

@@ -82,7 +82,7 @@ def suggest(
     Example: rosrv guard suggest
     """
     found = appliance.ask_or_exit(GuardSuggestionsWanted())
-    by_scan = [one for one in found.suggestions if with_scan and one.preset in WITHOUT]
+    by_scan = [suggestion for suggestion in found.suggestions if with_scan and suggestion.preset in WITHOUT]
     (_put if appliance.as_json else _print)(found)
     if by_scan:
         _say_permitted(appliance, by_scan)
@@ -110,8 +110,8 @@ def _put(found: Suggestions) -> None:
 def _print(found: Suggestions) -> None:
     for guard in found.loaded:
         say(f"loaded: {guard.name} ({guard.preset} on {guard.topics['command']})", "green")
-    for one in found.suggestions:
-        _say_suggestion(one)
+    for suggestion in found.suggestions:
+        _say_suggestion(suggestion)
     for sentence in found.left_out:
         say(sentence, "yellow")
     if not (found.suggestions or found.loaded):
@@ -123,8 +123,8 @@ def _print(found: Suggestions) -> None:
 
 def _say_suggestion(one: Suggestion) -> None:
     set_by = {**one.measured, **one.values}
-    rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
-                     if each.name not in set_by and each.name != "limits")  # fmt: skip
+    rest = ", ".join(f"{parameter.name}={parameter.default}" for parameter in PRESETS[one.preset].parameters
+                     if parameter.name not in set_by and parameter.name != "limits")  # fmt: skip
     notes = [
         f"from the current rate: {', '.join(one.measured)}" if one.measured else "",
         f"check these defaults: {rest}" if rest else "",
@@ -136,24 +136,24 @@ def _say_suggestion(one: Suggestion) -> None:
 
 
 def _say_permitted(appliance: Appliance, guards: Sequence[Suggestion]) -> None:
-    topics = [one.topics["by"] for one in guards]
+    topics = [guard.topics["by"] for guard in guards]
     scans, why_not = _scans(appliance, topics)
-    for one in guards:
-        topic = one.topics["by"]
-        row = {"scan": topic, "guard": one.name}
+    for guard in guards:
+        topic = guard.topics["by"]
+        row = {"scan": topic, "guard": guard.name}
         recorded = scans.get(topic, [])
         why = why_not or (
             "" if recorded else f"{topic} has no scan in the last {_SINCE} of the flight recorder"
         )
-        permits = dict(_permits(one, recorded)) if recorded else {}
+        permits = dict(_permits(guard, recorded)) if recorded else {}
         if recorded and permits[""] is None:
-            why = f"the last message of {topic} is not a valid scan: {one.preset} would stop the base"
+            why = f"the last message of {topic} is not a valid scan: {guard.preset} would stop the base"
         if appliance.as_json:
             say_json({**row, "unknown": why} if why else {**row, "permits": permits})
         elif why:
-            say(f"{one.name}: what it would permit is not known: {why}", "yellow")
+            say(f"{guard.name}: what it would permit is not known: {why}", "yellow")
         else:
-            say(f"{one.name}: {_sentence(topic, permits)}")
+            say(f"{guard.name}: {_sentence(topic, permits)}")
 
 
 def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Scans], str]:

@@ -355,7 +355,7 @@ class _Writer:
             (bases, ("overspeed",), "no guard stops {} when the base is measured too fast", self._no_measurement),
             (arms, (), "no guard stops {} before the arm meets a person or a thing", None),
         ):  # fmt: skip
-            bare = [one for one in commands if not self._guards(one, presets)]
+            bare = [command for command in commands if not self._guards(command, presets)]
             if bare:
                 advised = help_(bare[0]) if help_ else ""
                 yield what.format(_named(bare)) + (f": {advised}" if advised else "")

@@ -424,7 +424,7 @@ def _undo(guard: GuardRow) -> str:
     if guard.origin != "current":
         return "rosrv monitor rollback"
     defaults = {
-        one.name: one.default for one in PRESETS[guard.preset].parameters
+        parameter.name: parameter.default for parameter in PRESETS[guard.preset].parameters
     }  # those of the text are its values
     constants = {
         name: value for name, value in values_of(guard.given).items() if not same(value, defaults[name])
@@ -471,7 +471,7 @@ def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str
 
 
 def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
-    names = {each.name for each in preset.parameters}
+    names = {parameter.name for parameter in preset.parameters}
     return {name: value for name, value in values_of(row.given).items() if name in names}
 
 

@@ -213,7 +213,7 @@ def report_interventions(
 def _report(appliance: Appliance, since: int | None, end: int, other: Path | None) -> MachineReport:
     logs = logs_of(audit_of(appliance.way), other, _VERB)
     sources = [_reported(name, log) for name, log in logs.items()]
-    begins = min((one.begins_utc for one in sources if one.begins_utc), default="")
+    begins = min((source.begins_utc for source in sources if source.begins_utc), default="")
     if since is None:
         since = parse_timestamp(begins, end) if begins else end
     period = Period(since, end)

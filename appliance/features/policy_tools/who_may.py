@@ -89,9 +89,9 @@ def _within(outer: Network, inner: Network) -> bool:
 def _outside(policy: Policy, networks: list[Network]) -> Address | None:
     starts: list[Address] = [
         ipaddress.IPv4Address(0),
-        *_ends([one for one in networks if one.version == 4]),
+        *_ends([network for network in networks if network.version == 4]),
         ipaddress.IPv6Address(0),
-        *_ends([one for one in networks if one.version == 6]),
+        *_ends([network for network in networks if network.version == 6]),
     ]
     return next((one for one in starts if not policy.names(one)), None)
 

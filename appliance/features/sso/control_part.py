@@ -65,7 +65,7 @@ class SessionTable:
         return [kept.session for kept in self._usable()]
 
     def of(self, session_id: str) -> SignedOn | None:
-        return next((one for one in self.sessions() if one.id == session_id), None)
+        return next((session for session in self.sessions() if session.id == session_id), None)
 
     def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[SignedOn, list[SignedOn]]:
         name, now = f"{_PREFIX}{identity.name}", clock.wall()
@@ -110,9 +110,9 @@ class SessionTable:
 
     def end_all(self, name: str) -> list[SignedOn]:
         spellings = {name, *(f"{_PREFIX}{one}" for one in (name, name_of(name)))}
-        ended = [one for one in self.sessions() if one.name in spellings]
+        ended = [session for session in self.sessions() if session.name in spellings]
         if not ended:
-            names = ", ".join(sorted({one.name for one in self.sessions()})[:20])
+            names = ", ".join(sorted({session.name for session in self.sessions()})[:20])
             known = f"no person is signed in as {name[:140]!r}; signed in: {names}" if names else ""
             raise UnknownThingError(known or "no person is signed in")
         self._drop(*(one.id for one in ended))

@@ -23,10 +23,10 @@ def list_sessions(appliance: Appliance) -> None:
         return
     if not body.sessions:
         say("No person is signed in at the provider.")
-    for one in body.sessions:
-        groups = [f"doors {', '.join(one.groups)}"] if one.groups else []
-        row = f"{one.name:<32} {one.role:<12} {one.id}"
-        say_row([row, f"until {moment(one.expires)}", f"sub {one.subject}", *groups])
+    for session in body.sessions:
+        groups = [f"doors {', '.join(session.groups)}"] if session.groups else []
+        row = f"{session.name:<32} {session.role:<12} {session.id}"
+        say_row([row, f"until {moment(session.expires)}", f"sub {session.subject}", *groups])
 
 
 @speaks

@@ -165,8 +165,8 @@ class _Log:
         self.unreadable: list[int] = []
         self.takeovers = [_Takeover(self, *told) for told in self._decoded(TOOK_OVER, TookOver)]
         self.handovers = list(self._decoded(_HANDED_OVER, HandedOver))
-        self.names = {one.detail.appliance for one in self.takeovers}
-        self.epochs = {one.epoch for one in self.takeovers}
+        self.names = {takeover.detail.appliance for takeover in self.takeovers}
+        self.epochs = {takeover.epoch for takeover in self.takeovers}
 
     def _decoded(self, event: str, kind: type[_T]) -> Iterator[tuple[int, int, _T]]:
         for row in self._rows:
@@ -208,11 +208,11 @@ class _Log:
 
     def names_of(self, absent: str) -> Iterator[TakeoverFinding]:
         kind = TakeoverFindingKind.LOG_MISSING
-        for one in self.takeovers:
-            previous = one.detail.previous
-            if one.detail.checkpoint is not None or (previous and previous.appliance == absent):
-                message = f"record {one.sequence} names the log of {absent}, which is missing"
-                yield TakeoverFinding(kind, one.epoch, message)
+        for takeover in self.takeovers:
+            previous = takeover.detail.previous
+            if takeover.detail.checkpoint is not None or (previous and previous.appliance == absent):
+                message = f"record {takeover.sequence} names the log of {absent}, which is missing"
+                yield TakeoverFinding(kind, takeover.epoch, message)
         for sequence, _time, handed in self.handovers:
             if self.stayed(sequence) is None:
                 message = f"record {sequence} hands over to {absent}, whose log is missing"

@@ -41,7 +41,7 @@ def page(inventory: GraphInventory, draft: PolicyDraft | None) -> str:
     parts += section("Any host that reaches the master may today", (), exposure(inventory).items())
     parts += section(
         "Ports that answered", ("host", "port", "what is usually there"),
-        [(each.host, each.port, each.what) for each in inventory.listeners],
+        [(listener.host, listener.port, listener.what) for listener in inventory.listeners],
     )  # fmt: skip
     wrong = [(fault,) for fault in problems(inventory)]
     parts += section("Faults", (), wrong)
@@ -53,7 +53,7 @@ def page(inventory: GraphInventory, draft: PolicyDraft | None) -> str:
     )
     parts += section(
         "Services that start, stop or reset something", ("service", "provider"),
-        [(one.name, _on(inventory, one.providers)) for one in acting_services(inventory)],
+        [(service.name, _on(inventory, service.providers)) for service in acting_services(inventory)],
     )  # fmt: skip
     parts += section(
         "Parameters with the name of a secret (not read)",
@@ -68,7 +68,7 @@ def page(inventory: GraphInventory, draft: PolicyDraft | None) -> str:
     parts += section(
         "Services",
         ("service", "provider"),
-        [(one.name, _on(inventory, one.providers)) for one in inventory.services],
+        [(service.name, _on(inventory, service.providers)) for service in inventory.services],
     )
     parts += section("Connections", ("node", "topic", "with", "transport"), _connections(inventory))
     if draft is not None:

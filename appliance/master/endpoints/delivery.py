@@ -303,7 +303,7 @@ def _united(some: frozenset[str] | None, others: frozenset[str] | None) -> froze
 
 
 def _without(publishers: tuple[str, ...], removed: frozenset[str] | None) -> tuple[str, ...]:
-    return () if removed is None else tuple(one for one in publishers if one not in removed)
+    return () if removed is None else tuple(publisher for publisher in publishers if publisher not in removed)
 
 
 @dataclass(slots=True)

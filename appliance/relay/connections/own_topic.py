@@ -48,7 +48,7 @@ class OwnTopicPublisher(Upstream):
 
     def waiting(self) -> str:
         """Return the name of a subscriber whose socket has not taken all messages, or an empty text."""
-        return next((one.caller_id for one in self._topic.members if one.descriptor < 0), "")
+        return next((member.caller_id for member in self._topic.members if member.descriptor < 0), "")
 
     def close(self) -> None:
         self._current = None

@@ -74,7 +74,7 @@ class _Copy:
             raise TypeError(found[0])
         self.monitors: MonitorSet = found
         self._wanted, self.now = wanted, clock.wall_ns()
-        nodes = ["", *dict.fromkeys(one.node for one in wanted.messages)]
+        nodes = ["", *dict.fromkeys(message.node for message in wanted.messages)]
         self._sources = {node: number for number, node in enumerate(nodes)}
         found.limit_time(time.thread_time, budget)
         found.name_senders(lambda source: ("the test", nodes[source]))

@@ -104,7 +104,7 @@ def hold_begun(monitors: MonitorSet, message: SpecificationsStated, switches: Ma
 def taken(
     message: SpecificationsStated, began: list[str], monitors: MonitorSet | None
 ) -> SpecificationsTaken:
-    held = [] if monitors is None else [one for one in monitors.monitors if one.held]
+    held = [] if monitors is None else [monitor for monitor in monitors.monitors if monitor.held]
     because = {one.name: one.why_held for one in held if one.why_held}
     return SpecificationsTaken(
         message.revision, began, [one.name for one in held], message.statement, because

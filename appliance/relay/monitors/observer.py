@@ -218,7 +218,7 @@ class Observer:
         """Return why a monitor stops a topic, and its publishers, if a timer led to it."""
         cause = self._words(outcome, monitor, topic)
         nodes = [] if outcome.timer is None else self._publishers(topic)[:_PUBLISHERS]
-        found: list[dict[str, object]] = [{"node": one.caller_id, "host": one.host} for one in nodes]
+        found: list[dict[str, object]] = [{"node": node.caller_id, "host": node.host} for node in nodes]
         if outcome.timer is not None and not nodes and (last := self.senders.last(topic)) is not None:
             found = [{"node": last.caller_id, "host": last.host, "ended": True}]
         return {**({"cause": cause} if cause else {}), **({"publishers": found} if found else {})}

@@ -94,7 +94,7 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def public_keys(self) -> frozenset[bytes]:
-        return frozenset(one.public_key for one in self.appliances.values())
+        return frozenset(appliance.public_key for appliance in self.appliances.values())
 
     def appliance_with(self, der: bytes) -> str:
         fingerprint = hashlib.sha256(der).hexdigest()
@@ -177,9 +177,9 @@ def check_name(name: str) -> None:
 
 def check_stored(robot: Robot) -> None:
     """Raise `EnrolmentError` or `ValueError` for a robot that cannot have been stored by a command."""
-    for one in robot.appliances.values():
-        _certificate(one.certificate.encode())
-        Ed25519PublicKey.from_public_bytes(one.public_key)
+    for appliance in robot.appliances.values():
+        _certificate(appliance.certificate.encode())
+        Ed25519PublicKey.from_public_bytes(appliance.public_key)
     for name in robot.appliances:
         check_name(name)
     if robot.group:

@@ -487,7 +487,7 @@ def _folders(folder: Path) -> list[Path]:
     """Return the folders in a folder without a system call for each, as there may be thousands."""
     try:
         with os.scandir(folder) as entries:
-            return [folder / name for name in sorted(one.name for one in entries if one.is_dir())]
+            return [folder / name for name in sorted(entry.name for entry in entries if entry.is_dir())]
     except FileNotFoundError:
         return []
 

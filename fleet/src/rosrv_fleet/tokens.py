@@ -66,7 +66,7 @@ class OperatorTokens:
         made = OperatorToken(name=name, role=role, hash=hash_of(text).hex(), added=clock.wall_ns())
         with changing(self._file.parent):
             tokens = self.all()
-            if any(one.name == name for one in tokens):
+            if any(token.name == name for token in tokens):
                 raise TokenError(
                     f"{name} already has a token; remove it first: rosrv-fleet token remove {name}"
                 )
@@ -77,7 +77,7 @@ class OperatorTokens:
     def remove(self, name: str) -> None:
         with changing(self._file.parent):
             tokens = self.all()
-            left = [one for one in tokens if one.name != name]
+            left = [token for token in tokens if token.name != name]
             if len(left) == len(tokens):
                 raise TokenError(f"{name!a} has no token; list them: rosrv-fleet token list")
             with recorded(self._file.parent, "token remove", name):

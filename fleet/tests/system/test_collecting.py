@@ -39,7 +39,7 @@ def test_each_segment_has_a_signed_receipt_on_the_robot(site: FleetSite, make_ro
     lines = (robot.folder / "state" / "receipts.ndjson").read_bytes().splitlines()
     receipts = [msgspec.json.decode(line, type=SegmentReceipt) for line in lines]
     assert all(receipt.is_signed(site.receipt_key) and receipt.robot == "arm1" for receipt in receipts)
-    assert [one.first for one in receipts[1:]] == [one.last + 1 for one in receipts[:-1]]
+    assert [receipt.first for receipt in receipts[1:]] == [receipt.last + 1 for receipt in receipts[:-1]]
     assert receipts[0].first == 1
     assert not msgspec.structs.replace(receipts[0], last=999).is_signed(site.receipt_key)
 
@@ -92,7 +92,7 @@ def test_a_search_continues_with_its_cursor(site: FleetSite, make_robot: MakeRob
     cursor = None
     while True:
         page = site.get("/v1/search", limit=7, **({"cursor": cursor} if cursor else {})).json()
-        pages += [one["id"] for one in page["records"]]
+        pages += [record["id"] for record in page["records"]]
         cursor = page["cursor"]
         if cursor is None:
             break

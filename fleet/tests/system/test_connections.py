@@ -143,5 +143,5 @@ def test_slow_searches_delay_no_other_work(site: FleetSite, make_robot: MakeRobo
 
 
 def _done(futures: list[Future[httpx.Response]], count: int) -> list[httpx.Response]:
-    found = [one.result() for one in futures if one.done()]
+    found = [future.result() for future in futures if future.done()]
     return found if len(found) >= count else []

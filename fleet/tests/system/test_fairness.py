@@ -206,10 +206,10 @@ def test_a_robot_hides_no_gap_of_another(site: FleetSite, make_robot: MakeRobot)
     for _ in range(17):
         summary, body = forged(bad, 1, log=log, number=5)
         answers.append(put(site, bad.certificates, summary, gzip.compress(body)))
-    assert [one.status_code for one in answers] == [201] * 16 + [409]
+    assert [answer.status_code for answer in answers] == [201] * 16 + [409]
     assert "16 segments have the number 5" in answers[-1].text
     good.record(5)
     good.push()
-    forks = {one["name"]: one["forks"] for one in site.health()["robots"]}
+    forks = {robot["name"]: robot["forks"] for robot in site.health()["robots"]}
     assert forks == {"bad": 16, "good": 0}
     assert "seals two histories" in site.run("verify", "bad", status=1).stdout

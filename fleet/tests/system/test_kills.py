@@ -88,8 +88,8 @@ def _check_receipts(site: FleetSite, robot: FleetRobot) -> None:
     lines = (robot.folder / "state" / "receipts.ndjson").read_bytes().splitlines()
     receipts = [msgspec.json.decode(line, type=SegmentReceipt) for line in lines]
     assert receipts
-    for one in receipts:
-        assert store.has(SegmentPlace(one.robot, one.log, one.number, one.segment))
+    for receipt in receipts:
+        assert store.has(SegmentPlace(receipt.robot, receipt.log, receipt.number, receipt.segment))
 
 
 def test_segments_are_accepted_without_a_database(own_cluster: PostgresCluster, tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ async def test_unproven_addresses_leave_half_of_the_connections(table: ClientCon
     (operator,) = _opened(table, "10.0.0.1")
     table.prove("10.0.0.1")
     robots = [one for number in range(150) for one in _opened(table, f"10.1.0.{number}")]
-    assert all(table.established(one.fileno(), f"robot{one.fileno()}") for one in robots)
+    assert all(table.established(robot.fileno(), f"robot{robot.fileno()}") for robot in robots)
     for number in range(17):
         _opened(table, f"203.0.113.{number}", 64)
     assert len(robots) == 150

@@ -63,7 +63,7 @@ def made(since: int | None = None, *, waiting: int = 0) -> MachineReport:
 
 def test_robots_are_merged_by_time_and_a_record_that_was_sent_twice_counts_once() -> None:
     """An id is compared within its robot only, so that a robot cannot hide the records of another one."""
-    assert [(one.appliance, one.event) for one in made().interventions] == [
+    assert [(intervention.appliance, intervention.event) for intervention in made().interventions] == [
         ("arm1", "monitor disabled"), ("arm1", "authority handed over"), ("arm2", "monitor set"),
         ("arm1", "took over"), ("arm1", "monitor enabled"),
     ]  # fmt: skip
@@ -78,7 +78,7 @@ def test_a_robot_and_its_standby_are_one_history() -> None:
 
 def test_a_state_from_before_the_period_still_counts() -> None:
     report = made(round(3.5 * HOUR))
-    assert [one.event for one in report.interventions] == ["monitor enabled"]
+    assert [intervention.event for intervention in report.interventions] == ["monitor enabled"]
     assert [one.since_utc[11:13] for one in report.switched_off] == ["01"]
 
 

@@ -59,7 +59,7 @@ def test_the_tests_import_only_what_is_shipped() -> None:
 def imported(text: str) -> Iterator[str]:
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            yield from (one.name for one in node.names)
+            yield from (name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom):
             yield from (
                 name for one in node.names for name in (f"{node.module}", f"{node.module}.{one.name}")

@@ -86,7 +86,7 @@ def test_each_act_and_another_value_of_each_parameter_happen_in_the_worlds_of_ea
     planned = {planned_act(preset, seed) for seed in range(400)}
     parameters = PRESETS[preset].parameters
     varied = {name for name, text in chosen if text != _text(PRESETS[preset].parameter(name).default)}
-    assert {one.name for one in parameters} - varied == set()
+    assert {parameter.name for parameter in parameters} - varied == set()
     observes = PRESETS[preset].given_topics.keys() - {COMMAND}
     assert planned - {""} == set(ACTS) - kind.not_yet.keys() - (set() if observes else {"cut"})
     assert all(kind.not_yet.values())
@@ -129,7 +129,7 @@ def _takes_any_node(text: str) -> str:
 @pytest.mark.parametrize(("preset", "topic"), [one for one in ALONE if one[1] != COMMAND])
 def test_a_guard_that_takes_any_node_for_its_source_is_found(preset: str, topic: str) -> None:
     found = (run_one(preset, seed, _takes_any_node, alone=topic).violations for seed in range(100))
-    assert any(one.law == "L4" for violations in found for one in violations)
+    assert any(violation.law == "L4" for violations in found for violation in violations)
 
 
 LAWS_OF = {
@@ -161,7 +161,7 @@ def test_each_hostile_sender_is_found_without_a_guard_and_without_luck(sender: s
 def test_a_guard_that_stops_everything_is_found(preset: str) -> None:
     """A rate drops commands, and never stops, so it has no honest motion to stop."""
     found = (run_one(preset, seed, stops_everything).violations for seed in range(100))
-    assert any(one.law == "live" for violations in found for one in violations)
+    assert any(violation.law == "live" for violations in found for violation in violations)
 
 
 @pytest.mark.parametrize("preset", WORLDS)

@@ -40,7 +40,7 @@ def compiled(*texts: str) -> Compiled:
 
 def module(of: Compiled) -> WasmModule:
     return written(
-        of.functions, [each.component for each in groups(of.specifications)], ValueCodec(of.messages)
+        of.functions, [group.component for group in groups(of.specifications)], ValueCodec(of.messages)
     )
 
 
@@ -114,7 +114,7 @@ FAULTS: dict[str, tuple[object, str, object]] = {
     "no handler runs": (*ADVANCE, _advance(handlers=lambda _: ())),
     "a handler in another state": (*ADVANCE, _advance(
         handlers=lambda one: tuple(
-            msgspec.structs.replace(each, states=frozenset({0})) for each in one.handlers
+            msgspec.structs.replace(handler, states=frozenset({0})) for handler in one.handlers
         )
     )),
     "handlers in another order": (*ADVANCE, _advance(handlers=lambda one: one.handlers[::-1])),

@@ -21,7 +21,7 @@ SHIPPED = sorted((Path(__file__).parents[3] / "monitors").rglob("*.rv"))
 
 def found(*files: Path) -> list[str]:
     texts = {str(file): file.read_text() for file in files}
-    warnings = [one.text for one in compiled_from(texts, definitions()).warnings]
+    warnings = [warning.text for warning in compiled_from(texts, definitions()).warnings]
     words = [word for kind in KINDS.values() for word in (*kind, "are not checked")]
     return [text for text in warnings if any(word in text for word in words)]
 
@@ -34,6 +34,6 @@ def test_no_shipped_monitor_has_such_a_warning() -> None:
 @table(Path(__file__).parent / "flow.txt")
 def test_a_lint_finds_its_kind_and_no_other(case: Case) -> None:
     warnings = compiled_from({"x.rv": case.text}, definitions()).warnings
-    texts = [one.text for one in warnings]
+    texts = [warning.text for warning in warnings]
     kinds = [kind for kind, words in KINDS.items() if any(word in text for text in texts for word in words)]
     assert tuple(kinds or ["accepted"]) == case.expected, warnings

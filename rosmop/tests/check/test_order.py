@@ -177,7 +177,7 @@ class Programs:
 
 def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
     before, statements = programs.declarations(), programs.statements(count)
-    body = "\n".join(f'{one} printf("%ld\\n", look());' for one in statements)
+    body = "\n".join(f'{statement} printf("%ld\\n", look());' for statement in statements)
     outcome = act(body, before=before, most=1_000_000_000)
     assert not outcome.faults
     if directory is not None:

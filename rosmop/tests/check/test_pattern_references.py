@@ -85,7 +85,7 @@ def test_the_module_takes_these_messages_and_the_text_is_loadable() -> None:
     text = f"s() {{ {EVENTS} pattern: globally: a as A forbids b {{x < @A.x}} @violation {{ }} }}"
     compiled = compiled_from({"x.rv": text}, definitions())
     require_loadable(encoded(compiled))
-    assert [one.text for one in compiled.warnings] == [
+    assert [warning.text for warning in compiled.warnings] == [
         f"no property uses the event `{name}`" for name in "pq"
     ]
     both = BothWays(text)

@@ -101,7 +101,7 @@ OPEN = {
 
 
 def verdicts(outcomes: list[Outcome]) -> list[str]:
-    return [verdict.category for one in outcomes for verdict in one.verdicts]
+    return [verdict.category for outcome in outcomes for verdict in outcome.verdicts]
 
 
 def said(monitors: MonitorSet) -> str:
@@ -201,6 +201,6 @@ def test_the_message_of_a_slice_answers_its_own_binding_only(order: str) -> None
     for time in (4, 6):
         monitors.process("/goal", message("std_msgs/String", data="a"), time * SECOND)
         [outcome] = monitors.advance((time + 2) * SECOND)
-        assert [one.category for one in outcome.verdicts] == ["violation"]
+        assert [verdict.category for verdict in outcome.verdicts] == ["violation"]
         assert outcome.verdicts[0].binding == {"id": "a"}
         assert [line.text for line in outcome.log] == [f"a {time // 2 - 1}"]

@@ -153,7 +153,7 @@ def test_contradictions_of_held_out_recordings_are_listed() -> None:
     odd[2] = replace(odd[2], rows=tuple(rows))
     learnt = learnt_from(odd, 0.25)
     assert [part.name for part in learnt.held_out] == ["drive 3"]
-    widened = {each.says for each in learnt.candidates if each.widened}
+    widened = {candidate.says for candidate in learnt.candidates if candidate.widened}
     assert "data is out of range" in widened
     assert "WIDENED after" in learnt.text
     assert "data has a new value" in {each.says for each in learnt.left_out}
@@ -193,7 +193,7 @@ def test_omitted_conditions_are_listed() -> None:
 
     rows = tuple(("/arm", START + tick * 50_000_000, joints()) for tick in range(600))
     learnt = learnt_from([Recorded("arm", rows, {"/arm": "sensor_msgs/JointState"})], 0)
-    kinds = [each.kind for each in learnt.candidates]
+    kinds = [candidate.kind for candidate in learnt.candidates]
     assert (kinds.count("range"), kinds.count("length")) == (10, 4)
     assert re.search(r"^// \d+ conditions more on /arm are not here", learnt.text, re.MULTILINE)
     assert "// Nothing was held out: it is untested." in learnt.text

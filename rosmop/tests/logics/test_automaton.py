@@ -77,10 +77,10 @@ def test_components_against_reachability() -> None:
         components = strong_components(edges, edges.__getitem__)
         place = {node: number for number, component in enumerate(components) for node in component}
         assert sorted(place) == list(range(size))
-        for one in edges:
+        for edge in edges:
             for other in edges:
-                assert (place[one] == place[other]) == (other in leads[one] and one in leads[other])
-                assert other not in leads[one] or place[other] <= place[one]
+                assert (place[edge] == place[other]) == (other in leads[edge] and edge in leads[other])
+                assert other not in leads[edge] or place[other] <= place[edge]
 
 
 def test_many_states_with_many_ways_out_are_refused() -> None:

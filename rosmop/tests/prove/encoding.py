@@ -21,7 +21,7 @@ def with_function(module: bytes, number: int, code: Code) -> bytes:
     reader = Reader(parts[decoding.CODES])
     bodies = [reader.take(reader.unsigned()) for _ in range(reader.unsigned())]
     bodies[number] = _body(code)
-    parts[decoding.CODES] = row([unsigned(len(one)) + one for one in bodies])
+    parts[decoding.CODES] = row([unsigned(len(body)) + body for body in bodies])
     return module[:8] + b"".join(section(kind, content) for kind, content in parts.items())
 
 

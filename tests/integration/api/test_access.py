@@ -70,7 +70,7 @@ def test_a_flood_of_one_host_is_rate_limited(tmp_path: Path) -> None:
         assert 429 in statuses[-10:]
         assert rest.get("/v1/status").status == 200  # a host with a valid token is still served
         answers = [rest.get("/healthz") for _ in range(400)]
-        refused = [one for one in answers if one.status == 429]
+        refused = [answer for answer in answers if answer.status == 429]
         assert refused
         assert int(refused[0].headers["retry-after"]) >= 1
 

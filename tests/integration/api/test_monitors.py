@@ -47,7 +47,7 @@ def test_effects_of_a_monitor_are_counted_and_kept(appliance: Appliance, tmp_pat
         ros.talker("rospy", "/chatter", name="talker")
         events = rest.events("/v1/audit/stream?event=message%20dropped&after=0")
         next(events)
-        dropped = json.loads(next(one for one in events if one.get("event") == "record")["data"])
+        dropped = json.loads(next(event for event in events if event.get("event") == "record")["data"])
         events.close()
     assert dropped["detail"]["monitor"] == "speed"
     happened = rest.get("/v1/monitors/speed/history").json["happened"]
@@ -57,7 +57,7 @@ def test_effects_of_a_monitor_are_counted_and_kept(appliance: Appliance, tmp_pat
 
     def counted() -> dict[str, Any] | None:
         row: dict[str, Any] = next(
-            one for one in rest.get("/v1/monitors").json["monitors"] if one["name"] == "speed"
+            monitor for monitor in rest.get("/v1/monitors").json["monitors"] if monitor["name"] == "speed"
         )
         return row if row["drops"] else None
 

@@ -62,7 +62,7 @@ def test_a_valid_policy_is_in_force_at_once_and_survives(appliance: Appliance) -
         "loaded": True, "revision": first + 1, "replaced": first, "revoked": 1, "confirm_by": None, "warnings": [],
         "changes": [], "ends": [],
     }  # fmt: skip
-    assert [(one["what"], one["resource"]) for one in posted.json["ends"]] == [("publication", "/cmd_vel")]
+    assert [(end["what"], end["resource"]) for end in posted.json["ends"]] == [("publication", "/cmd_vel")]
     assert posted.etag == tag(first + 1)
     assert register(appliance.master_uri, "/cmd_vel")[0] == 0
     assert loaded_last_by(appliance) == ["first"]

@@ -33,7 +33,7 @@ def seconds_of_a_call(appliance: Appliance) -> float:
 
 def process_row(appliance: Appliance, role: str) -> dict[str, Any]:
     rows: list[dict[str, Any]] = appliance.status()["processes"]
-    return next(one for one in rows if one["role"] == role)
+    return next(row for row in rows if row["role"] == role)
 
 
 def unchanged(appliance: Appliance, row: dict[str, Any]) -> bool:
@@ -96,12 +96,12 @@ def test_a_flood_of_rest_does_not_affect_rvmaster(appliance: Appliance) -> None:
     floods = [subprocess.Popen([sys.executable, "-c", program, str(rest.url.port)]) for _ in range(2)]
     try:
         times = []
-        while all(one.poll() is None for one in floods):
+        while all(flood.poll() is None for flood in floods):
             times.append(seconds_of_a_call(appliance))
     finally:
-        for one in floods:
-            one.kill()
-            one.wait()
+        for flood in floods:
+            flood.kill()
+            flood.wait()
     assert times
     assert max(times) < allowed(3), times
     assert unchanged(appliance, control)

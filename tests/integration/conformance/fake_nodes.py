@@ -69,7 +69,7 @@ class FakeNodes:
 
     def calls(self, node: str, method: str) -> list[tuple[Any, ...]]:
         with self._changed:
-            return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
+            return [call.params[1:] for call in self._calls if (call.node, call.method) == (node, method)]
 
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
         with self._changed:

@@ -42,7 +42,7 @@ def test_answers_are_those_of_rosmaster(both: BothMasters, title: str) -> None:
             continue
         call = call_of(line)
         name, *_ = [*call.params, ""]
-        answers = both.call(call.method, *(of_fake_nodes(name, one) for one in call.params))
+        answers = both.call(call.method, *(of_fake_nodes(name, param) for param in call.params))
         if call.method == "system.multicall":
             assert answers.plain == answers.appliance
         else:

@@ -73,7 +73,7 @@ def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> N
             == 0
         )
     records = siege.appliance.recorded("--deny", "--host", guest, count=len(topics))
-    assert {one["resource"] for one in records if one["event"] == "decision"} >= set(topics)
+    assert {record["resource"] for record in records if record["event"] == "decision"} >= set(topics)
     of_unknown_hosts = [
         one
         for one in siege.appliance.audit("--deny", "--limit", "10000")

@@ -155,7 +155,7 @@ def test_a_latched_stop_outlives_a_relay_on_a_full_disk(
                     eventually(lambda: killed not in appliance.pids("relay"), appliance.story)
                 before = eventually(lambda: monitor(appliance), appliance.story)["drops"]
                 eventually(lambda: monitor(appliance)["drops"] >= before + 10, appliance.story)
-                assert not any(one.get("event") == "received" for one in listener.events[mark:])
+                assert not any(event.get("event") == "received" for event in listener.events[mark:])
                 ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: false")
                 listener.wait_for(event="received", since=mark)
             appliance.stop()

@@ -58,8 +58,8 @@ def test_safe_triggering(unguarded: Drive) -> None:
     guarded = Simulation(specification("safe_triggering")).run()
     assert [shot.fired for shot in guarded.shots] == [True, False, True]
     assert guarded.poses == unguarded.poses
-    assert [one.data for one in guarded.messages] == [one.data for one in unguarded.messages]
-    assert [one.topic for one in guarded.messages if one.result != "passed"] == [TRIGGERED]
+    assert [message.data for message in guarded.messages] == [message.data for message in unguarded.messages]
+    assert [message.topic for message in guarded.messages if message.result != "passed"] == [TRIGGERED]
 
 
 def test_safe_zone(unguarded: Drive) -> None:
@@ -67,7 +67,7 @@ def test_safe_zone(unguarded: Drive) -> None:
     assert 20 < guarded.farthest() < 20 + SLACK
     end = guarded.poses[-1]
     assert math.hypot(end.x, end.y) < 19
-    first = next(one for one in guarded.messages if one.result == "dropped")
+    first = next(message for message in guarded.messages if message.result == "dropped")
     outside = next(index for index, pose in enumerate(unguarded.poses) if math.hypot(pose.x, pose.y) > 20)
     late = first.time - unguarded.messages[0].time - outside * 50_000_000
     assert 0 <= late <= 101_000_000  # the next command after the border was crossed
@@ -77,11 +77,11 @@ def test_safe_zone(unguarded: Drive) -> None:
 def test_obstacle_avoidance() -> None:
     guarded = Simulation(specification("obstacle_avoidance")).run()
     assert 0.3 < guarded.nearest(OBSTACLE) < 1.3
-    alarms = [one for one in guarded.messages if one.topic == "/landshark/obstacle_alarm"]
+    alarms = [message for message in guarded.messages if message.topic == "/landshark/obstacle_alarm"]
     said = Messages().decode("std_msgs/String", alarms[0].data).data
     assert said.startswith("obstacle at 1.")
     assert said.endswith("told to drive at 1.000000 m/s")
-    assert all(one.result != "dropped" for one in guarded.messages)
+    assert all(message.result != "dropped" for message in guarded.messages)
     assert guarded.farthest() > 20
 
 
@@ -127,16 +127,16 @@ def test_a_recording_gives_the_same_verdicts_as_the_drive(
     output = tmp_path / "guarded.bag"
     records = replayed(bag, *SHIPPED, output=output)
     messages = [one for one in records if "topic" in one]
-    assert [one["topic"] for one in messages] == [one.topic for one in unguarded.messages]
-    shots = [one["outcome"] for one in messages if one["topic"] == TRIGGERED]
+    assert [message["topic"] for message in messages] == [message.topic for message in unguarded.messages]
+    shots = [message["outcome"] for message in messages if message["topic"] == TRIGGERED]
     assert shots == ["passed", "dropped", "passed"]
     outcomes = {
-        topic: {one["outcome"] for one in messages if one["topic"] == topic}
+        topic: {message["outcome"] for message in messages if message["topic"] == topic}
         for topic in (VELOCITY, "/landshark/odom")
     }
     assert outcomes == {VELOCITY: {"passed", "changed", "dropped"}, "/landshark/odom": {"passed"}}
-    alarms = [one for one in messages if one["published"]]
-    assert {one["published"][0]["topic"] for one in alarms} == {"/landshark/obstacle_alarm"}
+    alarms = [message for message in messages if message["published"]]
+    assert {alarm["published"][0]["topic"] for alarm in alarms} == {"/landshark/obstacle_alarm"}
     assert not [one for one in records if one["faults"]]
     again = replayed(output, *specification("safe_triggering"))
     assert [one["outcome"] for one in again if one["topic"] == TRIGGERED] == ["passed", "passed"]
@@ -209,6 +209,6 @@ def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path
     told(robot, "aim", "0", "0.3")
     fires(robot, shots)
     verdicts = appliance.recorded("--event", "monitor verdict", count=3)
-    assert [one["detail"]["category"] for one in reversed(verdicts)] == ["warned", "locked", "locked"]
+    assert [verdict["detail"]["category"] for verdict in reversed(verdicts)] == ["warned", "locked", "locked"]
     appliance.rosrv("monitor", "remove", "gun.rv")
     fires(robot, shots + 1)

@@ -161,7 +161,7 @@ class _Control(_Actor):
                 self.say(restored=sorted(self.sockets), count=count)
                 self.serve()
             case ProcessesChanged(processes):
-                self.say(processes={one.role: [one.pid, one.restarts] for one in processes})
+                self.say(processes={process.role: [process.pid, process.restarts] for process in processes})
             case ProcessDied(role, _index, pid, end):
                 self.say(died=role, died_pid=pid, end=end)
             case _:

@@ -141,7 +141,7 @@ class Place:
             self.state.config,
             self.ports[0],
             "http://127.0.0.1:1",
-            sections=Sections({type(one): one for one in sections}),
+            sections=Sections({type(section): section for section in sections}),
         )
         plan = ProcessSlot(role, 0).plan(facts, there.fileno(), None)
         sandbox = replace(plan.sandbox, reads=(*plan.sandbox.reads, str(ROOT)))

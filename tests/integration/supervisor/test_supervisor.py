@@ -361,7 +361,7 @@ def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
     memory = [str(path) for path in (common.state / "monitors").glob("*/relay-0")]
     supervisors = _open_files(common.process.pid)
     relays = supervisors & _open_files(common.living("relay")) - {"/dev/null"}
-    assert [one for one in relays if one.startswith(("socket:", "/"))] == memory
+    assert [relay for relay in relays if relay.startswith(("socket:", "/"))] == memory
     assert [role for role in ALL if set(memory) & _open_files(common.living(role))] == ["relay"]
 
 

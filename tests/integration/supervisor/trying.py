@@ -111,7 +111,7 @@ def _new_namespace() -> str:
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(b"clone")
     libc = ctypes.CDLL(None, use_errno=True)
     arguments = (NEW_USER | signal.SIGCHLD, 0, 0, 0, 0)
-    result = libc.syscall(ctypes.c_long(number), *(ctypes.c_long(one) for one in arguments))
+    result = libc.syscall(ctypes.c_long(number), *(ctypes.c_long(argument) for argument in arguments))
     if result == 0:
         os._exit(0)
     if result < 0:

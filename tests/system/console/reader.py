@@ -163,7 +163,7 @@ class Reader:
 
 
 def texts(locators: Iterable[Any]) -> list[str]:
-    return [str(one.inner_text()) for one in locators]
+    return [str(locator.inner_text()) for locator in locators]
 
 
 def wait_until(page: Page, condition: str) -> None:

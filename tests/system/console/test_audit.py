@@ -86,10 +86,10 @@ def test_records_dropped_from_the_list_can_be_fetched(opened: Callable[..., Read
     }"""
     rows = [{"sequence": number} for number in (8, 7, 6)]
     kept = page.evaluate(added, {"records": rows, "cursor": None, "most": 3})
-    assert [one["sequence"] for one in kept["records"]] == [9, 8, 7]
+    assert [record["sequence"] for record in kept["records"]] == [9, 8, 7]
     assert kept["cursor"] == "7"
     whole = page.evaluate(added, {"records": rows, "cursor": None, "most": 4})
-    assert [one["sequence"] for one in whole["records"]] == [9, 8, 7, 6]
+    assert [record["sequence"] for record in whole["records"]] == [9, 8, 7, 6]
     assert whole["cursor"] is None
 
 

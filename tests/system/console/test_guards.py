@@ -110,6 +110,6 @@ def test_the_check_of_a_driver_asks_measures_and_ends_with_its_window(
         expect(dialog.get_by_role("status")).to_contain_text("drive slowly now")
         dialog.get_by_role("button", name="End the check").click()
         records = appliance.recorded("--event", "driver checked", count=2)
-        assert {one["detail"]["outcome"] for one in records} == {"stopped", "interrupted"}
+        assert {record["detail"]["outcome"] for record in records} == {"stopped", "interrupted"}
     viewed = opened(token("viewer", "watcher")).go("robot").get_by_role("button", name="Check the driver")
     expect(viewed).to_have_attribute("aria-disabled", "true")

@@ -78,4 +78,4 @@ def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -
     listed = map(json.loads, appliance.rosrv("host", "list", "--json").stdout.splitlines())
     assert {one["name"]: one["state"] for one in listed} == {"ocu-1": "revoked", "ocu-2": "awaited"}
     events = appliance.recorded("--event", "host revoked")
-    assert [one["detail"]["name"] for one in events] == ["ocu-1"]
+    assert [event["detail"]["name"] for event in events] == ["ocu-1"]

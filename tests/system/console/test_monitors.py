@@ -36,7 +36,7 @@ def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reade
     expect(switch).to_have_attribute("aria-checked", str(before).lower())
     assert state(appliance, "safeZone")["enabled"] is before
     events = [one for one in appliance.recorded("--event", "monitor *abled") if one["resource"] == "safeZone"]
-    assert {one["detail"]["who"] for one in events} == {"first"}
+    assert {event["detail"]["who"] for event in events} == {"first"}
 
 
 @pytest.mark.parametrize("width", [390, 1280, 1920])

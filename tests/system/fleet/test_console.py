@@ -249,8 +249,8 @@ def _axe(page: Page) -> list[str]:
     kinds = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
     found = Axe().run(page, options={"resultTypes": ["violations"], "runOnly": kinds})
     return [
-        f"{one['id']}: {[node['target'] for node in one['nodes'][:3]]}"
-        for one in found.response["violations"]
+        f"{violation['id']}: {[node['target'] for node in violation['nodes'][:3]]}"
+        for violation in found.response["violations"]
     ]
 
 

@@ -46,9 +46,9 @@ def acts_of(site: FleetSite) -> list[tuple[str, str, str]]:
     assert site.data is not None
     acts = map(json.loads, (site.data / "acts.ndjson").read_text().splitlines())
     return [
-        (one["who"], one["act"], one["about"])
-        for one in acts
-        if "evidence" in one["act"] and one["result"] == "done"
+        (act["who"], act["act"], act["about"])
+        for act in acts
+        if "evidence" in act["act"] and act["result"] == "done"
     ]
 
 

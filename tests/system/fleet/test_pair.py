@@ -95,13 +95,13 @@ def _join(lab: Lab, site: StandbySite, fleet: Fleet) -> None:
 
 
 def _configure(site: StandbySite, operator: Operator) -> None:
-    for one in site.appliances.values():
-        root, config = one.directory / "root.json", one.directory / "appliance.yaml"
+    for appliance in site.appliances.values():
+        root, config = appliance.directory / "root.json", appliance.directory / "appliance.yaml"
         root.write_bytes((operator.repository / "root.json").read_bytes())
         root.chmod(0o644)
         bundles = {"root": str(root), "interval": 5, "confirm_seconds": 1}
         config.write_text(json.dumps({"fleet": {"bundles": bundles}}))
-        one.options = ("--config", str(config), *one.options)
+        appliance.options = ("--config", str(config), *appliance.options)
 
 
 def _bundles(site: StandbySite, name: str) -> tuple[str, bool] | None:

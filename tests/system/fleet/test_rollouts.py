@@ -303,7 +303,7 @@ def test_enrolled_robots_that_never_reported_are_visible(fleet: Fleet) -> None:
     fleet.start(path)
     fleet.until(lambda state: state["state"] == "done")
     robots = fleet.operator.get(f"/v1/rollouts/{SITE}/{GROUP}").json()["robots"]
-    assert {one["name"]: one["condition"] for one in robots} == {
+    assert {robot["name"]: robot["condition"] for robot in robots} == {
         "absent": "never seen",
         "r-0": "in force",
         "r-1": "in force",
@@ -376,7 +376,7 @@ def test_a_restarted_collector_does_not_take_its_own_absence_for_silence(fleet: 
         later.call(service.tick())
         stored = service.rollouts[RobotGroup(SITE, GROUP)]
         assert (stored.rollout.state, stored.rollout.ring) == ("running", 0)
-        assert {one.kind for one in service.conditions(RobotGroup(SITE, GROUP)).values()} == {
+        assert {condition.kind for condition in service.conditions(RobotGroup(SITE, GROUP)).values()} == {
             "in force",
             "no bundle",
         }

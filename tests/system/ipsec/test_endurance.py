@@ -55,7 +55,7 @@ def test_a_host_moves(site: TunnelSite) -> None:
         moved = site.recorded(mark, event="tunnel moved")
         assert (moved["host"], moved["detail"]["remote"]) == (joined.address, "10.88.0.41")
         listener.wait_for_count(len(listener.seen(event="received")) + 20, event="received")
-        assert [one["remote"] for one in site.hosts()] == ["10.88.0.41"]
+        assert [host["remote"] for host in site.hosts()] == ["10.88.0.41"]
         assert site.trail.seen(event="tunnel down") == []
         heard = numbers(listener)
         assert heard == list(range(heard[0], heard[0] + len(heard))), "messages were lost"

@@ -68,7 +68,7 @@ def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "
 
 
 def row(site: TunnelSite, name: str) -> dict[str, Any]:
-    return next(one for one in site.hosts() if one["name"] == name)
+    return next(host for host in site.hosts() if host["name"] == name)
 
 
 def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost,
     script = tmp_path / "join.sh"
     laptop.run("sh", str(script), awaited(site, "last", script))
     site.is_up("last")
-    assert len({one["address"] for one in site.hosts()}) == len(site.hosts())
+    assert len({host["address"] for host in site.hosts()}) == len(site.hosts())
     mark = site.mark
     site.appliance.rosrv("host", "revoke", "last")
     revoked = site.recorded(mark, event="host revoked")

@@ -265,7 +265,7 @@ def test_hosts_without_a_bucket_have_one_common_limit(
             opened = sum(flood(other, address, (master,), 15) for other in others)
             assert 5 <= opened <= 12, f"{opened} of 30 came through"
             assert flood(attacker, address, (master,), 1) == 1
-        (status,) = [one for one in firewall.report().rules if "per host" in one.purpose]
+        (status,) = [rule for rule in firewall.report().rules if "per host" in rule.purpose]
         assert status.in_force
         assert status.packets >= 30
 
@@ -439,12 +439,12 @@ def test_the_probe_reports_closed_and_open_ports(protected: Host) -> None:
         result = probe_port(protected.namespace, port)
         assert result.closed
         assert result.listening
-        assert [one.outcome for one in result.attempts] == [ConnectOutcome.REFUSED] * 2
+        assert [attempt.outcome for attempt in result.attempts] == [ConnectOutcome.REFUSED] * 2
         assert result.listening_outside == ("::",)
         firewall.remove()
         result = probe_port(protected.namespace, port)
         assert not result.closed
-        assert [one.outcome for one in result.attempts] == [ConnectOutcome.REACHED] * 2
+        assert [attempt.outcome for attempt in result.attempts] == [ConnectOutcome.REACHED] * 2
     assert not probe_port(protected.namespace, port).listening
     with listening(protected, "127.0.0.1") as port:
         assert probe_port(protected.namespace, port).listening == ("127.0.0.1",)

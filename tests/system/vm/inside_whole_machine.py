@@ -40,7 +40,7 @@ def state_of_the_machine() -> dict[str, object]:
         "policies": told("ip", "xfrm", "policy"),
         "interfaces": sorted(interfaces.links(Namespace.own())),
         "addresses": sorted(
-            one for one in interfaces.addresses(Namespace.own()) if not one.startswith("fe80")
+            address for address in interfaces.addresses(Namespace.own()) if not address.startswith("fe80")
         ),
         "namespaces": [one.name for one in namespaces() if not one.name.startswith("rosrv-machine")],
         "forwarding": Path("/proc/sys/net/ipv4/ip_forward").read_text(),

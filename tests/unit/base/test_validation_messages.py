@@ -52,8 +52,8 @@ def test_the_form_of_a_name_is_described_in_words(pattern: str, words: str) -> N
 def test_the_command_line_explains_valid_values() -> None:
     told = []
     for verb, command in commands():
-        for one in command.params:
-            kind, name = one.type_descriptor, one.opts[0]
+        for param in command.params:
+            kind, name = param.type_descriptor, param.opts[0]
             if not (kind.is_choice or kind.annotation in (int, float)):
                 continue
             bounds = kind.parameter_info
@@ -107,7 +107,7 @@ def test_the_configuration_explains_valid_keys(tmp_path: Path, monkeypatch: pyte
             try:
                 resolve(None, {}, {path[0]: given})
             except ConfigError as error:
-                told |= {one.text for one in error.mistakes}
+                told |= {mistake.text for mistake in error.mistakes}
     assert not [one for one in told if LIBRARY.search(one)]
     assert len(told) > 300
 

@@ -129,7 +129,7 @@ def test_blocks_are_one_line_with_count_and_earliest_end(hosts: int, end: float 
 
 def test_the_gravest_come_first() -> None:
     status = changed("policy.differs_from_file", True, relay="away", rosmaster="being rebuilt")
-    assert [one.severity for one in open_alarms(status)] == ["alarm", "warning", "notice"]
+    assert [alarm.severity for alarm in open_alarms(status)] == ["alarm", "warning", "notice"]
 
 
 def test_drops_and_many_denials_of_the_last_minute_are_warnings() -> None:

@@ -17,7 +17,7 @@ ELSEWHERE = {
 
 def test_every_verb_of_a_running_appliance_is_covered() -> None:
     options = {
-        name: {one for parameter in verb.params for one in parameter.opts} for name, verb in commands()
+        name: {opt for parameter in verb.params for opt in parameter.opts} for name, verb in commands()
     }
     both = {name for name, known in options.items() if {"--state", "--api"} <= known}
     here, transcript = COMPARISON.read_text(), COMPARISON.with_name("both_ways.txt").read_text()

@@ -65,10 +65,10 @@ def test_every_verb_has_help_with_an_example(name: str, verb: Verb) -> None:
 def test_every_argument_and_option_has_help(program: typer.Typer) -> None:
     """A name such as MONITOR or PRESET alone does not say which values exist."""
     assert [
-        f"{' '.join(words)} {one.name}"
+        f"{' '.join(words)} {param.name}"
         for words, command, context in command_line_page.commands(("",), program)
-        for one in command.get_params(context)
-        if not hasattr(command, "list_commands") and not one.hidden and not one.help
+        for param in command.get_params(context)
+        if not hasattr(command, "list_commands") and not param.hidden and not param.help
     ] == []
 
 

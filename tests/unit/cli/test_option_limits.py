@@ -30,11 +30,11 @@ def _arguments(verb: str, given: str) -> list[str]:
     """Return a command line of the verb with its required arguments and options, except the option `given`."""
     command = dict(commands())[verb]
     words: list[str] = list(_BESIDE.get((verb, given), []))
-    for one in command.params:
-        if isinstance(one, TyperArgument) and (one.required or verb in _NEED_ALL):
-            words.append(_WORDS.get((one.metavar or one.name or "").strip("[]{}.…").upper(), "x"))
-        elif one.required and given not in one.opts:
-            words += [max(one.opts, key=len), "x"]
+    for param in command.params:
+        if isinstance(param, TyperArgument) and (param.required or verb in _NEED_ALL):
+            words.append(_WORDS.get((param.metavar or param.name or "").strip("[]{}.…").upper(), "x"))
+        elif param.required and given not in param.opts:
+            words += [max(param.opts, key=len), "x"]
     return words
 
 

@@ -42,10 +42,10 @@ class Option(NamedTuple):
 
 
 OPTIONS = [
-    Option(name, max(one.opts, key=len), one.metavar or "", one.help or "", one)
+    Option(name, max(param.opts, key=len), param.metavar or "", param.help or "", param)
     for name, command in commands()
-    for one in command.params
-    if isinstance(one, TyperOption) and not one.hidden
+    for param in command.params
+    if isinstance(param, TyperOption) and not param.hidden
 ]
 
 

@@ -119,7 +119,7 @@ def test_each_order_waits_or_has_a_reason() -> None:
     assert not WAITS.keys() & AT_ONCE.keys()
     require_rows(orders, WAITS.keys() | AT_ONCE.keys(), "WAITS, or AT_ONCE with the reason")
     waiting = {
-        name for name, verb in commands() if any("--when-standing" in each.opts for each in verb.params)
+        name for name, verb in commands() if any("--when-standing" in param.opts for param in verb.params)
     }
     require_rows({verb for verbs in WAITS.values() for verb in verbs}, waiting, "WAITS")
     require_rows(waiting, _CALLS.keys() | _UNTRIED.keys(), "_CALLS, or _UNTRIED with the reason")

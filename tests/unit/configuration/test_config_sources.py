@@ -81,7 +81,7 @@ def test_messages_about_values_are_our_own(value: Any) -> None:
         with suppress(ConfigError):
             resolve(None, {}, flags)
             continue
-        told += [one.partition(", not ")[0] for one in mistakes(None, {}, flags)]
+        told += [mistake.partition(", not ")[0] for mistake in mistakes(None, {}, flags)]
     assert [
         one
         for one in told
@@ -130,7 +130,7 @@ def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
 )
 def test_an_unreadable_file_is_an_error(file: Path, text: str, expected: str) -> None:
     file.write_text(text)
-    assert any(expected in one for one in mistakes(file))
+    assert any(expected in mistake for mistake in mistakes(file))
 
 
 def test_a_named_file_must_exist(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_the_provenance_names_files_and_sources(released: Path) -> None:
         path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in released.glob("rosrv*")
     }
     sources = {
-        one["name"]: one["digest"]
-        for one in statement["predicate"]["buildDefinition"]["resolvedDependencies"]
+        resolvedDependency["name"]: resolvedDependency["digest"]
+        for resolvedDependency in statement["predicate"]["buildDefinition"]["resolvedDependencies"]
     }
     assert len(sources["rosrv"]["gitCommit"].partition("-")[0]) == 40
     assert "requirements.lock" in sources

@@ -14,7 +14,7 @@ CLOUD = ROOT / "examples/cloud-init/user-data.yaml"
 
 def written() -> dict[str, str]:
     data: dict[str, Any] = yaml.safe_load(CLOUD.read_text())
-    return {one["path"]: one["content"] for one in data["write_files"]}
+    return {file["path"]: file["content"] for file in data["write_files"]}
 
 
 def test_the_role_has_the_packages_defaults(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
     with Reader(tmp_path / "drive.bag") as reader:
         found = [(time, connection.topic, data) for connection, time, data in reader.messages()]
         definitions = {connection.topic: connection.msgdef.data for connection in reader.connections}
-    assert found == [(one.time, one.topic, one.data) for one in drive.messages]
+    assert found == [(message.time, message.topic, message.data) for message in drive.messages]
     assert "uint8 SINGLE_SHOT" in definitions["/landshark_control/trigger"]
     with pytest.raises(FileExistsError):
         record(drive, tmp_path / "drive.bag")

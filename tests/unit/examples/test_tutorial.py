@@ -52,12 +52,12 @@ def test_the_page_quotes_run(folder: Path) -> None:
 def test_the_second_one_locks_after_two_in_a_row(folder: Path) -> None:
     (folder / "gun.rv").write_text(SECOND)
     guarded = Simulation([folder / "gun.rv"]).run()
-    assert [one.result for one in guarded.messages if one.topic == TRIGGERED] == [
+    assert [message.result for message in guarded.messages if message.topic == TRIGGERED] == [
         "passed",
         "dropped",
         "passed",
     ]
-    assert {one.result for one in guarded.messages if one.topic != TRIGGERED} == {"passed"}
+    assert {message.result for message in guarded.messages if message.topic != TRIGGERED} == {"passed"}
 
 
 def test_the_last_one_keeps_the_robot_slow_while_its_gun_is_raised(folder: Path) -> None:

@@ -86,7 +86,7 @@ def test_each_state_has_its_alarms_metrics_and_line(view: StateView[Any]) -> Non
     [(found, state)] = states_of(status)
     assert found is view
     assert [
-        (one.kind, view.kinds[one.kind.partition(":")[0]].severity) for one in view.alarms(state)
+        (alarm.kind, view.kinds[alarm.kind.partition(":")[0]].severity) for alarm in view.alarms(state)
     ] == alarms
     assert set(view.samples(state)) == {metric.name for metric in view.metrics}
     assert view.line is not None

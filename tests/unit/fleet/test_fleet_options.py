@@ -35,10 +35,10 @@ def _commands(command: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 FLEET = [
-    (verb, max(one.opts, key=len), one)
+    (verb, max(param.opts, key=len), param)
     for verb, command in _commands(typer.main.get_command(app))
-    for one in command.params
-    if one.param_type_name == "option" and one.name != "help" and not one.hidden
+    for param in command.params
+    if param.param_type_name == "option" and param.name != "help" and not param.hidden
 ]
 
 

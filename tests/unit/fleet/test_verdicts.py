@@ -275,7 +275,7 @@ def rewritten(site: Site, log: Path) -> None:
 def of_log(log: Path, key: bytes, *elsewhere: Any) -> Iterator[str]:
     alone, full = (verify(log, key, *more) for more in ((), elsewhere))
     yield f"signed through {alone.signed_through} of {alone.last}, removal: {alone.removal}"
-    yield from (f"alone: {one.kind}: {one.message}" for one in alone.findings)
+    yield from (f"alone: {finding.kind}: {finding.message}" for finding in alone.findings)
     yield from (f"elsewhere: {one.kind}: {one.message}" for one in full.findings if one not in alone.findings)
 
 
@@ -302,7 +302,7 @@ def of_store(site: Site, folder: Path, changes: dict[int, Lines], further: Lines
     robot = Robot(name="arm1", key=site.public.hex(), certificate="", added=0)
     for proof in prove(store, robot, _LARGEST):
         yield f"collector: {proof.segments} segments, {proof.records} records, {proof.missing} missing"
-        yield from (f"collector: {one}".replace(f"{folder}/", "") for one in proof.findings)
+        yield from (f"collector: {finding}".replace(f"{folder}/", "") for finding in proof.findings)
 
 
 class InProcess(Verifier):

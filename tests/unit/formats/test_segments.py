@@ -55,17 +55,17 @@ def written(path: Path, number: int) -> bytes:
 
 
 def test_a_segment_is_proven_with_the_key_alone(segments: list[bytes], public: bytes) -> None:
-    read = [SegmentReader(io.BytesIO(one), (public,), _LARGEST) for one in segments]
+    read = [SegmentReader(io.BytesIO(segment), (public,), _LARGEST) for segment in segments]
     found = [[columns.sequence for columns in one] for one in read]
     summaries = [one.summary() for one in read]
     assert [one for part in found for one in part] == list(range(1, summaries[-1].last + 1))
     assert summaries[0].header.begin is None
     assert [one.header.begin for one in summaries[1:]] == [one.header.end for one in summaries[:-1]]
-    assert len({one.name for one in summaries}) == 3
+    assert len({summary.name for summary in summaries}) == 3
 
 
 def test_its_records_are_the_lines_of_an_export(segments: list[bytes], path: Path) -> None:
-    lines = [line for one in segments for line in one.decode("ascii").splitlines()[1:]]
+    lines = [line for segment in segments for line in segment.decode("ascii").splitlines()[1:]]
     exported = [evidence_line(entry, chain) for entry, chain in evidence(path, Filter())]
     assert lines == exported[: len(lines)]
 
@@ -83,7 +83,7 @@ def test_a_large_segment_is_refused_early(segments: list[bytes], public: bytes) 
 
 
 def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: Path, public: bytes) -> None:
-    second, third = (SegmentReader(io.BytesIO(one), (public,), _LARGEST) for one in segments[1:])
+    second, third = (SegmentReader(io.BytesIO(segment), (public,), _LARGEST) for segment in segments[1:])
     second.summary()
     removed = second.header.end
     header = SegmentHeader(

@@ -72,9 +72,9 @@ def text_of(written: dict[str, dict[str, str]]) -> str:
 
 def held(world: ControlParts) -> set[Row]:
     return {
-        (str(node.host), node.name, WORDS[each.kind], each.resource)
+        (str(node.host), node.name, WORDS[registration.kind], registration.resource)
         for node in world.registry.all()
-        for each in node.registrations.values()
+        for registration in node.registrations.values()
     } | {
         (row.host, row.caller_id, "subscription" if row.kind == "topic" else "call", row.resource)
         for row in world.grants.all()

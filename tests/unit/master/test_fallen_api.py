@@ -58,7 +58,7 @@ class World:
 
     @property
     def refusals(self) -> list[dict[str, Any]]:
-        return [one for one in self.trail.rows if one["event"] == "order refused"]
+        return [row for row in self.trail.rows if row["event"] == "order refused"]
 
 
 class Api:
@@ -135,7 +135,7 @@ async def test_public_data_of_a_token_opens_nothing(world: World) -> None:
             assert (answer.ok, answer.trouble) == (False, "forbidden")
     assert world.done == []
     assert len(world.refusals) == len(guesses) * 4
-    assert {one["decision"] for one in world.refusals} == {"deny"}
+    assert {refusal["decision"] for refusal in world.refusals} == {"deny"}
 
 
 async def test_a_signed_order_is_carried_out_unchanged(world: World, token: str, api: Api) -> None:
@@ -166,7 +166,7 @@ async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
     for old in (seen, kept_back):
         assert "has not issued this challenge since it started" in (await api.ask(order, shown, old)).error
     assert len(world.done) == 1
-    assert [one["who"] for one in world.refusals] == ["alice"] * 4
+    assert [refusal["who"] for refusal in world.refusals] == ["alice"] * 4
 
 
 @pytest.mark.parametrize(
@@ -206,8 +206,8 @@ async def test_another_order_under_a_valid_proof_is_an_alarm(
     assert (await api.ask(order, token, bare)).trouble == "forbidden"
     assert (await api.ask(order, token, None)).trouble == "forbidden"
     assert world.done == []
-    assert [one["severity"] for one in world.refusals] == [Severity.ALARM] * 3
-    assert {one["verb"] for one in world.refusals} == {admin.verb_of(order)}
+    assert [refusal["severity"] for refusal in world.refusals] == [Severity.ALARM] * 3
+    assert {refusal["verb"] for refusal in world.refusals} == {admin.verb_of(order)}
 
 
 async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
@@ -219,7 +219,7 @@ async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
     assert "another request was signed" in (await api.ask(order, reading_key(alice), by_bob)).error
     assert "this is for admins" in (await api.ask(order, reading_key(bob), by_bob)).error
     assert world.done == []
-    assert [one["who"] for one in world.refusals] == ["alice", "bob"]
+    assert [refusal["who"] for refusal in world.refusals] == ["alice", "bob"]
 
 
 async def test_orders_of_a_revoked_token_are_refused(world: World, token: str, api: Api) -> None:

@@ -18,7 +18,7 @@ class Desk:
 
     def said(self) -> list[dict[str, object]]:
         fields = [read_fields(DEFINITIONS, "rosgraph_msgs/Log", one.data) for one in self.sent]
-        return [one for one in fields if one is not None]
+        return [field for field in fields if field is not None]
 
 
 def test_a_line_is_a_log_message() -> None:

@@ -91,8 +91,8 @@ def test_a_blocked_host_and_a_group_without_a_claim_are_not_asked_for() -> None:
 def test_every_reader_of_a_policy_knows_ask() -> None:
     asked, plain = policy(), policy(TEXT.replace("ask agent-1", "agent-1"))
     cases = "cases: [{host: 10.0.0.7, node: /it, ask: [publish /cmd_vel], deny: [call /other]}]"
-    assert [one.passed for one in run_cases(asked, cases, "cases")] == [True, True]
-    assert [one.passed for one in run_cases(plain, cases, "cases")] == [True, False]
+    assert [case.passed for case in run_cases(asked, cases, "cases")] == [True, True]
+    assert [case.passed for case in run_cases(plain, cases, "cases")] == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -109,4 +109,4 @@ def test_every_reader_of_a_policy_knows_ask() -> None:
 def test_ask_elsewhere_is_an_error(text: str, fault: str) -> None:
     with pytest.raises(PolicyError) as caught:
         compile_policy(text, file="site.ini")
-    assert any(fault in one.text for one in caught.value.findings)
+    assert any(fault in finding.text for finding in caught.value.findings)

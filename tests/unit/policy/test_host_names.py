@@ -69,6 +69,6 @@ def test_an_address_has_the_narrowest_label() -> None:
         "192.0.2.1",
         "local",
     )
-    assert [label_of(one, labels) for one in addresses] == [
+    assert [label_of(address, labels) for address in addresses] == [
         "tablet", "guests", "laptop", "robot", "tablet", "door:alice", "", "",
     ]  # fmt: skip

@@ -69,7 +69,7 @@ def test_the_most_specific_key_decides_alone() -> None:
 def test_a_mistake_is_reported_with_its_place(line: str, place: str, text: str) -> None:
     with pytest.raises(PolicyError) as refused:
         policy(line)
-    found = [str(one) for one in refused.value.findings]
+    found = [str(finding) for finding in refused.value.findings]
     assert any(
         one.startswith(f"p.ini:{place}: error: ") and text.replace("'", '"') in one for one in found
     ), found
@@ -81,8 +81,8 @@ def test_the_number_of_limits_is_bounded() -> None:
 
 
 def test_a_default_that_never_limits_is_a_warning() -> None:
-    warnings = [str(one) for one in policy("/** = topic 1 Hz", "default = topic 2 Hz").warnings]
-    assert [one for one in warnings if "group" not in one and "there is no" not in one] == [
+    warnings = [str(warning) for warning in policy("/** = topic 1 Hz", "default = topic 2 Hz").warnings]
+    assert [warning for warning in warnings if "group" not in warning and "there is no" not in warning] == [
         "p.ini:14:1: warning: never limits: /** at line 13 matches every name before it"
     ]
 

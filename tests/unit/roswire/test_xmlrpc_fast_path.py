@@ -38,7 +38,7 @@ def dumped(values: list[Value], method: str | None) -> bytes:
 
 
 def parts(*params: list[Value]) -> list[Value]:
-    return [[{"methodName": "setParam", "params": one} for one in params]]
+    return [[{"methodName": "setParam", "params": param} for param in params]]
 
 
 LIST = b"<value><array><data></data></array></value>"

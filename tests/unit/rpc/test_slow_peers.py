@@ -42,7 +42,7 @@ async def test_slowloris(beginning: bytes) -> None:
         await client.ended()
         assert clock.now() - begun < WAIT
         dripping.cancel()
-        assert [("did not finish" in one) for one in server.troubles] == ([True] if beginning else [])
+        assert [("did not finish" in trouble) for trouble in server.troubles] == ([True] if beginning else [])
 
 
 async def test_stalled_body() -> None:

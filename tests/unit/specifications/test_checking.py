@@ -52,7 +52,7 @@ def test_without_lints_only_the_warnings_are_missing(text: str) -> None:
     files, definitions = {"a.rv": text}, read_folder(MONITORS).definitions
     found = contents(files, definitions)
     assert contents_at_start(files, definitions, lints=False) == msgspec.structs.replace(found, warnings=())
-    assert any("NaN passes" in one for one in found.warnings) or text != WARNED
+    assert any("NaN passes" in warning for warning in found.warnings) or text != WARNED
 
 
 def test_errors_are_found_without_lints() -> None:
@@ -99,7 +99,7 @@ def test_an_invalid_module_is_an_error_of_its_specification(monkeypatch: pytest.
 
 def rejecting(name: str) -> Callable[[Compiled, object], int]:
     def check_steps(compiled: Compiled, _module: object) -> int:
-        if any(one.name == name for one in compiled.specifications):
+        if any(specification.name == name for specification in compiled.specifications):
             raise WasmError("type mismatch")
         return 0
 

@@ -30,7 +30,7 @@ async def loaded(desk: Desk, **given: Any) -> SpecificationManager:
 
 
 def values(monitors: SpecificationManager) -> dict[str, object]:
-    return {one.name: one.value for one in monitors.givens.states(monitors.checked, "cap")}
+    return {state.name: state.value for state in monitors.givens.states(monitors.checked, "cap")}
 
 
 def stated(monitors: SpecificationManager) -> dict[str, Any]:

@@ -352,7 +352,7 @@ async def test_a_load_or_removal_of_others_leaves_a_broken_file_as_the_start_lef
     order = admin.MonitorLoad({"b.rv": B})
     tried, loaded = await monitors.attempt(admin.MonitorTry(order), "eve"), await monitors.load(order, "eve")
     for answer in (tried, loaded, await monitors.remove(admin.MonitorRemove(["b"]), "eve")):
-        named = [one.file for one in answer.warnings if "does nothing" in one.text]
+        named = [warning.file for warning in answer.warnings if "does nothing" in warning.text]
         assert sorted(named) == ["bytes.rv", "code.rv", "text.rv"]
         assert idle() == (["code"], ["bytes.rv", "text.rv"])
     assert monitors.names() == ["a", "code"]
@@ -401,8 +401,8 @@ async def test_a_start_looks_for_warnings_beside_a_file_that_did_nothing(desk: D
     (desk.folder / "b.rv").write_text("nonsense")
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
-    assert any("does nothing" in one for one in monitors.checked.warnings)
-    assert ["NaN passes" in one for one in (await desk.monitors()).checked.warnings] == [True]
+    assert any("does nothing" in warning for warning in monitors.checked.warnings)
+    assert ["NaN passes" in warning for warning in (await desk.monitors()).checked.warnings] == [True]
 
 
 async def test_an_unconfirmed_change_goes_back_to_the_warnings_of_the_load(desk: Desk) -> None:

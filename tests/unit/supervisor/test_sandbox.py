@@ -102,7 +102,7 @@ def test_a_program_includes_its_dynamic_linker(tmp_path: Path) -> None:
     link.symlink_to("/usr/bin/python3")
     first, *loaders = executables_of(link)
     assert first == str(Path("/usr/bin/python3").resolve())
-    assert all("ld-linux" in one for one in loaders)
+    assert all("ld-linux" in loader for loader in loaders)
     assert loaders
     sandbox = with_system_files(SandboxPlan(), "/s/relay", "/s/run")
     assert "/s/run" in sandbox.reads

@@ -96,7 +96,7 @@ def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, 
     going += ["-d %s %s" % (settings.fixed, reset), "-d %s -j DROP" % settings.fixed]
     peers = [settings.appliances[name].address for name in names]
     peers += [settings.followers[name].address for name in sorted(settings.followers)]
-    requests = ["-s %s -j RETURN" % one for one in peers]
+    requests = ["-s %s -j RETURN" % peer for peer in peers]
     requests.append("-p udp --dport %d -j DROP" % settings.listen[1])
     chains = {
         "in": [

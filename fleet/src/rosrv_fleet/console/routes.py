@@ -117,7 +117,7 @@ def _shown(found: FleetPage, asked: Mapping[str, str], bundles: Sequence[StoredE
 
 def _record(record: dict[str, Any], bundles: Sequence[StoredEvidence]) -> str:
     decision = str(record.get("decision") or "")
-    covering = next((one.id for one in bundles if one.has(record)), None)
+    covering = next((bundle.id for bundle in bundles if bundle.has(record)), None)
     words = (record["event"], record["host"], record["caller_id"], record["resource"], record["reason"])
     return row(
         _SEARCH_COLUMNS,
@@ -265,7 +265,7 @@ def _filter(rows: Sequence[RobotRow], asked: Mapping[str, str]) -> str:
     return (
         '<form class="filter" action="/" role="search" aria-label="Robots">'
         + field("name", asked["name"])
-        + choice("group", "group", [("", "any"), *((one, one) for one in groups)], asked["group"])
+        + choice("group", "group", [("", "any"), *((group, group) for group in groups)], asked["group"])
         + choice("state", "state", words, asked["state"])
         + "<button>Show</button></form>"
     )

@@ -58,7 +58,7 @@ class _RobotVerifier(Verifier):
     def read_key(self, _key: Path | None) -> str:
         key = load_pem_public_key(self.read("audit.pub"))
         raw = key.public_bytes_raw().hex() if isinstance(key, Ed25519PublicKey) else "of another kind"
-        if raw not in {one.key for one in self._robot.appliances.values()}:
+        if raw not in {appliance.key for appliance in self._robot.appliances.values()}:
             raise _OtherKeyError(raw)
         return raw
 

@@ -58,8 +58,8 @@ def appliance(lab: Lab) -> Iterator[Appliance]:
 def agent(robot: Host, *frames: dict[str, Any], answer: str) -> dict[str, Any]:
     def work() -> dict[str, Any]:
         with connect(AGENT) as client:
-            for one in frames:
-                client.send(json.dumps(one))
+            for frame in frames:
+                client.send(json.dumps(frame))
             while True:
                 found: dict[str, Any] = json.loads(client.recv(20.0))
                 if found["op"] == answer:

@@ -41,7 +41,7 @@ def guards(appliance: Appliance) -> list[str]:
 def outcome_in_log(appliance: Appliance, outcome: str) -> dict[str, Any]:
     def found() -> list[dict[str, Any]]:
         details = [one["detail"] for one in appliance.audit("--event", "driver checked")]
-        return [one for one in details if one["outcome"] == outcome]
+        return [detail for detail in details if detail["outcome"] == outcome]
 
     return eventually(found, f"a check with the outcome {outcome}")[-1]
 

@@ -314,7 +314,7 @@ def test_delays_are_counted_over_a_restart_of_a_relay(beating: Beating) -> None:
     """A relay that was stopped is late, which is an alarm; a new relay process counts on."""
 
     def times() -> GuardTimes:
-        rows = {one.name: one.times for one in beating.appliance.ask(GuardsWanted()).guards}
+        rows = {guard.name: guard.times for guard in beating.appliance.ask(GuardsWanted()).guards}
         assert rows["deadman"] is not None
         return rows["deadman"]
 
@@ -326,7 +326,7 @@ def test_delays_are_counted_over_a_restart_of_a_relay(beating: Beating) -> None:
         threading.Event().wait(0.2)
     eventually(lambda: times().late > before.late, "the delay is counted")
     assert times().latest >= times().limit
-    assert any(one["kind"] == "guard-late:deadman" for one in beating.appliance.rows("alarm", "list"))
+    assert any(row["kind"] == "guard-late:deadman" for row in beating.appliance.rows("alarm", "list"))
     late, timed = times().late, times().timed
     killed = beating.appliance.kill("relay")
     eventually(lambda: killed not in beating.appliance.pids("relay"), "another relay runs")

@@ -18,7 +18,7 @@ ACTS = {"deadman": "stopped", "estop": "stopped", "limit": "limited"}
 
 
 def guards(appliance: Appliance) -> dict[str, Any]:
-    return {one["guard"]: one for one in appliance.rows("guard", "list") if "guard" in one}
+    return {row["guard"]: row for row in appliance.rows("guard", "list") if "guard" in row}
 
 
 def values(appliance: Appliance, guard: str) -> dict[str, object]:
@@ -73,7 +73,7 @@ def test_copies_act_and_the_stop_reaches_the_driver_of_a_standing_robot(
             name: one["stops"] for name, one in states.items()
         }
         records = own_appliance.recorded(event="guard tested", count=3)
-        assert {one["detail"]["monitor"]: one["detail"]["digest"] for one in records} == {
+        assert {record["detail"]["monitor"]: record["detail"]["digest"] for record in records} == {
             name: one["digest"] for name, one in states.items()
         }
         teleop.stop()

@@ -99,9 +99,9 @@ def test_a_stop_has_its_cause_in_each_place(
 def moves(appliance: Appliance, *names: str) -> bool:
     rows = [guards(appliance)[name] for name in names]
     return all(
-        one["state"] == "free" and (one["last_stop"] or {"until": 0})["until"] is not None for one in rows
+        row["state"] == "free" and (row["last_stop"] or {"until": 0})["until"] is not None for row in rows
     )
 
 
 def guards(appliance: Appliance) -> dict[str, Any]:
-    return {one["guard"]: one for one in appliance.rows("guard", "list") if "guard" in one}
+    return {row["guard"]: row for row in appliance.rows("guard", "list") if "guard" in row}

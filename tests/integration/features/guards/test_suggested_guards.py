@@ -44,7 +44,7 @@ def test_the_guards_of_a_running_robot_are_proposed_and_can_be_pasted(
     own_appliance: Appliance, common_robot: Host, tmp_path: Path, robot: str
 ) -> None:
     appliance, reviewed = own_appliance, advice(graph_of(robot))
-    wanted = without_rates(one.command for one in reviewed.suggestions)
+    wanted = without_rates(suggestion.command for suggestion in reviewed.suggestions)
     with RosSession(appliance.master_uri, tmp_path, common_robot) as ros:
         start(ros, robot)
 

@@ -169,7 +169,7 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     replayed = appliance.rosrv("monitor", "replay", "censor", "--since", "1h", "--json").stdout
     found = [json.loads(line) for line in replayed.splitlines()]
     drops = [one for one in found if one["kind"] == "drop"]
-    assert len([one for one in drops if one["bag"] == row["id"]]) == len(said(ros, bag, "/rude"))
+    assert len([drop for drop in drops if drop["bag"] == row["id"]]) == len(said(ros, bag, "/rude"))
     assert found[0]["kind"] == "gap"
     assert found[0]["until"] == pytest.approx(row["began"] / 10**9, abs=1e-6)  # a gap has microseconds
     table = appliance.rosrv("monitor", "replay", "censor", "--since", "1h").stdout.splitlines()

@@ -50,7 +50,7 @@ def test_a_message_really_goes_through(appliance: Appliance) -> None:
         state = str(master.getSystemState("/looker"))
     assert "selftest" not in state
     records = appliance.recorded("--caller", "/rosrv_selftest_publisher", "--category", "publish")
-    assert {one["resource"] for one in records} == {"/rosrv_selftest"}
+    assert {record["resource"] for record in records} == {"/rosrv_selftest"}
 
 
 def test_a_strict_policy_is_not_a_failure(appliance: Appliance) -> None:

@@ -49,10 +49,10 @@ def test_every_record_arrives_and_verifies(
     collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
     came = collector.sequences()
     assert came == sorted(set(came))
-    collector.wait_for(lambda messages: any(one.event == "checkpoint-signed" for one in messages))
+    collector.wait_for(lambda messages: any(message.event == "checkpoint-signed" for message in messages))
     kept = tmp_path / "receiver.ndjson"
-    checkpoints = [one for one in collector.messages if one.event == "checkpoint-signed"]
-    kept.write_text("".join(json.dumps(one.fields) + "\n" for one in checkpoints))
+    checkpoints = [message for message in collector.messages if message.event == "checkpoint-signed"]
+    kept.write_text("".join(json.dumps(checkpoint.fields) + "\n" for checkpoint in checkpoints))
     assert "kept elsewhere agree" in appliance.rosrv("audit", "verify", "--checkpoints", str(kept)).stdout
     status = forwarding_status(appliance)
     assert status["trouble"] == ""

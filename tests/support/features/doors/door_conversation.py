@@ -285,8 +285,8 @@ class DoorConversation:
     # --- the master ---
 
     async def _answered(self, call: MethodCall) -> Value:
-        method, (caller, *params) = call.method, [str(one) for one in call.params]
-        name = next((one for one in params if one.startswith("/")), "")
+        method, (caller, *params) = call.method, [str(param) for param in call.params]
+        name = next((param for param in params if param.startswith("/")), "")
         if caller.startswith(self._world.node.name) and re.match(
             r"(un)?(register|subscribe)|(set|delete)Param", method
         ):

@@ -227,7 +227,7 @@ class GuardedRobot:
 
     def resume(self) -> None:
         """Resume the guards that hold the guarded topic until an operator does so."""
-        if held := [one.name for one in self.ask(admin.MonitorsWanted()).monitors if one.held]:
+        if held := [monitor.name for monitor in self.ask(admin.MonitorsWanted()).monitors if monitor.held]:
             self.ask(admin.MonitorResume(held))
 
     def talker(self, name: str, sender: str) -> Process:
@@ -276,7 +276,7 @@ class GuardedRobot:
         """Return the faults of monitors, but for those that bytes cause that are not a message."""
         reasons = [one["reason"] for one in self.appliance.audit(event="monitor fault")]
         self.appliance.ignore_earlier_records()
-        return [one for one in reasons if "the bytes are not a message" not in one]
+        return [reason for reason in reasons if "the bytes are not a message" not in reason]
 
     def judged(self) -> bool:
         """Return whether each guard is in force and has got messages since its relay started."""
@@ -382,7 +382,7 @@ def another_node(robot: GuardedRobot) -> None:
         robot.ros.processes.remove(guest)
     robot.forgotten += 1
     for name, preset in robot.presets.items():
-        if "forget" in {one.name for one in preset.parameters}:
+        if "forget" in {parameter.name for parameter in preset.parameters}:
             robot.ask(GuardSet(name, {"forget": str(robot.forgotten)}))
         elif preset.name in WAIT:
             load(robot)

@@ -84,7 +84,7 @@ def named(preset: str) -> Preset:
 
 @functools.cache
 def _loaded_values(preset: str) -> frozenset[str]:
-    return frozenset(each.name for each in named(preset).parameters if each.loads)
+    return frozenset(parameter.name for parameter in named(preset).parameters if parameter.loads)
 
 
 @functools.cache

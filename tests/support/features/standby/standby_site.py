@@ -229,7 +229,7 @@ class StandbySite:
 
     def story(self) -> str:
         witness_said = "\n".join(self.witness.errors) if self.witness is not None else ""
-        return "\n".join([witness_said, *(one.story() for one in self.appliances.values())])
+        return "\n".join([witness_said, *(appliance.story() for appliance in self.appliances.values())])
 
     def ros(self) -> RosSession:
         return RosSession(MASTER, self.home, self.robot)
@@ -238,8 +238,8 @@ class StandbySite:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for one in self.appliances.values():
-            one.close()
+        for appliance in self.appliances.values():
+            appliance.close()
         for process in (self.witness, self._follower):
             if process is not None:
                 process.stop()

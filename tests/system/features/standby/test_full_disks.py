@@ -33,11 +33,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
         StandbySite(lab, home, lease_folder=disk) as made,
         ExitStack() as disks,
     ):
-        for one in made.appliances.values():
-            member = load_membership(path_of(one.state))
+        for appliance in made.appliances.values():
+            member = load_membership(path_of(appliance.state))
             assert member is not None
-            disks.enter_context(small_disk(one.state, "200m", "mode=0711"))
-            save_membership(path_of(one.state), member)
+            disks.enter_context(small_disk(appliance.state, "200m", "mode=0711"))
+            save_membership(path_of(appliance.state), member)
         made.start_witness()
         made.start("a")
         made.until_active("a")
@@ -165,8 +165,8 @@ def refuse(site: StandbySite, words: str) -> None:
             return done.returncode == 1 and words in " ".join(done.stdout.split())
 
         eventually(reports, site.story)
-    for one in site.appliances.values():
-        done = one.rosrv("standby", "switch", check=False)
+    for appliance in site.appliances.values():
+        done = appliance.rosrv("standby", "switch", check=False)
         assert (done.returncode, words in done.stderr) == (1, True), done
     assert site.lease.read().epoch == epoch
 

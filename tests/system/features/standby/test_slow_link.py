@@ -23,8 +23,8 @@ def test_a_standby_that_lacks_changes_is_reported_by_both_and_refuses_the_order(
         eventually(lambda: site.in_sync() == {active}, site.story)
         for one in site.appliances.values():
             eventually(lambda one=one: LACKS in fails(one), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
-        for one in site.appliances.values():
-            done = one.rosrv("standby", "switch", check=False)
+        for appliance in site.appliances.values():
+            done = appliance.rosrv("standby", "switch", check=False)
             assert (done.returncode, LACKS in done.stderr) == (1, True), done
         assert site.in_sync() == {active}
     site.until_both_in_sync()

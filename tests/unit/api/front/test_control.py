@@ -131,7 +131,7 @@ async def test_an_order_is_withdrawn_when_its_client_disconnects(link: ControlLi
 async def test_open_questions_are_bounded(link: ControlLink, there: Control) -> None:
     asked = [asyncio.create_task(link.ask(StatusWanted(), bearer("w"), seconds=1)) for _ in range(200)]
     answers = await asyncio.gather(*asked, return_exceptions=True)
-    assert all(isinstance(one, ControlAwayError) for one in answers)
+    assert all(isinstance(answer, ControlAwayError) for answer in answers)
     assert len(there.heard) == 48
 
 

@@ -29,9 +29,9 @@ class Probed:
         self.control.attach(HeldChannel())
         self.control.known = True
         (self._ready,) = [
-            one.endpoint  # type: ignore[attr-defined]  # it is a route with one
-            for one in routes(self.control, self.history).routes
-            if one.path == "/readyz"  # type: ignore[attr-defined]  # and a path
+            route.endpoint  # type: ignore[attr-defined]  # it is a route with one
+            for route in routes(self.control, self.history).routes
+            if route.path == "/readyz"  # type: ignore[attr-defined]  # and a path
         ]
 
     async def _measures(self) -> Measures:

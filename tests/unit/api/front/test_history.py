@@ -79,7 +79,7 @@ async def test_samples_stay_in_order_when_the_clock_is_set_back() -> None:
     with using(machine):
         async with sampling(measures) as samples:
             await until(samples, len(times))
-    assert [one.time for one in samples.samples(1000) if one.time != 1020.0] == [1005.0, 1015.0]
+    assert [sample.time for sample in samples.samples(1000) if sample.time != 1020.0] == [1005.0, 1015.0]
 
 
 async def test_without_control_followers_get_the_reason() -> None:

@@ -59,7 +59,7 @@ def posted(app: FastAPI, sent: Any) -> httpx.Response:
 def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) -> None:
     answer = posted(app, sent)
     assert answer.status_code == 422
-    assert [one["where"] for one in answer.json()["errors"]] == places
+    assert [error["where"] for error in answer.json()["errors"]] == places
     assert posted(app, {"name": "xy", "count": 1}).text == "xy"
 
 

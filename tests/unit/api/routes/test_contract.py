@@ -131,7 +131,7 @@ def test_every_operation_has_a_summary_its_token_and_problems(contract: dict[str
     }
     own = {name for name in BY_HAND[None] if " /v1/openapi." in name}
     assert {name for name, one in operations.items() if "security" not in one} == BY_HAND[None] - own
-    assert len({one["operationId"] for one in operations.values()}) == len(operations)
+    assert len({operation["operationId"] for operation in operations.values()}) == len(operations)
     for name, one in operations.items():
         assert one["summary"] and one["description"], name
         for status, response in one["responses"].items():
@@ -184,7 +184,7 @@ def test_every_operation_has_examples(contract: dict[str, Any]) -> None:
     }
     missing = [line for name, one in operations.items() for line in _unexemplified(name, one, kinds)]
     assert not missing, "\n".join([f"add an example to {EXAMPLE_FILE}:", *missing])
-    assert set(EXAMPLES) <= {*kinds, *(one["operationId"] for one in operations.values())}
+    assert set(EXAMPLES) <= {*kinds, *(operation["operationId"] for operation in operations.values())}
     assert len(operations) > 60
 
 

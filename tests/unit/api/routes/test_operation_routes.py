@@ -265,7 +265,7 @@ def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operatio
             changes = operation.is_change and not dry and not expected[1]
             assert [who for _order, who in world().carried.orders] == [f"a-{role}"] * changes, case
             if role is None:  # the journal folds equal calls without a token
-                assert {one["decision"] for one in world().trail.rows} <= {"deny"}
+                assert {row["decision"] for row in world().trail.rows} <= {"deny"}
             elif operation.is_change:
                 [record] = world().trail.rows
                 denied = bool(expected[1]) and (expected[0] in (401, 403) or not dry)
@@ -510,8 +510,8 @@ def test_routes_written_by_hand_are_for_these_roles() -> None:
 def roles_of(dependant: Any) -> Iterator[str | None]:
     if dependant is not None:
         yield getattr(dependant.call, "least", None)
-        for one in dependant.dependencies:
-            yield from roles_of(one)
+        for dependency in dependant.dependencies:
+            yield from roles_of(dependency)
 
 
 def test_a_role_is_judged_before_the_request() -> None:

@@ -61,7 +61,7 @@ def test_a_dry_run_lists_everything_that_a_load_would_end(world: RestWorld) -> N
     without_cases(world)
     report = world.asked("POST", "/v1/policy?dry_run=1", NOTHING).json()
     assert (report["loaded"], report["revision"], report["revoked"]) == (False, 7, None)
-    assert {(one["what"], one["resource"]) for one in report["ends"]} == {
+    assert {(end["what"], end["resource"]) for end in report["ends"]} == {
         (what, name) for _call, name, what in GRANTS
     }
     [change] = [one for one in report["changes"] if one["category"] == "publish"]

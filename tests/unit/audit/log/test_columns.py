@@ -74,7 +74,7 @@ def test_texts_are_bounded_and_storable(field: str) -> None:
 )  # fmt: skip
 def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
     columns = to_columns(make(**fields), 1)
-    assert all(type(one) in (str, int, bytes, type(None)) for one in columns)
+    assert all(type(column) in (str, int, bytes, type(None)) for column in columns)
     assert abs(columns.time) < 1 << 63
     assert from_columns(columns).id == "0" * 20
 

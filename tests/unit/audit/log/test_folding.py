@@ -248,8 +248,8 @@ def test_denials_of_different_parameters_are_separate() -> None:
         denial(resource="getParam", detail={"call": "getParam", "key": "/b"}),
         denial(resource="getParam", detail={"call": "hasParam", "key": "/b"}),
     ]
-    assert [list(folder.offer(one, 0.0)) for one in kinds] == [[one] for one in kinds]
-    assert [list(folder.offer(one, 0.0)) for one in kinds] == [[], [], []]
+    assert [list(folder.offer(kind, 0.0)) for kind in kinds] == [[kind] for kind in kinds]
+    assert [list(folder.offer(kind, 0.0)) for kind in kinds] == [[], [], []]
 
 
 def test_a_reported_count_is_added() -> None:

@@ -424,8 +424,8 @@ def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
     assert tried_again(log) is None
     assert log.close() is None
     denials = [entry.record for entry in export(path, Filter(decision=("deny",)))]
-    counted = sum(one.detail["count"] for one in denials if one.event == "denials folded")
-    assert counted + sum(one.event == "decision" for one in denials) == 51
+    counted = sum(denial.detail["count"] for denial in denials if denial.event == "denials folded")
+    assert counted + sum(denial.event == "decision" for denial in denials) == 51
     assert verify(path).ok
 
 

@@ -55,7 +55,7 @@ def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: P
     log.close()
     assert path.stat().st_size < before / 2
     reports = [entry.record for entry in export(path, Filter(event="records removed"))]
-    removed = sum(one.detail["count"] for one in reports)
+    removed = sum(report.detail["count"] for report in reports)
     kept = list(export(path, Filter()))
     assert removed >= 1900
     assert kept[0].sequence == removed + 1
@@ -230,7 +230,7 @@ def test_removal_beyond_retention_is_found(make_log: MakeLog, path: Path, notary
         attacker.execute("DELETE FROM record WHERE sequence <= ?", (first,))
         attacker.commit()
     assert (FindingKind.MISSING, first, first) in {
-        (one.kind, one.first, one.last) for one in verify(path).findings
+        (finding.kind, finding.first, finding.last) for finding in verify(path).findings
     }
 
 

@@ -98,7 +98,7 @@ def test_a_start_is_written_in_few_records(robot: Robot) -> None:
     robot.start("")
     let_pass(robot.log, 30)
     reads = [one for one in robot.written if str(one.detail.get("call")) == "getParam"]
-    own = [one for one in reads if one.detail.get("key") != "/use_sim_time"]
+    own = [read for read in reads if read.detail.get("key") != "/use_sim_time"]
     assert (len(own), len(reads)) == (2 * NODES, 3 * NODES)
     listed = {name for one in own for name in one.detail.get("parameters", {one.detail.get("key"): 1})}
     assert listed == {f"/node_{node}/gain_{one}" for node in range(NODES) for one in range(PARAMETERS)}

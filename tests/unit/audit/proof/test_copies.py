@@ -39,7 +39,7 @@ def log(make_log: MakeLog, path: Path) -> Path:
 
 def kinds(result: Verification) -> set[FindingKind]:
     assert result.ok == (not result.findings)
-    return {one.kind for one in result.findings}
+    return {finding.kind for finding in result.findings}
 
 
 def test_an_unchanged_log_agrees(log: Path) -> None:
@@ -88,7 +88,7 @@ def test_an_end_removed_by_root_is_found(log: Path, key: Ed25519PrivateKey, tmp_
         connection.execute("DELETE FROM checkpoint WHERE sequence > 90")
         connection.commit()
     result = verify(log, copies=copies)
-    cut = [one for one in result.findings if one.kind is FindingKind.TRUNCATED]
+    cut = [finding for finding in result.findings if finding.kind is FindingKind.TRUNCATED]
     assert [(one.first, one.last) for one in cut] == [(91, copies[1].sequence)]
 
 

@@ -28,7 +28,7 @@ OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
 
 
 def kinds(result: Verification) -> set[FindingKind]:
-    return {one.kind for one in result.findings}
+    return {finding.kind for finding in result.findings}
 
 
 def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:

@@ -64,7 +64,7 @@ def attack(path: Path, *statements: str) -> None:
 def found(path: Path, **arguments: Any) -> list[tuple[FindingKind, int, int]]:
     result = verify(path, **arguments)
     assert result.ok == (not result.findings)
-    return [(one.kind, one.first, one.last) for one in result.findings]
+    return [(finding.kind, finding.first, finding.last) for finding in result.findings]
 
 
 @pytest.mark.parametrize(("moment", "signed"), [("_log_id", True), ("_Verifier", False)])
@@ -178,7 +178,7 @@ def test_rewritten_chain(log: Path) -> None:
     rewrite(log, 60)
     result = verify(log)
     assert not result.ok
-    assert {one.kind for one in result.findings} == {FindingKind.CHECKPOINT_CHANGED}
+    assert {finding.kind for finding in result.findings} == {FindingKind.CHECKPOINT_CHANGED}
 
 
 def test_rewritten_chain_and_checkpoints(log: Path) -> None:
@@ -331,7 +331,7 @@ def test_each_changed_byte_is_found_or_harmless(log: Path) -> None:
         if result.ok:
             assert content(log) == before, f"byte {position} of {len(data)}"
         else:
-            assert all(one.message for one in result.findings)
+            assert all(finding.message for finding in result.findings)
             found_out += 1
     log.write_bytes(data)
     assert verify(log).ok
@@ -478,7 +478,7 @@ def test_findings_are_limited(log: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("appliance.audit.proof.verification._MAX_FINDINGS", 10)
     attack(log, "DELETE FROM record WHERE sequence % 5 = 0 AND sequence <= 150")
     result = verify(log)
-    removed = [one for one in result.findings if one.kind is FindingKind.MISSING]
+    removed = [finding for finding in result.findings if finding.kind is FindingKind.MISSING]
     assert [(one.first, one.last) for one in removed[:10]] == [(5 * n, 5 * n) for n in range(1, 11)]
     assert result.findings[-1].message == "records 55 to 150: 20 further findings, not told one by one"
 
@@ -495,7 +495,7 @@ def test_a_forged_log_does_not_keep_verification_busy(log: Path, monkeypatch: py
     attack(log, "UPDATE record SET hash = randomblob(32)")
     result = verify(log)
     assert len(searched) == 3
-    assert [one.kind for one in result.findings].count(
+    assert [finding.kind for finding in result.findings].count(
         FindingKind.CHANGED
     ) == 4  # the last one is the number of others
     assert "further findings" in result.findings[-1].message

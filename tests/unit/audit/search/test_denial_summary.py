@@ -59,7 +59,7 @@ def test_the_host_with_the_most_denials_is_first() -> None:
     second, first = found.hosts
     assert (second.host, second.count, first.host, first.count) == ("10.0.0.2", 7, "10.0.0.1", 1)
     assert (second.first, second.last) == (rfc3339(BEGIN + 2 * _SECOND), rfc3339(BEGIN + 8 * _SECOND))
-    assert {(one.name, one.count) for one in second.reasons} == {
+    assert {(reason.name, reason.count) for reason in second.reasons} == {
         ("[Publishers] /cmd_* robot.ini:12", 2), ("value 8 is wrong", 2), ("third", 2),
     }  # fmt: skip
     assert second.callers == [CountedName("/a", 6), CountedName("/b", 1)]
@@ -75,7 +75,7 @@ def test_decisions_come_before_the_noise_of_a_port_scan(monkeypatch: pytest.Monk
     folded_noise = folded(KIND, "10.0.0.1", 99, of="malformed", reasons={"x is not HTTP": 99})
     calls = folded(KIND, "10.0.0.1", 3, of="decision", reasons={"no rule for /arm": 3})
     [row] = of(denial(1, rule=RULE), calls, *noise, folded_noise).hosts
-    assert [(one.name, one.count) for one in row.reasons] == [
+    assert [(reason.name, reason.count) for reason in row.reasons] == [
         ("no rule for /arm", 3),
         ("[Publishers] /cmd_* robot.ini:12", 1),
         ("x is not HTTP", 99),

@@ -160,7 +160,7 @@ def test_connections_of_a_wildcard_displace_no_named_host(everybodys: ListenerLi
     ]
     assert sum(not one.refused for one in crowd) == connection_table.connected.bounds.unknown
     robots += [Opened(connection_table, host) for host in (ROBOT, REGISTERED)]
-    assert not any(one.refused or one.cut for one in robots)
+    assert not any(robot.refused or robot.cut for robot in robots)
 
 
 ROBOT, REGISTERED = address_of("10.0.0.1"), address_of("10.9.0.7")

@@ -145,7 +145,7 @@ async def test_a_reload_of_an_unchanged_policy_deprives_no_host(tmp_path: Path, 
     }
     with appliance.started(live=lambda: live, **given) as policies:
         loaded = await policies.reload(PolicyReload(), "operator")
-        assert [one for one in loaded.warnings if "loses" in one] == []
+        assert [warning for warning in loaded.warnings if "loses" in warning] == []
         appliance.file.write_text(OPEN.replace("[Publishers]\n", "[Publishers]\n/cmd_vel =\n"))
         loaded = await policies.reload(PolicyReload(), "operator")
         had = kind in ("approval", "holder")
@@ -511,7 +511,7 @@ async def test_rights_end_and_begin_with_a_record_each_and_a_reload_begins_an_en
     set_wall(datetime(2026, 12, 1, 21, 59, 50, tzinfo=UTC).timestamp())
 
     def told() -> list[str]:
-        found = [one.reason for one in appliance.records.records if one.event == "rights changed"]
+        found = [record.reason for record in appliance.records.records if record.event == "rights changed"]
         appliance.records.clear()
         return found
 

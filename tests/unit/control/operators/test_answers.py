@@ -43,7 +43,7 @@ OPEN_OF_FEATURES = {("TopicMessage", "fields")}
 
 
 def kinds(base: type[Any]) -> set[type[Any]]:
-    below = [kinds(one) for one in base.__subclasses__()]
+    below = [kinds(subclass) for subclass in base.__subclasses__()]
     return set().union(*below) if below else {base}
 
 

@@ -163,7 +163,7 @@ async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None
     await tokens.revoke(TokenRevoke("alice"), "bob")
     assert tokens.usable() == []
     await lives.trail.durable()
-    assert [one["who"] for one in lives.records("token revoked")] == ["bob", "bob"]
+    assert [record["who"] for record in lives.records("token revoked")] == ["bob", "bob"]
 
 
 async def test_only_a_valid_token_can_be_rotated(lives: Lives) -> None:
@@ -286,7 +286,7 @@ async def _rotate_and_die(lives: Lives) -> None:
 
 
 async def uses(tokens: TokenOrders) -> dict[str, float | None]:
-    return {one.name: one.last_used for one in (await tokens.listed(TokenList())).tokens}
+    return {token.name: token.last_used for token in (await tokens.listed(TokenList())).tokens}
 
 
 async def test_the_last_use_survives_a_restart(lives: Lives) -> None:

@@ -223,7 +223,7 @@ async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api
     api.channel.send(RequestMade(8, StatusWanted(), VIEWER_TOKEN))
     api.channel.send(loading(9, "[Nodes]"))
     answers = (await api.until(7))[1:]
-    assert [answer_of(one).trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
+    assert [answer_of(answer).trouble for answer in answers] == ["forbidden"] * 4 + ["", ""]
     assert [who for _request, who in world.asked] == ["alice", "w"]
 
 

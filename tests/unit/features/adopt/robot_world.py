@@ -361,7 +361,7 @@ class RobotWorld:
             self.give_list(node, str(params[0]), _texts(params[1]))
         if method == "getBusInfo":
             rows = [
-                (topic, one) for topic, links in node.links.items() for one in links
+                (topic, link) for topic, links in node.links.items() for link in links
             ]  # also those that ended
             rows += [(topic, "http://earlier:1/") for topic, looks in node.reads_on.items() if looks]
             node.reads_on = {topic: max(0, looks - 1) for topic, looks in node.reads_on.items()}

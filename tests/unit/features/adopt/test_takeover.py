@@ -881,6 +881,6 @@ def test_a_second_taking_without_unknown_hosts_leaves_no_record() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()
         await taken_again(world)
-        assert "graph restored" not in {one.event for one in world.parts.records.records}
+        assert "graph restored" not in {record.event for record in world.parts.records.records}
 
     run(story)

@@ -285,7 +285,7 @@ async def test_approvals_are_as_promised_in_any_order(site: Site, seed: int) -> 
             for one in promised.held.values()
         }
         leases = {key[:3] for key, one in promised.held.items() if one.state == "lease"}
-        enforced = frozenset(one for one in leases if one[1] is not Category.CALL)
+        enforced = frozenset(lease for lease in leases if lease[1] is not Category.CALL)
         assert not promised.asks or site.policy.approved == enforced
         assert site.orders.limits()[0].used == len(shown)
         texts = [row["reason"] for row in site.trail.rows if row["event"].startswith("approval")]

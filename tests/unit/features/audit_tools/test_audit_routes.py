@@ -36,7 +36,7 @@ def test_pages_join_without_gap_or_repetition(world: RestWorld, order: str) -> N
     for _page in range(4):
         page = world.asked("GET", f"/v1/audit?resource=/page/*&limit=2&order={order}{cursor}").json()
         assert len(page["records"]) <= 2
-        seen += [one["resource"] for one in page["records"]]
+        seen += [record["resource"] for record in page["records"]]
         cursor = f"&cursor={page['cursor']}"
     assert page["cursor"] is None
     assert seen[:: -1 if order == "newest" else 1] == [f"/page/{number}" for number in range(7)]

@@ -89,9 +89,9 @@ class Site:
 
     def handed_over(self) -> list[str]:
         return [
-            f"{one['earlier']} -> {one['holder']}"
-            for one in self.trail.rows
-            if one["event"] == "authority handed over"
+            f"{row['earlier']} -> {row['holder']}"
+            for row in self.trail.rows
+            if row["event"] == "authority handed over"
         ]
 
     async def state(self) -> GroupState:
@@ -164,7 +164,7 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
     assert site.handed_over() == [
         f"nobody -> {PILOT}", f"{PILOT} -> {BOSS}", f"{BOSS} -> {SECOND}", f"{SECOND} -> {AGENT}", f"{AGENT} -> nobody",
     ]  # fmt: skip
-    assert [one["host"] for one in site.trail.rows if one["event"] == "authority refused"] == [
+    assert [row["host"] for row in site.trail.rows if row["event"] == "authority refused"] == [
         SECOND, AGENT, STRANGER, STRANGER,
     ]  # fmt: skip
     handed_over = site.handed_over()
@@ -197,12 +197,12 @@ async def test_a_holder_loses_a_group(site: Site) -> None:
         await site.orders.take(take, "op")
         site.policy = compile_policy(text, file="site.ini")
         await site.pass_time(CHECK_SECONDS)
-    reasons = [one["reason"].rpartition(": ")[2] for one in site.trail.rows if one.get("holder") == "nobody"]
+    reasons = [row["reason"].rpartition(": ")[2] for row in site.trail.rows if row.get("holder") == "nobody"]
     assert reasons == [
         "it was silent for 5 s", "it was silent for 5 s", "the policy no longer lets it hold the group",
         "the policy no longer has the group",
     ]  # fmt: skip
-    stops = [one["reason"] for one in site.trail.rows if one["event"] == "motion stopped"]
+    stops = [row["reason"] for row in site.trail.rows if row["event"] == "motion stopped"]
     ended = [*reasons[:1], "its nodes ended", *reasons[1:3]]
     assert stops == [f"base: {reason}" for reason in ended], "its messages pass without a group"
 
@@ -255,7 +255,7 @@ async def test_a_relay_that_hangs_delays_the_end_of_no_other_group(site: Site) -
     for _ in range(9):
         await asyncio.sleep(0)
     assert site.orders.holders() == {}
-    assert [one["topics"] for one in site.trail.rows if one["event"] == "motion stopped"] == [["/arm"]]
+    assert [row["topics"] for row in site.trail.rows if row["event"] == "motion stopped"] == [["/arm"]]
     await site.orders.check()  # both hand-overs are under way
     site.hanging.clear()
     await check
@@ -296,13 +296,13 @@ async def test_a_node_takes_and_gives_for_its_host(site: Site) -> None:
         return OwnServiceCalled(7, "/rosrv/drive/take", host, "/pad")
 
     answers = [await site.orders.take_called(called(host)) for host in (PILOT, SECOND, AGENT, STRANGER)]
-    assert [(one.success, one.text.split(":")[0]) for one in answers] == [
+    assert [(answer.success, answer.text.split(":")[0]) for answer in answers] == [
         (True, f"{PILOT} holds base"),
         (False, f"{PILOT} holds base"),
         (False, "base"),
         (False, f"{STRANGER} has no claim to a group of [Authority]"),
     ]
-    assert not any(one.repeats for one in answers)  # it may be outdated at the host's next call
+    assert not any(answer.repeats for answer in answers)  # it may be outdated at the host's next call
     assert (await site.orders.give_called(called(SECOND))).text == f"{SECOND} holds no group"
     assert (await site.orders.give_called(called(PILOT))).success
     assert (await site.state()).holder == ""

@@ -176,7 +176,7 @@ def test_planted_links_and_pipes_are_refused(state: Path, tmp_path: Path) -> Non
     (state / "api" / "garbage.db").write_text("no database")
     back_up(state, tmp_path / "backup.tar.gz")
     with tarfile.open(tmp_path / "backup.tar.gz") as archive:
-        assert [one for one in archive.getnames() if one.startswith("api/")] == ["api/garbage.db"]
+        assert [name for name in archive.getnames() if name.startswith("api/")] == ["api/garbage.db"]
 
 
 @pytest.mark.parametrize("name", ["api/key.pem", "api/folder/shadow"])

@@ -276,7 +276,7 @@ async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str,
 @pytest.mark.nightly
 def test_own_addresses_are_those_that_a_socket_can_have() -> None:
     addresses = ("127.0.0.1", "192.0.2.1", "2001:db8::1")
-    assert [is_own(ipaddress.ip_address(one)) for one in addresses] == [True, False, False]
+    assert [is_own(ipaddress.ip_address(address)) for address in addresses] == [True, False, False]
 
 
 @pytest.mark.parametrize("note", ["a\nb", "\x1b[31m"])

@@ -35,6 +35,6 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
     orders = DoorOrders(site.core, site.table, tickets=tickets, visits=visits, processes=site.processes)
     secret = tickets.make("alice", 60.0, "ann")[1] if ticket == "valid" else "wrong"
     assert orders.enter("alice", secret, peer, 3)[0] == status
-    assert [(one["host"], one["decision"]) for one in site.trail.rows] == (
+    assert [(row["host"], row["decision"]) for row in site.trail.rows] == (
         [] if decision is None else [(peer, decision)]
     )

@@ -96,7 +96,7 @@ async def test_names_that_never_answer_delay_only_those_of_their_host(kind: str,
     for _look in range(3):
         seen = await robot.lookout.look()
         await asyncio.sleep(2)
-    found = [one.topic for one in seen.topics] + [one.service for one in seen.services]
+    found = [topic.topic for topic in seen.topics] + [service.service for service in seen.services]
     assert sum(name.startswith("/robot") for name in found) == 60
     before = len(robot.asked)
     for _look in range(30):

@@ -85,7 +85,7 @@ async def test_viewers_that_wait_for_the_node_are_bounded_like_connections(
     refused = [client.response.status_code for client in clients if client.response is not None]
     assert refused == [503] * (100 - most)
     assert sum(not task.done() for task in control.serving) == most
-    changes = [one for one in control.reports if isinstance(one, door_link.ConnectionsChanged)]
+    changes = [report for report in control.reports if isinstance(report, door_link.ConnectionsChanged)]
     assert (sum(one.began for one in changes), sum(one.refused for one in changes)) == (0, 100 - most)
     await control.end()
 

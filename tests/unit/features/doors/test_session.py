@@ -158,7 +158,7 @@ async def test_messages_of_every_size_have_frames_that_clients_read(deflate: boo
         channels: list[Any] = []
         while not channels:
             channels = (await clients["f"].next()).get("channels", [])
-        number = next(one["id"] for one in channels if one["topic"] == "/state")
+        number = next(channel["id"] for channel in channels if channel["topic"] == "/state")
         clients["f"].send({"op": "subscribe", "subscriptions": [{"id": 9, "channelId": number}]})
         await asyncio.sleep(1)
         for size in (0, 1, 40, 121, 122, 125, 126, 127, 65_400, 65_535, 65_536, 70_000, 300_000):
@@ -643,7 +643,7 @@ async def test_a_denial_of_the_policy_before_is_asked_about_again() -> None:
         assert [frame["channels"] for frame in _taken(client) if frame["op"] == "advertise"] == [[]]
         del world.master.denials["registerSubscriber"]
         await asyncio.sleep(2)
-        assert [one["topic"] for one in (await client.next())["channels"]] == ["/load"]
+        assert [channel["topic"] for channel in (await client.next())["channels"]] == ["/load"]
 
 
 async def test_names_of_parameters_whose_reads_wait_are_bounded() -> None:

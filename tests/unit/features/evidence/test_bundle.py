@@ -462,7 +462,7 @@ def _unseal(records: list[dict[str, Any]]) -> None:
 
 
 def _invent(records: list[dict[str, Any]]) -> None:
-    load = next(one for one in records if one["event"] == "policy loaded")
+    load = next(record for record in records if record["event"] == "policy loaded")
     load["detail"] = json.dumps({**json.loads(load["detail"]), "sha256": "0" * 64})
 
 
@@ -529,7 +529,7 @@ def test_copied_checkpoints_show_a_rewritten_history(
     assert reviewer.status(bundle, "--json") == 0
     said = json.loads(reviewer.said)
     assert (said["ok"], said["findings"], said["kept_elsewhere"]) == (True, [], 0)
-    copies = [json.loads(one.as_json()) for one in signed_checkpoints(control.log.path)]
+    copies = [json.loads(checkpoint.as_json()) for checkpoint in signed_checkpoints(control.log.path)]
     kept = tmp_path / "copies.ndjson"
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
     assert reviewer.status(bundle, "--checkpoints", kept) == 0

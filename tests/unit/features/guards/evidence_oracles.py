@@ -54,11 +54,11 @@ def sensor(seed: int, events: int = 60) -> None:
                     values[j] = chance.choice((math.nan, math.inf, 0.05, 31.0))
             data = scan(trace.now, -1, 0.1, 0.1, 30, np.array(values))
             if source.hear(node, trace.now):
-                good = sum(1 for one in values if math.isfinite(one) and 0.1 <= one <= 30)
+                good = sum(1 for value in values if math.isfinite(value) and 0.1 <= value <= 30)
                 seen = good > 0 and good >= least * len(values)
                 repeated = repeated + 1 if repr(values) == repr(list(before)) else 0
                 before = tuple(values)
-            trace.observe("by", data, node, [round(one, 4) for one in values[:10]])
+            trace.observe("by", data, node, [round(value, 4) for value in values[:10]])
             fine = seen and (frozen == 0 or repeated < frozen) and source.alone(trace.now, 1000)
             bad_since = None if fine else trace.now if bad_since is None else bad_since
             continue
@@ -80,8 +80,8 @@ def cross_check(seed: int, events: int = 80) -> None:
     apart = False
     for _ in range(events):
         moved, was = trace.moving, trace.now
-        due = min(one.heard + silent for one in sources.values())
-        if differing < samples and all(one.alone(trace.now, 1000) for one in sources.values()):
+        due = min(source.heard + silent for source in sources.values())
+        if differing < samples and all(source.alone(trace.now, 1000) for source in sources.values()):
             bad_since = None
         trace.wait(pause(chance, silent, 30))
         if moved:
@@ -119,12 +119,12 @@ def cross_check(seed: int, events: int = 80) -> None:
             elif sources["by"].alone(trace.now, 1020) and sources["other"].alone(trace.now, 1020):
                 bad_since = None
             continue
-        live = all(trace.now - one.heard <= silent + 20 for one in sources.values())
+        live = all(trace.now - source.heard <= silent + 20 for source in sources.values())
         surely = all(
-            trace.now - one.heard < silent and one.alone(trace.now, 1020) for one in sources.values()
+            trace.now - source.heard < silent and source.alone(trace.now, 1020) for source in sources.values()
         )
         may = live and len(velocity) == 2 and differing < samples
-        may = may and all(one.alone(trace.now, 999) for one in sources.values())
+        may = may and all(source.alone(trace.now, 999) for source in sources.values())
         trace.judge(motion(chance), 1, may=may, must=surely and agreeing >= samples)
 
 

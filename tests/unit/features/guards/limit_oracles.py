@@ -28,7 +28,7 @@ SPECIAL = (math.nan, math.inf, -math.inf, 1e300, -1e300, -0.0, 5e-324)
 
 def _limit(trace: Trace, legs: Legs, most: tuple[float, float]) -> None:
     got = trace.command(legs)
-    if max(abs(one) for one in legs if not math.isnan(one)) > HUGE:
+    if max(abs(leg) for leg in legs if not math.isnan(leg)) > HUGE:
         assert got is not None and finite(got), trace.said(f"{got} is not finite")
         assert norm(got[:3]) <= most[0] + 1e-6 and norm(got[3:]) <= most[1] + 1e-6, trace.said(
             f"{got} is too fast"

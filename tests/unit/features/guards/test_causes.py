@@ -93,7 +93,7 @@ class Robot:
         self.interceptor.observations.flush()
         for one in self.quiet.reports.sent:
             self.events += (
-                [] if not isinstance(one, MonitorsReported) else [each for each in one.events if each.safe]
+                [] if not isinstance(one, MonitorsReported) else [event for event in one.events if event.safe]
             )
         self.quiet.reports.sent.clear()
 

@@ -116,7 +116,7 @@ class Robot:
         interceptor.observations.flush()
         reports = [one for one in self.monitors.reports.sent if isinstance(one, MonitorsReported)]
         self.monitors.reports.sent.clear()
-        return [event for one in reports for event in one.events]
+        return [event for report in reports for event in report.events]
 
 
 def parked(robot: Robot) -> tuple[tuple[ObservationPoint, bytes], ...]:
@@ -146,7 +146,7 @@ def test_a_day_of_a_guard_that_acts_takes_few_records(
     robot = Robot(preset, site.time)
     rows = situation(robot)
     seconds = [robot.second(*rows) for _ in range(4)]
-    assert [_kinds(one) for one in seconds[1:]] == [_kinds(seconds[-1])] * 3
+    assert [_kinds(second) for second in seconds[1:]] == [_kinds(seconds[-1])] * 3
     begun = site.file.stat().st_size
     for events in [*seconds, *[seconds[-1]] * (DAY - len(seconds))]:
         site.second(events)
@@ -160,13 +160,13 @@ def test_a_day_of_a_guard_that_acts_takes_few_records(
         ("publish", "monitor published"),
         ("log", "monitor log"),
     ):
-        reported = [event for each in seconds for event in each if event.kind == kind and not event.safe]
+        reported = [event for second in seconds for event in second if event.kind == kind and not event.safe]
         numbers = sum(event.count or 1 for event in reported)
         numbers += (DAY - len(seconds)) * sum(
             event.count or 1 for event in seconds[-1] if event.kind == kind and not event.safe
         )
-        assert sum(one.detail.get("count", 1) for one in records if one.event == name) == numbers
-    acts = sum(event.count or 1 for each in seconds for event in each if event.safe)
+        assert sum(record.detail.get("count", 1) for record in records if record.event == name) == numbers
+    acts = sum(event.count or 1 for second in seconds for event in second if event.safe)
     acts += (DAY - len(seconds)) * sum(event.count or 1 for event in seconds[-1] if event.safe)
     begins, ends = (site.found(event) for event in ("stop begun", "stop ended"))
     assert len(begins) == len(ends) == (0 if preset == "speed" else 1)
@@ -203,8 +203,8 @@ def test_ten_seconds_are_recorded_as_before_and_the_end_with_the_number_and_the_
     for _ in range(70):
         site.second([])
     records = site.found("message dropped")
-    assert [one.detail.get("count") for one in records][:20] == [None, 9] * 10
-    assert sum(one.detail.get("count", 1) for one in records) == 700
+    assert [record.detail.get("count") for record in records][:20] == [None, 9] * 10
+    assert sum(record.detail.get("count", 1) for record in records) == 700
     assert (records[-1].detail["total"], records[-1].detail["seconds"]) == (700, 69)
     assert len(records) <= 23
 
@@ -227,7 +227,7 @@ def test_no_action_is_lost_and_each_kind_has_one_record_a_minute(site: Site, see
     assert len(records) <= 4 * 2 * (20 + 3130 / 60 + 1)
     names = {"drop": "message dropped", "change": "message changed", "fault": "monitor fault"}
     for kind, name in [*names.items(), ("shadow drop", "shadow observed")]:
-        assert sum(one.detail.get("count", 1) for one in records if one.event == name) == given[kind]
+        assert sum(record.detail.get("count", 1) for record in records if record.event == name) == given[kind]
     assert not site.records.some or not site.records.repetitions.waits
 
 
@@ -261,9 +261,9 @@ def test_stops_that_follow_each_other_closely_become_one(site: Site) -> None:
         site.second([])
     records = site.found()
     assert len(records) <= 2 * 5 + DAY / 4 / 60 + 2
-    ends = [one for one in records if one.event == "stop ended"]
+    ends = [record for record in records if record.event == "stop ended"]
     assert len(ends) * 2 == len(records)
-    assert sum(one.detail["actions"] for one in ends) == DAY // 16
+    assert sum(end.detail["actions"] for end in ends) == DAY // 16
 
 
 def test_a_stop_that_was_open_when_control_ended_is_closed_with_an_unknown_end(site: Site) -> None:

@@ -19,4 +19,4 @@ def test_a_digest_changes_with_preset_text_and_values() -> None:
 
 def test_presets_have_different_digests() -> None:
     digests = {text_digest(preset.text) for preset in PRESETS.values()}
-    assert len(digests) == len(PRESETS) and all(len(one) == 16 for one in digests)
+    assert len(digests) == len(PRESETS) and all(len(digest) == 16 for digest in digests)

@@ -197,7 +197,7 @@ async def test_each_change_of_a_guard_is_recorded_with_its_digest(monitors: Spec
 
     def recorded() -> list[Any]:
         orders.look()
-        return [one.detail for one in trail.records if one.event == "guard loaded"]
+        return [record.detail for record in trail.records if record.event == "guard loaded"]
 
     [first] = recorded()
     assert first["digest"] == (await row(orders)).digest
@@ -262,7 +262,7 @@ async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: S
         "the guard fence acted late 3 times in the last minute (limit 20 ms, longest since its relay began 43 ms):"
         " rosrv guard list"
     ]
-    assert [one.event for one in trail.records].count("guard late") == 1
+    assert [record.event for record in trail.records].count("guard late") == 1
     let_time_pass(60.0)
     assert alarms() == []
 
@@ -279,7 +279,7 @@ async def test_the_heartbeat_is_off_for_the_reason_of_a_relay(monitors: Specific
         assert state is not None
         reasons.append(state.heartbeat)
     assert reasons == ["a relay process is starting", "", "fence is disabled", "fence is disabled", ""]
-    events = [one.event for one in trail.records if one.event.startswith("heartbeat")]
+    events = [record.event for record in trail.records if record.event.startswith("heartbeat")]
     assert events == ["heartbeat begun", "heartbeat ended", "heartbeat begun"]
     monitors.rollout.lost(0)
     assert orders.state().heartbeat == "a relay process ended"  # type: ignore[union-attr]  # a heartbeat is set
@@ -407,7 +407,7 @@ async def test_a_guard_of_before_0_4_stays_in_force_as_a_monitor_that_is_named(t
         await orders.new(guard_requests.GuardNew("sane", {"command": "/c"}, types=types, name="still"), "eve")
         await monitors.remove(admin.MonitorRemove(["sane.rv"]), "eve")
         listed = await orders.guards(guard_requests.GuardsWanted())
-        assert ([one.name for one in listed.guards], listed.warnings) == (["still"], [])
+        assert ([guard.name for guard in listed.guards], listed.warnings) == (["still"], [])
 
 
 async def test_a_type_of_an_unknown_topic_is_refused(
@@ -457,7 +457,7 @@ async def test_suggestions_name_the_guards_that_are_loaded(monitors: Specificati
     orders = orders_of(monitors, graph=Graph([], topics, []))
     found = await orders.suggestions(guard_requests.GuardSuggestionsWanted())
     assert [one.name for one in found.loaded] == ["fence"]
-    assert [one.preset for one in found.suggestions] == ["deadman", "speed"]
+    assert [suggestion.preset for suggestion in found.suggestions] == ["deadman", "speed"]
     assert found.left_out[0].startswith("/estop_enabled: its name does not say")
 
 

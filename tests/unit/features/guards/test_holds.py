@@ -68,7 +68,7 @@ def test_the_table_of_topics_on_which_a_monitor_acts(text: str, acted: set[str])
     for monitor in started(text).monitors:
         assert set(monitor.code.acts_on) == acted
     without = compiled_from({"guard.rv": text}, DEFINITIONS, without_code=["guard.rv"])
-    assert {one.acts_on for one in without.specifications} == {tuple(sorted(acted))}
+    assert {specification.acts_on for specification in without.specifications} == {tuple(sorted(acted))}
 
 
 @MADE

@@ -26,7 +26,7 @@ COUNTS = [
 
 @pytest.mark.parametrize(("page", "words", "preset", "name"), DEFAULTS)
 def test_a_default_on_a_page_is_the_presets(page: str, words: str, preset: str, name: str) -> None:
-    [default] = [one.default for one in PRESETS[preset].parameters if one.name == name]
+    [default] = [parameter.default for parameter in PRESETS[preset].parameters if parameter.name == name]
     assert words.format(default) in (DOCS / page).read_text().replace("\n", " ")
 
 

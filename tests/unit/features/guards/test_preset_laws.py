@@ -503,7 +503,7 @@ def test_every_preset_has_a_recipe_or_a_test_of_its_own() -> None:
 def test_each_reason_has_a_cell() -> None:
     places = [place for preset in RECIPES for place in places_of(preset)]
     for *cell, state in REASONS:
-        there = ((one.preset, one.topic, one.name) for one in places)
+        there = ((place.preset, place.topic, place.name) for place in places)
         assert state in {"*", *STATES} and any(
             all(wanted in {"*", given} for wanted, given in zip(cell, one, strict=True)) for one in there
         ), f"no cell has the reason {cell}"

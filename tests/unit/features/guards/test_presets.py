@@ -118,7 +118,7 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
     )
     assert text.replace("0,0 4,0 0,3.5", "1,1 2,1 2,2") == with_values(text, {"polygon": "1,1 2,1 2,2"})
     [code] = compiled(text).specifications
-    assert {one.topic for one in code.events if one.topic} == {"/base/cmd", "/pose"}
+    assert {event.topic for event in code.events if event.topic} == {"/base/cmd", "/pose"}
 
 
 def test_a_name_of_an_entry_is_not_a_topic() -> None:
@@ -199,7 +199,7 @@ def test_the_page_names_an_existing_test_for_each_row() -> None:
     rows = [row for row in section.splitlines() if row.startswith("| ") and not row.endswith(" test |")]
     cells = [row.split("|")[-2].strip().strip("`") for row in rows]
     tests = [one for cell in cells if cell for one in cell.split("`, `")]
-    named = [re.fullmatch(r"(test_\w+)(?:\[(.*)\])?", one) for one in tests]
+    named = [re.fullmatch(r"(test_\w+)(?:\[(.*)\])?", test) for test in tests]
     untested = [row.split("|")[1].strip() for row in rows if row.endswith("| |")]
     assert len(rows) == 24 and untested == [NO_TEST]
     files = [file for folder in ("tests", "rosmop/tests") for file in (ROOT / folder).rglob("test_*.py")]

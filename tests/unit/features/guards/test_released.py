@@ -45,7 +45,7 @@ def made(preset: Preset, kinds: tuple[str, ...] = ()) -> Guard:
     """Return a guard with other topics and values than those of the preset."""
     types = dict(zip(preset.topics, kinds or (types[0] for types in preset.topics.values()), strict=True))
     topics = {name: f"/robot/{name}/goal" for name in preset.given_topics}
-    values = {each.name: another(each) for each in preset.parameters}
+    values = {parameter.name: another(parameter) for parameter in preset.parameters}
     return Guard("mine", preset, topics, types, values)
 
 

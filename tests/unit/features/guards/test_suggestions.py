@@ -36,9 +36,9 @@ def text(proposal: Suggestion, graph: list[TopicFacts]) -> str:
 
 
 def printed(found: Suggestions) -> Iterator[str]:
-    for one in found.suggestions:
-        yield one.command.removeprefix("rosrv guard new ")
-        yield from (f"  instead: {', '.join(topics)}" for topics in one.others.values())
+    for suggestion in found.suggestions:
+        yield suggestion.command.removeprefix("rosrv guard new ")
+        yield from (f"  instead: {', '.join(topics)}" for topics in suggestion.others.values())
     yield from (f"! {sentence}" for sentence in found.left_out)
     yield from (f"- {sentence}" for sentence in found.not_protected[:-1])
 
@@ -49,7 +49,7 @@ def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
     found = advice(graph)
     assert [*printed(found)] == ROBOTS[robot]["proposal"].splitlines()
     assert found.not_protected[-1].startswith("never by a guard: ")
-    sources = {f"{one.name}.rv": text(one, graph) for one in found.suggestions}
+    sources = {f"{suggestion.name}.rv": text(suggestion, graph) for suggestion in found.suggestions}
     assert len(sources) == len(found.suggestions)
     if robot not in sample(ROBOTS, 4):
         return
@@ -81,7 +81,7 @@ def test_nothing_is_proposed_that_is_loaded(robot: str) -> None:
         {guard.name for guard in loaded},
     )
     one_less = advice(graph, loaded[1:], ["deadman", "deadman_2"])
-    assert [one.topics for one in one_less.suggestions] == [found[0].topics]
+    assert [suggestion.topics for suggestion in one_less.suggestions] == [found[0].topics]
     assert one_less.suggestions[0].name not in {"deadman", "deadman_2"}
 
 
@@ -96,7 +96,7 @@ def test_a_second_robot_changes_nothing_for_the_first(robot: str) -> None:
     def essence(one: Suggestion) -> tuple[str, dict[str, str]]:
         return one.preset, {name: topic for name, topic in one.topics.items() if name != "reset"}
 
-    assert [essence(one) for one in alone.suggestions] == [
+    assert [essence(suggestion) for suggestion in alone.suggestions] == [
         essence(one) for one in both.suggestions if one.topics["command"].startswith("/a/")
     ]
     for one in both.suggestions:
@@ -118,8 +118,8 @@ def moved(graph: list[TopicFacts], space: str) -> list[TopicFacts]:
 def test_without_its_source_a_guard_is_left_out(robot: str) -> None:
     """No neighbour's source takes its place."""
     graph = moved(graph_of(robot), "a")
-    for one in advice(graph).suggestions:
-        sources = {topic for name, topic in one.topics.items() if name not in {"command", "reset"}}
+    for suggestion in advice(graph).suggestions:
+        sources = {topic for name, topic in suggestion.topics.items() if name not in {"command", "reset"}}
         less = [topic for topic in graph if topic.name not in sources]
         again = advice([*moved(graph_of(robot), "b"), *less]).suggestions
         assert all(topic.startswith("/a/") for each in again if each.topics["command"].startswith("/a/")
@@ -160,7 +160,7 @@ def test_a_navigation_that_also_publishes_odometry_commands_the_base() -> None:
         TopicFacts("/cmd_vel", TWIST, ("/nav",), ("/base",)),
         TopicFacts("/odom", ODOMETRY, ("/nav",), ()),
     ]
-    assert {"deadman", "fence"} <= {one.preset for one in advice(graph).suggestions}
+    assert {"deadman", "fence"} <= {suggestion.preset for suggestion in advice(graph).suggestions}
 
 
 def test_the_list_of_what_is_not_protected_is_never_empty_and_knows_the_guards_in_use() -> None:
@@ -240,7 +240,7 @@ def test_a_reset_is_a_word_of_its_name_and_never_the_stop_itself(topic: str, res
         TopicFacts("/e_stop", "std_msgs/Bool", ("/plc",), (), 10),
         TopicFacts(topic, "std_msgs/Bool", ("/plc",), (), 10),
     ]
-    found = [one.topics for one in advice(graph).suggestions if one.preset == "estop"]
+    found = [suggestion.topics for suggestion in advice(graph).suggestions if suggestion.preset == "estop"]
     assert found and all(("reset" in one) == resets and one["stop"] != one.get("reset") for one in found)
 
 
@@ -263,7 +263,7 @@ def scanned(command: str, kind: str, scan: str) -> Suggestions:
 )
 def test_a_scanner_that_may_not_look_ahead_needs_its_direction(scan: str, said: bool) -> None:
     found = scanned("/cmd_vel", "geometry_msgs/Twist", scan)
-    assert "separation" in {one.preset for one in found.suggestions}
+    assert "separation" in {suggestion.preset for suggestion in found.suggestions}
     assert any("set mounted and sector" in one for one in found.left_out) == said
 
 
@@ -271,7 +271,7 @@ def test_a_scanner_that_may_not_look_ahead_needs_its_direction(scan: str, said: 
 def test_no_separation_is_proposed_for_velocities_in_the_frame_of_the_map(leaf: str) -> None:
     kind = "geometry_msgs/TwistStamped" if leaf == "cmd_vel" else "geometry_msgs/Twist"
     found = scanned(f"/mavros/setpoint_velocity/{leaf}", kind, "/scan")
-    presets = {one.preset for one in found.suggestions}
+    presets = {suggestion.preset for suggestion in found.suggestions}
     assert "sensor" in presets and "separation" not in presets
     assert any("separation of /mavros" in one for one in found.left_out)
 
@@ -282,13 +282,13 @@ def test_a_flood_of_topics_is_cut_and_said() -> None:
         for number in range(700)
     ]
     found = advice(graph)
-    assert len({one.topics["command"] for one in found.suggestions}) == MAX_COMMANDS
+    assert len({suggestion.topics["command"] for suggestion in found.suggestions}) == MAX_COMMANDS
     assert "only the first" in found.left_out[-1]
 
 
 @pytest.mark.complete
 def test_each_preset_is_proposed_for_some_robot_or_has_a_reason() -> None:
-    found = {one.preset for robot in ROBOTS for one in advice(graph_of(robot)).suggestions}
+    found = {suggestion.preset for robot in ROBOTS for suggestion in advice(graph_of(robot)).suggestions}
     where = (
         "suggestions.py: propose it for a robot of robots.yaml, or list it in NOT_SUGGESTED with the reason"
     )
@@ -370,8 +370,8 @@ def test_topics_of_another_host_crowd_out_none_of_the_robot() -> None:
             for number in range(600)
         ),
     ]
-    assert "/cmd_vel" in {one.command for one in advice(graph).suggestions} | {
-        topic for one in advice(graph).suggestions for topic in one.topics.values()
+    assert "/cmd_vel" in {suggestion.command for suggestion in advice(graph).suggestions} | {
+        topic for suggestion in advice(graph).suggestions for topic in suggestion.topics.values()
     }
 
 

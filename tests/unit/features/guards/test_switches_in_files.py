@@ -113,7 +113,7 @@ async def test_a_load_that_is_taken_back_leaves_the_switch_as_it_was(tmp_path: P
 
 def alarms(state: GuardsState | None) -> dict[str, str]:
     assert state is not None
-    found = {one.kind: one.text for one in GUARDS_VIEW.states[0].alarms(state)}
+    found = {alarm.kind: alarm.text for alarm in GUARDS_VIEW.states[0].alarms(state)}
     return {kind: text for kind, text in found.items() if kind.startswith(("guard-off", "guard-older"))}
 
 

@@ -102,7 +102,7 @@ def test_a_moving_base_is_stopped_by_an_unreadable_observation(
     monitors.judge("/cmd_vel", bytearray(STILL), now)
     assert monitors.judge("/cmd_vel", bytearray(DRIVE), now).result == "passed"
     outcome = monitors.judge(topics[damaged], bytearray(DAMAGE[damage](GOOD[name][damaged])), now + 1)
-    assert [one.malformed for one in outcome.faults] == [True]
+    assert [fault.malformed for fault in outcome.faults] == [True]
     sent = [one.data for each in monitors.advance(now + 2) for one in each.sent()]
     assert sent == [bytes(48)]
     driven = monitors.judge("/cmd_vel", bytearray(DRIVE), now + 3)
@@ -294,7 +294,7 @@ def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
     goal = bytearray(head[:16] + bytes(8) + b"\1\0\0\0a" + goal[28:])
     assert monitors.judge("/move_base/goal", goal, SECOND).result == "passed"
     outcome = monitors.judge("/move_base/result", bytearray(b"\1"), 2 * SECOND)
-    assert [one.malformed for one in outcome.faults] == [True]
+    assert [fault.malformed for fault in outcome.faults] == [True]
     sent = [one.topic for each in monitors.advance(200 * SECOND) for one in each.sent()]
     assert sent == ["/move_base/cancel"]
 
@@ -303,7 +303,7 @@ def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
 def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[SetPart], MonitorSet]) -> None:
     monitors = started("joints", made)
     outcome = monitors.judge("/joint_states", bytearray(b"\1"), SECOND)
-    assert [one.malformed for one in outcome.faults] == [True]
+    assert [fault.malformed for fault in outcome.faults] == [True]
     sent = [one.topic for each in monitors.advance(SECOND + 1) for one in each.sent()]
     assert sent == [PRESETS["joints"].given_topics["command"]]
 

@@ -74,14 +74,14 @@ class Robot:
     def __init__(self, folder: Path | None, *guards: Guard, shadow: bool = False) -> None:
         self.orders: list[Any] = []
         self.refused = ["it would hold /c"]
-        self.files = {f"{one.name}.rv": text_of(one) for one in guards}
+        self.files = {f"{guard.name}.rv": text_of(guard) for guard in guards}
         self.folder = None if folder is None else str(folder)
         self.loaded = LOADED
         margin = {"name": "margin", "value": 0.2, "default": 0.2, "kind": "double"}
         self.rows = [
-            example(MonitorState, name=one.name, file=f"{one.name}.rv", shadow=shadow, enabled=not shadow,
+            example(MonitorState, name=guard.name, file=f"{guard.name}.rv", shadow=shadow, enabled=not shadow,
                     topics=["/cmd_vel"], given=[margin])
-            for one in guards
+            for guard in guards
         ]  # fmt: skip
 
     def answer(self, request: Any) -> Any:

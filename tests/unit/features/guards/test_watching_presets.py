@@ -456,7 +456,7 @@ def test_a_goal_without_a_result_is_cancelled() -> None:
     goals = [
         guard.tell("command", with_id(name, 24, 72), at) for name, at in (("a", 1), ("b", 500), ("", 600))
     ]
-    assert [one.result for one in goals] == ["passed", "passed", "dropped"]
+    assert [goal.result for goal in goals] == ["passed", "passed", "dropped"]
     guard.tell("by", with_id("b", 24, 5), 900)
     guard.tell("by", with_id("a", 24, 5), 950, "/b")
     guard.got.clear()

@@ -136,7 +136,7 @@ def straight(speed: float, direction: float) -> Legs:
 
 
 def finite(numbers: tuple[float, ...]) -> bool:
-    return all(math.isfinite(one) for one in numbers)
+    return all(math.isfinite(number) for number in numbers)
 
 
 def norm(numbers: tuple[float, ...]) -> float:

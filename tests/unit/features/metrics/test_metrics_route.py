@@ -71,9 +71,9 @@ def test_every_metric_is_exported_as_listed() -> None:
 
 def test_values_are_exported() -> None:
     samples = {
-        (one.name, tuple(sorted(one.labels.items()))): one.value
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
-        for one in family.samples
+        for sample in family.samples
     }
     assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
     assert samples["rosrv_decision_seconds_count", ()] == 2
@@ -104,10 +104,10 @@ def test_values_are_exported() -> None:
 
 def test_tunnels_are_measured() -> None:
     samples = {
-        (one.name, tuple(sorted(one.labels.items()))): one.value
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
-        for one in family.samples
-        if "tunnel" in one.name or "host" in one.name
+        for sample in family.samples
+        if "tunnel" in sample.name or "host" in sample.name
     }
     a = (("host", "a"),)
     assert samples["rosrv_tunnel_up", a] == 1

@@ -111,7 +111,7 @@ def argument_of(parameter: CallParameter[Any]) -> Any:
 def gate_says(policy: Policy, call: RosCall[Any], tree: Tree) -> Decision:
     gate = CallGate(lambda: policy, Registry(), HostLimits())
     name = "" if call.row.wire else NAME
-    arguments = tuple(argument_of(one) for one in call.method.parameters)
+    arguments = tuple(argument_of(parameter) for parameter in call.method.parameters)
     caller = Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0)
     decision = gate.decide(Attempt(caller, call, arguments), tree)
     assert not isinstance(decision, NameConflict)
@@ -141,7 +141,7 @@ def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
     word = "allow" if allowed else "deny"
     deed = f"{SAID[request.category]} {request.resource}"
     text = f"cases:\n- host: {request.host}\n  node: {NAME}\n  {word}: ['{deed}']\n"
-    return all(one.passed for one in run_cases(policy, text, "cases"))
+    return all(case.passed for case in run_cases(policy, text, "cases"))
 
 
 @settings(max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow])
@@ -216,7 +216,7 @@ def test_an_action_has_the_answer_of_its_call(rules: dict[str, dict[str, str] | 
     ]  # fmt: skip
     for category, thing, row in deeds_and_calls:
         request = Request(ipaddress.ip_address(host), NAME, category, thing)
-        arguments = [argument_of(one) for one in row.method.parameters]
+        arguments = [argument_of(parameter) for parameter in row.method.parameters]
         if row.resource is not None:
             arguments[row.resource] = thing
         caller = Caller(Peer(request.host, host, "10.0.0.1"), NAME, 0)

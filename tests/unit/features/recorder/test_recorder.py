@@ -76,7 +76,7 @@ class Scene:
         return self.recorder.step(said)
 
     def closed(self, answers: list[messages.Message]) -> list[Recording]:
-        return [one.recording for one in answers if isinstance(one, recorder_link.RecordingClosed)]
+        return [answer.recording for answer in answers if isinstance(answer, recorder_link.RecordingClosed)]
 
     def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
         path = self.folder / recording.id / "recording.bag"

@@ -98,7 +98,7 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
     assert last is not None
     following = messages_around(RECORDING, bag, last, neighbours=2)
     assert following.messages[following.chosen] == found.messages[-1]
-    assert [one.fields["data"] for one in following.messages[:2]] == ["1.0", "1.0"]
+    assert [message.fields["data"] for message in following.messages[:2]] == ["1.0", "1.0"]
     assert messages_around(RECORDING, bag, 0, neighbours=3).chosen == 0
     end = messages_around(RECORDING, bag, 2**60, neighbours=3)
     assert (end.chosen, len(end.messages)) == (3, 4)
@@ -156,7 +156,7 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
     at: int | MessagePosition = 0
     while True:
         found = messages_around(RECORDING, tmp_path / "a.bag", at, neighbours=1)
-        seen += [one.fields["data"] for one in found.messages[found.chosen + (at != 0) :]]
+        seen += [message.fields["data"] for message in found.messages[found.chosen + (at != 0) :]]
         after = MessagePosition.parsed(found.messages[-1].place)
         assert after is not None
         if after == at:

@@ -44,8 +44,8 @@ def raised() -> set[str]:
     for file in ROOT.rglob("*.py"):
         text = file.read_text()
         for function in functions(ast.parse(text if "StartError" in text else "")):
-            calls = (one.exc for one in statements(function) if isinstance(one, ast.Raise))
-            names = [getattr(one.func, "id", "") for one in calls if isinstance(one, ast.Call)]
+            calls = (statement.exc for statement in statements(function) if isinstance(statement, ast.Raise))
+            names = [getattr(call.func, "id", "") for call in calls if isinstance(call, ast.Call)]
             found |= {f"{file.relative_to(ROOT)}:{function.name}"} if "StartError" in names else set()
     return found
 
@@ -90,7 +90,7 @@ def test_a_program_without_which_nothing_starts_is_a_failure(
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda _name: None)
     monkeypatch.setattr(Path, "exists", lambda _path: False)
-    found = {one.check: one.outcome for one in machine_checks.programs()}
+    found = {program.check: program.outcome for program in machine_checks.programs()}
     assert found[name] == "fail"
 
 

@@ -112,7 +112,7 @@ async def test_a_person_signs_out_of_their_own_session_only(world: World) -> Non
         await world.sso.sign_out(requests.SignOut(f"{1:012x}"), "sso:bob")
     await world.sso.sign_out(requests.SignOut(f"{1:012x}"), "sso:alice")
     ended = await world.sso.end(requests.SessionsEnd("bob"), "first")
-    assert [one.name for one in ended.sessions] == ["sso:bob"]
+    assert [session.name for session in ended.sessions] == ["sso:bob"]
     assert world.tokens.usable() == []
     assert world.events().count("signed off") == 2
     with pytest.raises(UnknownThingError, match=r"^no person is signed in$"):

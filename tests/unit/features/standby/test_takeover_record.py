@@ -122,7 +122,7 @@ def test_a_restart_within_an_epoch_repeats_no_record(tmp_path: Path) -> None:
             await a.recorder.took_over(epoch)
 
     a, _b = after(tmp_path, story)
-    assert [one["epoch"] for one in records(a, "took over")] == [1, 2]
+    assert [record["epoch"] for record in records(a, "took over")] == [1, 2]
 
 
 def test_the_own_log_knows_the_takeover_before(tmp_path: Path) -> None:
@@ -148,13 +148,13 @@ def test_the_state_has_a_takeover_only_once_its_record_is_on_disk(tmp_path: Path
         assert a.store.settings()["last takeover"] == '{"epoch":1,"appliance":"a"}'
 
     a, _b = after(tmp_path, story)
-    assert [one["epoch"] for one in records(a, "took over")] == [1]
+    assert [record["epoch"] for record in records(a, "took over")] == [1]
 
 
 def test_the_takeover_is_sealed_and_replicated_at_once(tmp_path: Path) -> None:
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1, sealed=False):
-            ((place),) = [one.sequence for one in search(a.path, Filter(event="took over")).entries]
+            ((place),) = [entry.sequence for entry in search(a.path, Filter(event="took over")).entries]
             await until(lambda: (kept := a.replicated()) and kept.sequence >= place)
 
     after(tmp_path, story)
@@ -192,7 +192,7 @@ def test_a_hand_over_returns_when_the_state_has_the_sealed_log(tmp_path: Path) -
         async with a.active(1):
             await a.decide(2, 1)
         await a.hand_over(1)
-        (place,) = [one.sequence for one in search(a.path, Filter(event="handed over")).entries]
+        (place,) = [entry.sequence for entry in search(a.path, Filter(event="handed over")).entries]
         kept = a.replicated()
         assert kept is not None
         assert kept.sequence >= place

@@ -75,7 +75,7 @@ def found(pair: Pair) -> list[tuple[Kind, int]]:
     assert sorted(turned.findings, key=str) == sorted(
         result.findings, key=str
     )  # the order of the logs does not matter
-    return [(one.kind, one.epoch) for one in result.findings]
+    return [(finding.kind, finding.epoch) for finding in result.findings]
 
 
 def read(path: Path, query: str) -> list[Any]:
@@ -124,7 +124,7 @@ def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) 
     fresh = build(tmp_path / "fresh", first_hour)
     for log, findings in ((fresh.a, []), (pair.a, [(Kind.LOG_MISSING, 4)])):
         result = verify_takeovers(VerifiedLog(log, verify(log)), absent="b")
-        assert [(one.kind, one.epoch) for one in result.findings] == findings
+        assert [(finding.kind, finding.epoch) for finding in result.findings] == findings
         assert result.ok is not bool(findings)
     states = fresh.a.parents[1], fresh.b.parents[1]
     fresh.b.unlink()
@@ -150,7 +150,7 @@ def test_the_tail_is_counted(pair: Pair) -> None:
 def test_signatures_before_the_named_checkpoint_seal_no_tail(pair: Pair) -> None:
     lost = msgspec.structs.replace(verify(pair.a), signed_through=3)
     result = verify_takeovers(VerifiedLog(pair.a, lost), VerifiedLog(pair.b, verify(pair.b)))
-    assert [one.tail_signed for one in result.takeovers if one.other == "a"] == [0, 0]
+    assert [takeover.tail_signed for takeover in result.takeovers if takeover.other == "a"] == [0, 0]
 
 
 def test_an_unsigned_tail_is_counted(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_retention_leaves_the_rest_proven(pair: Pair) -> None:
     first = verified(pair.a, pair.b).takeovers[1]
     result = verify_takeovers(begun_after(pair.a, first.through), VerifiedLog(pair.b, verify(pair.b)))
     assert result.ok, result.findings
-    assert [(one.epoch, one.link) for one in result.takeovers] == [
+    assert [(takeover.epoch, takeover.link) for takeover in result.takeovers] == [
         (2, "removed"),
         (4, "proven"),
         (5, "proven"),
@@ -194,7 +194,7 @@ def test_a_takeover_removed_by_retention_is_not_missing(pair: Pair) -> None:
     assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
     b = VerifiedLog(pair.b, verify(pair.b))
     within = verify_takeovers(begun_after(pair.a, 1), b)
-    assert [(one.kind, one.epoch) for one in within.findings] == [(Kind.TAKEOVER_MISSING, 3)]
+    assert [(finding.kind, finding.epoch) for finding in within.findings] == [(Kind.TAKEOVER_MISSING, 3)]
     ((place,),) = read(pair.a, "SELECT max(sequence) FROM record WHERE event = 'took over'")
     assert verify_takeovers(begun_after(pair.a, place - 1), b).findings == []
     assert verify_takeovers(begun_after(pair.a, place), b).findings == []
@@ -325,21 +325,21 @@ def test_a_different_checkpoint_with_the_same_hash(pair: Pair) -> None:
         )
         connection.execute("DELETE FROM checkpoint WHERE number > ?", (number,))
         connection.commit()
-    findings = [(one.kind, one.epoch) for one in verified(pair.a, pair.b).findings]
+    findings = [(finding.kind, finding.epoch) for finding in verified(pair.a, pair.b).findings]
     assert findings == [(Kind.CHECKPOINT_CHANGED, 5)]
 
 
 def test_a_takeover_with_an_earlier_epoch(pair: Pair) -> None:
     pair.forge_b(setting("epoch", "3", 5))
     assert (Kind.EPOCH_ORDER, 3) in found(pair)
-    names = [one.message for one in verified(pair.a, pair.b).findings]
+    names = [finding.message for finding in verified(pair.a, pair.b).findings]
     assert any("seals the takeover of epoch 4" in message for message in names), names
 
 
 def test_an_epoch_in_both_logs(pair: Pair) -> None:
     pair.forge_b(setting("epoch", "4", 5))
     assert "epoch 4: both logs have a takeover of epoch 4" in [
-        one.message for one in verified(pair.a, pair.b).findings
+        finding.message for finding in verified(pair.a, pair.b).findings
     ]
 
 
@@ -368,7 +368,7 @@ def test_an_unreadable_takeover(pair: Pair, value: str) -> None:
 def test_a_hand_over_that_does_not_fit(pair: Pair, field: str, value: str) -> None:
     pair.forge_b(setting(field, value, 2, "handed over"))
     assert Kind.EPOCH_ORDER in {kind for kind, _epoch in found(pair)}
-    assert any("hands it over to" in one.message for one in verified(pair.a, pair.b).findings)
+    assert any("hands it over to" in finding.message for finding in verified(pair.a, pair.b).findings)
 
 
 @pytest.mark.parametrize(

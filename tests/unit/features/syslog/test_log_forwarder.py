@@ -49,7 +49,7 @@ class Kept:
 
     @property
     def messages(self) -> list[Message]:
-        return [parse(one) for one in self.lines]
+        return [parse(line) for line in self.lines]
 
     def sequences(self) -> list[int]:
         return [int(one.fields["sequence"]) for one in self.messages if SYSLOG_ELEMENT not in one.elements]
@@ -83,7 +83,7 @@ def everything(path: Path) -> list[int]:
     cursor: str | None = "0"
     while cursor is not None:
         page = search(path, Filter(), cursor, 1000, newest_first=False)
-        found += [one.sequence for one in page.entries]
+        found += [entry.sequence for entry in page.entries]
         cursor = page.cursor
     return found
 
@@ -161,7 +161,7 @@ def test_only_denials_are_sent_if_configured(make_log: MakeLog, path: Path, kept
     log.close()
     one = forwarder(path, kept, "denials")
     run(one)
-    records = [one for one in kept.messages if SYSLOG_ELEMENT not in one.elements]
+    records = [message for message in kept.messages if SYSLOG_ELEMENT not in message.elements]
     assert {one.event for one in records} == {"decision", "probe-failed"}
     assert [one.fields.get("decision") for one in records if one.event == "decision"] == ["deny"]
     assert len(kept.messages) - len(records) == len(signed_checkpoints(path))
@@ -177,7 +177,7 @@ def test_checkpoints_at_the_receiver_prove_the_log(
     log.close()
     run(forwarder(path, kept))
     file = tmp_path / "messages.log"
-    file.write_bytes(b"\n".join(b"Nov 20 10:00:00 robot " + one for one in kept.lines))
+    file.write_bytes(b"\n".join(b"Nov 20 10:00:00 robot " + line for line in kept.lines))
     copies = read_copies(file)
     assert copies == signed_checkpoints(path)
     result = verify(path, copies=copies)

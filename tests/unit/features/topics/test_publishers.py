@@ -83,5 +83,5 @@ def test_the_end_of_a_registration_shows_its_beginning_only_without_a_loss() -> 
     """A node that unregistered was registered before the log begins, unless records were lost in between."""
     end = entry(8, "unregistered", host="10.0.0.9", caller_id="/n", category="publication", resource="/a")
     log = [entry(1, "decision"), counted(7, KIND, "decision"), end]
-    assert [one.node for one in found(log, 5).publishers] == ["/n"]
+    assert [publisher.node for publisher in found(log, 5).publishers] == ["/n"]
     assert found([entry(1, "decision"), entry(7, "records lost"), end], 5).publishers == ()

@@ -505,7 +505,7 @@ async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Benc
     assert bench.authority.lists == 0
     answers = await asyncio.gather(*(bench.certification.revocations(RevocationsWanted()) for _ in range(20)))
     assert bench.authority.lists == 1
-    assert len({one.revocations for one in answers}) == 1
+    assert len({answer.revocations for answer in answers}) == 1
     await bench.revoke("a")
     after = x509.load_pem_x509_crl(
         (await bench.certification.revocations(RevocationsWanted())).revocations.encode()
@@ -630,7 +630,7 @@ async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
         await bench.hosts.ports.tell(HostPorts("a", "closed", [], 4e9), "eve")
     overview = await bench.hosts.listed(HostList())
     assert overview.hosts[0].ports == PortsSeen("open", 5.0, [40001], "eve")
-    assert [(one.address, one.nodes, one.ports.state) for one in overview.machines] == [
+    assert [(machine.address, machine.nodes, machine.ports.state) for machine in overview.machines] == [
         ("10.0.0.7", 3, "closed")
     ]
 

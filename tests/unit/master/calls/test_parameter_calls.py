@@ -156,7 +156,7 @@ def test_a_run_is_one_request_in_its_order() -> None:
     server = OrderedServer(mirror())
     answers = ordered(server, ("setParam", "/a", {"b": 1}), ("deleteParam", "/a/b"), ("setParam", "/c", 2))
     assert server.requests == [["setParam /a", "deleteParam /a/b", "setParam /c"]]
-    assert [one[1] for one in answers] == ["setParam", "deleteParam", "setParam"]
+    assert [answer[1] for answer in answers] == ["setParam", "deleteParam", "setParam"]
     assert server.parameters.tree == server.tree.tree == {"a": {}, "c": 2}
     assert server.told == [("/a", "/me"), ("/a/b", None), ("/c", "/me")]
 
@@ -191,7 +191,7 @@ def test_a_run_beyond_the_bound() -> None:
         ("setParam", "/c", big),
         ("setParam", "/d", 1),
     )
-    assert [type(one) for one in answers] == [list, list, LimitReachedError, list]
+    assert [type(answer) for answer in answers] == [list, list, LimitReachedError, list]
     assert set(server.parameters.tree) == {"a", "b", "d"}
     assert server.parameters.weight <= 1100
 
@@ -203,7 +203,7 @@ def test_a_failing_part_and_a_lost_master() -> None:
     assert answers[1][0] == 1
     server.broken = CallFailedError("gone")
     answers = ordered(server, ("setParam", "/b", 1), ("deleteParam", "/a"))
-    assert [type(one) for one in answers] == [CallFailedError, CallFailedError]
+    assert [type(answer) for answer in answers] == [CallFailedError, CallFailedError]
     assert server.parameters.tree == {"a": 1}
     assert server.told == [("/a", "/me")]
 

@@ -190,7 +190,7 @@ RUNS = [[f"/arm/{run}_{place}" for place in range(64)] for run in range(3)]
 
 
 def told(answers: list[Any]) -> list[int]:
-    return [one[0][0] for one in answers]
+    return [answer[0][0] for answer in answers]
 
 
 async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
@@ -306,8 +306,8 @@ async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
     wanted: list[Value] = [part("getParam", "/arm/model")] * 100
     answers = await site.ask(OPERATOR, "system.multicall", wanted)
     assert len(answers) == 100
-    assert [one[0][0] for one in answers[:10]] == [1] * 10
-    assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
+    assert [answer[0][0] for answer in answers[:10]] == [1] * 10
+    assert all("more than 1000000 bytes; 90 more parts" in answer["faultString"] for answer in answers[10:])
     assert len(site.arrived) == 10
     assert site.trail.events == ["limit exceeded"]
     usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)

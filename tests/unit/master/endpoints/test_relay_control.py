@@ -248,9 +248,9 @@ async def test_a_lost_relay_loses_its_connections(world: World) -> None:
     relay, (first, second) = world.relay, world.links
     for link, topic in ((first, "/left"), (second, "/right")):
         link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"))
-    assert len({one.number for one in relay.carried.connections.values()}) == 2
+    assert len({connection.number for connection in relay.carried.connections.values()}) == 2
     second.end()
-    assert [one.resource for one in relay.carried.connections.values()] == ["/left"]
+    assert [connection.resource for connection in relay.carried.connections.values()] == ["/left"]
     assert (world.specifications.lost, relay.presence) == ([1], "1 of 2 are away")
     first.end()
     assert relay.presence == "away"

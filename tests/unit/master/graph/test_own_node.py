@@ -30,8 +30,8 @@ def decide(caller_id: str, method: str, resource: str) -> Decision:
     policy, call = compile_policy("[Nodes]\n", file="p.ini"), MASTER_CALLS[method]
     peer = Peer(ipaddress.ip_address("127.0.0.1"), "127.0.0.1", "127.0.0.1")
     arguments = tuple(
-        ApiUri(URI, parse_node_uri(URI)) if one in {CALLER_API, SERVICE_API} else resource
-        for one in call.method.parameters
+        ApiUri(URI, parse_node_uri(URI)) if parameter in {CALLER_API, SERVICE_API} else resource
+        for parameter in call.method.parameters
     )
     attempt = Attempt(Caller(peer, caller_id, 0, own=True), call, arguments)
     decision = CallGate(lambda: policy, Registry(), HostLimits()).decide(attempt, {})

@@ -51,7 +51,7 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
     world = ControlParts(store=store)
     await restored(world, store)
     [node] = world.registry.all()
-    assert [one.resource for one in node.registrations.values()] == ["/secret"]
+    assert [registration.resource for registration in node.registrations.values()] == ["/secret"]
     assert [world.places.socket(port).getsockname()[1] for port in node.ports] == [*node.ports]
     assert world.reload(POLICY.format("/secret=\n", "")) == 1
     await world.settle()

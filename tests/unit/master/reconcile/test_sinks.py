@@ -45,7 +45,7 @@ async def test_the_changes_of_a_turn_are_stored_together(
     append = WriteAhead.append
 
     def noted(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
-        written.append(sum(len(getattr(decoded(one.body), "rows", [one])) for one in changes))
+        written.append(sum(len(getattr(decoded(change.body), "rows", [change])) for change in changes))
         append(ahead, changes)
 
     decoded = msgspec.msgpack.Decoder(StoredChange).decode

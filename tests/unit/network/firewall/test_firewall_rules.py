@@ -215,9 +215,9 @@ def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
     both = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     six = PacketRule(chain=Chain.IN, purpose="six", verdict=PacketVerdict.DROP, source="fd00::/8")
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
-    assert [one.in_force for one in statuses((both, six), (four,), families=(4,))] == [True, True]
-    assert [one.in_force for one in statuses((both, six), (), families=(4,))] == [False, True]
-    assert [one.in_force for one in statuses((both, six), (four,))] == [False, False]
+    assert [status.in_force for status in statuses((both, six), (four,), families=(4,))] == [True, True]
+    assert [status.in_force for status in statuses((both, six), (), families=(4,))] == [False, True]
+    assert [status.in_force for status in statuses((both, six), (four,))] == [False, False]
 
 
 def test_a_rule_describes_itself() -> None:
@@ -347,7 +347,7 @@ def test_replication_and_lease_are_for_the_other_appliance() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", [one.name for one in fields(PacketRule)])
+@pytest.mark.parametrize("name", [field.name for field in fields(PacketRule)])
 def test_both_back_ends_translate_each_condition(name: str) -> None:
     """An ignored condition would match more packets. The other chains need nftables."""
     if name in ("purpose", "verdict", "chain"):

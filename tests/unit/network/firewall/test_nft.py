@@ -52,15 +52,15 @@ def test_the_owner_rule_in_libnftables_json() -> None:
 
 def test_each_chain_is_jumped_to_from_its_hooks() -> None:
     commands = render(appliance_rules(FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=11312)))
-    added = [one["add"] for one in commands]
+    added = [command["add"] for command in commands]
     chains = {body["chain"]["name"]: body["chain"] for body in added if "chain" in body}
     assert set(chains) == {"ROSRV-IN", "ROSRV-OUT", "ROSRV-IN-INPUT", "ROSRV-OUT-OUTPUT"}
     assert {chain["policy"] for chain in chains.values() if "hook" in chain} == {"accept"}
     jumps = [
         part["jump"]["target"]
-        for one in commands
-        if "rule" in one["add"]
-        for part in one["add"]["rule"]["expr"]
+        for command in commands
+        if "rule" in command["add"]
+        for part in command["add"]["rule"]["expr"]
         if "jump" in part
     ]
     assert sorted(jumps) == ["ROSRV-IN", "ROSRV-OUT"]

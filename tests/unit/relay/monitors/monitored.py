@@ -192,7 +192,7 @@ class MonitoredDialogue(Dialogue):
 
     def _kinds(self, *words: str) -> None:
         reports = [one for one in self.world.told if isinstance(one, MonitorsReported)]
-        assert {event.kind for one in reports for event in one.events} <= set(words)
+        assert {event.kind for report in reports for event in report.events} <= set(words)
 
 
 def _text(word: str) -> str:

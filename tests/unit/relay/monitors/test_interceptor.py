@@ -152,7 +152,7 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
     world.link.catch_up()
     world.until(lambda: any(getattr(one, "revision", 0) == 6 for one in world.told))
     answers = [one for one in world.told if isinstance(one, SpecificationsTaken | SpecificationsRefused)]
-    assert [one.statement for one in answers] == [1, 2, 3, 4, 5, 6]
+    assert [answer.statement for answer in answers] == [1, 2, 3, 4, 5, 6]
     assert isinstance(answers[3], SpecificationsRefused)
     assert world.engine.interceptor.wants("/other")
     assert not world.engine.interceptor.wants("/chatter")

@@ -127,8 +127,8 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
     ) | {"m8": 256}
     monitored.interceptor.observations.flush()
     changes: list[Any] = [one for one in monitored.sent() if getattr(one, "kind", "") == "change"]
-    assert {one.monitor for one in changes} == {"m8"}
-    assert sum(one.count or 1 for one in changes) == 256
+    assert {change.monitor for change in changes} == {"m8"}
+    assert sum(change.count or 1 for change in changes) == 256
     assert len(changes) <= 102
     monitored.close()
 
@@ -139,7 +139,7 @@ def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: T
     *_before, events, counters = told.monitored.heard.messages
     assert isinstance(events, MonitorsReported)
     assert isinstance(counters, MonitorsCounted)
-    assert [one.kind for one in events.events] == ["drop"]
+    assert [event.kind for event in events.events] == ["drop"]
     rows = {row.name: (row.events, row.drops) for row in counters.rows}
     assert rows == {"stop": (1, 0), "turn": (1, 0), "look": (1, 1)}
 
@@ -183,7 +183,7 @@ def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> 
         ("10.0.0.1", "/client0", 0),
         ("10.0.0.2", "/client0", 0),
     ]
-    assert [(one.host, one.caller_id, one.count) for one in counts] == [
+    assert [(count.host, count.caller_id, count.count) for count in counts] == [
         ("10.0.0.1", "", 49),
         ("10.0.0.2", "", 49),
     ]
@@ -199,7 +199,7 @@ def test_a_verdict_names_its_binding(together: bool) -> None:
     told = Told(together=together, texts=(turns,))
     told.send((5, 0, 0), (6, 0, 0), (5, 0, 0), (6, 0, 0))
     verdicts = told.events("verdict")
-    assert [(one.text, one.detail["binding"]) for one in verdicts] == [
+    assert [(verdict.text, verdict.detail["binding"]) for verdict in verdicts] == [
         ("property 1 of turns (ere) with x = 5.0: match", {"x": 5.0}),
         ("property 1 of turns (ere) with x = 6.0: match", {"x": 6.0}),
     ]
@@ -228,7 +228,7 @@ def test_counted_events_have_no_explanation(
     monkeypatch.setattr(observations, "_DISTINCT", 2)
     told = Told(together=together, texts=(AGAIN, TURNED))
     told.send(*[(x, 0, 0) for x in bindings], (5.0, 0, 2))
-    full = [one for one in told.events("verdict") if not one.count]
+    full = [event for event in told.events("verdict") if not event.count]
     assert full[-1].monitor == "turned"
     assert [len(one.detail["why"]["events"]) for one in full] == [1] * len(full)
     told.monitored.close()

@@ -32,8 +32,8 @@ def test_a_published_command_is_capped_dropped_and_recorded(monitors: QuietMonit
     assert sent == [0.22, 0.1]
     monitors.interceptor.observations.flush()
     events = [
-        one for said in monitors.reports.sent if isinstance(said, MonitorsReported) for one in said.events
+        event for said in monitors.reports.sent if isinstance(said, MonitorsReported) for event in said.events
     ]
-    assert [(one.kind, one.monitor, one.resource) for one in events] == [
+    assert [(event.kind, event.monitor, event.resource) for event in events] == [
         ("publish", "mux", "/cmd_vel"), ("drop", "cap", "/cmd_vel"), ("change", "cap", "/cmd_vel")
     ]  # fmt: skip

@@ -76,9 +76,9 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
         mine, other = (one.judge(topic, bytearray(body), now) for one in (monitors, whole))
         keeper.keep_all() if mine.before else keeper.keep(topic)
         check_same(unexplained(mine), unexplained(other))
-    for one in monitors.compiled.specifications:
-        for variable in one.variables:
-            known, found = (each.value(one.name, variable) for each in (monitors, whole))
+    for specification in monitors.compiled.specifications:
+        for variable in specification.variables:
+            known, found = (each.value(specification.name, variable) for each in (monitors, whole))
             assert repr(known) == repr(found)
 
 

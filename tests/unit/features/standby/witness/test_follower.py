@@ -570,7 +570,7 @@ def written(folder: Path, **changes: object) -> Path:
 def test_the_settings_of_a_follower_have_only_its_own_key(tmp_path: Path) -> None:
     settings = read_settings(str(written(tmp_path)))
     assert settings.follows_as == "arm"
-    assert [one.key for one in settings.appliances.values()] == [b"", b""]
+    assert [appliance.key for appliance in settings.appliances.values()] == [b"", b""]
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def test_its_patterns_compile_on_python_3_5() -> None:
         and isinstance(node.args[0].value, str)
     ]
     assert patterns
-    assert [one for one in patterns if newer.search(one)] == []
+    assert [pattern for pattern in patterns if newer.search(pattern)] == []
 
 
 def test_it_imports_only_the_standard_library() -> None:

@@ -31,7 +31,7 @@ def test_a_look_changes_nothing() -> None:
         answered(robot, request(do=operation, number=number, epoch=epoch))
         for number, (operation, epoch) in enumerate((("look", 1), ("claim", 1), ("look", 2)), 1)
     ]
-    assert [one and (one["ok"], one["epoch"], one["expired"]) for one in answers] == [
+    assert [answer and (answer["ok"], answer["epoch"], answer["expired"]) for answer in answers] == [
         (True, 1, True), (True, 2, False), (True, 2, False),
     ]  # fmt: skip
 
