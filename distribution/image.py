@@ -211,12 +211,12 @@ def lock(base: str, build_options: list[str]) -> None:
 def _rewrite(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
     tree = ImageFiles()
     with tarfile.open(saved) as archive:
-        entry = json.loads(_opened(archive, "manifest.json").read())[0]
-        config = json.loads(_opened(archive, entry["Config"]).read())
+        entry = json.loads(_open(archive, "manifest.json").read())[0]
+        config = json.loads(_open(archive, entry["Config"]).read())
         layers = []
         for number, name in enumerate(entry["Layers"]):
             tree.begin_layer()
-            with _opened(archive, name) as layer, tarfile.open(fileobj=layer) as members:
+            with _open(archive, name) as layer, tarfile.open(fileobj=layer) as members:
                 layers.append(_layer(work / f"layer{number}", _kept(members, tree, moment)))
     architecture = config["architecture"]
     labels = config["config"]["Labels"]
@@ -344,7 +344,7 @@ def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: 
                 archive.addfile(member, content)
 
 
-def _opened(archive: tarfile.TarFile, name: str) -> IO[bytes]:
+def _open(archive: tarfile.TarFile, name: str) -> IO[bytes]:
     member = archive.extractfile(name)
     assert member is not None, name  # noqa: S101  the engine wrote it
     return member

@@ -46,11 +46,11 @@ def parse_service_uri(text: str) -> NodeUri:
 
 
 def node_uri(host: str, port: int, path: str = "/") -> str:
-    return f"http://{_bracketed(host)}:{port}{path}"
+    return f"http://{_bracket(host)}:{port}{path}"
 
 
 def service_uri(host: str, port: int) -> str:
-    return f"rosrpc://{_bracketed(host)}:{port}"
+    return f"rosrpc://{_bracket(host)}:{port}"
 
 
 def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
@@ -96,5 +96,5 @@ def _complaint(text: str) -> str:
     return "has no valid host, port and path"
 
 
-def _bracketed(host: str) -> str:
+def _bracket(host: str) -> str:
     return f"[{host}]" if ":" in host else host

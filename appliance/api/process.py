@@ -84,7 +84,7 @@ class _Api:
         loop = asyncio.get_running_loop()
         # There are more threads than concurrent tasks, so a verification of the log never delays the check of a token.
         loop.set_default_executor(ThreadPoolExecutor(_THREADS, "api"))
-        self._lifeline.attach(loop, self._received, self._end)
+        self._lifeline.attach(loop, self._on_message, self._end)
         history = SampleHistory(lambda: measures_of(self._control))
         services = Services(
             self._settings, self._control, self._doorkeeper, self._journal, self._stopping, history
@@ -137,13 +137,13 @@ class _Api:
         self._given.set()
 
     def _context(self) -> ssl.SSLContext:
-        return tls_context(*self._certified())
+        return tls_context(*self._certify())
 
     async def _renew(self, context: ssl.SSLContext) -> None:
         while True:
             await asyncio.sleep(_RENEW_SECONDS)
             try:
-                if await asyncio.to_thread(renew, context, *self._certified()):
+                if await asyncio.to_thread(renew, context, *self._certify()):
                     _log.warning("REST has a new certificate, of the same key")
                     self._state_served()
             except (OSError, ValueError) as error:
@@ -153,7 +153,7 @@ class _Api:
         home = self._settings.state / "api"
         self._control.state_served(pin_of(home), fingerprint_of(home))
 
-    def _certified(self) -> tuple[Path, list[str], datetime.datetime]:
+    def _certify(self) -> tuple[Path, list[str], datetime.datetime]:
         address = self._settings.api_address
         names = self._settings.rest_names
         if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only
@@ -187,7 +187,7 @@ class _Api:
         except ChannelClosedError:
             self._stopping.set()
 
-    def _received(self, message: object, descriptors: tuple[int, ...]) -> None:
+    def _on_message(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.Ping(number):
                 self._report(messages.Pong(number))

@@ -41,9 +41,9 @@ class LogOutput(io.TextIOBase):
         self._lost, self._lost_since = 0, ""
         self._lock = threading.RLock()  # reentrant: a signal's handler may log while its thread does
         self._sending = self._retrying = False
-        os.register_at_fork(after_in_child=self._forked)
+        os.register_at_fork(after_in_child=self._on_fork)
 
-    def _forked(self) -> None:
+    def _on_fork(self) -> None:
         self._lock = threading.RLock()  # a thread that the child does not have may hold the other
 
     def fileno(self) -> int:

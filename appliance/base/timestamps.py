@@ -23,7 +23,7 @@ def parse_timestamp(text: str, now: int, zone: tzinfo | None = UTC) -> int:
     if ago is not None:
         return _bounded(now - int(float(ago[1]) * _UNITS[ago[2]] * _SECOND))
     try:
-        return parse_date(_dated(text, now, zone), zone)
+        return parse_date(_date(text, now, zone), zone)
     except ValueError as error:
         raise TimestampError(
             f"'{text}' is not a valid time: use 30s, 5m, 1h, 2d or 1w (that long ago), 10:32, yesterday,"
@@ -31,7 +31,7 @@ def parse_timestamp(text: str, now: int, zone: tzinfo | None = UTC) -> int:
         ) from error
 
 
-def _dated(text: str, now: int, zone: tzinfo | None) -> str:
+def _date(text: str, now: int, zone: tzinfo | None) -> str:
     found = re.fullmatch(
         r"(?:(today|yesterday)(?:[ T](?=.)|$))?(?:(\d\d:\d\d(?::\d\d)?)(Z|[+-]\d\d:\d\d)?)?", text, re.ASCII
     )

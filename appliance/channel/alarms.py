@@ -77,7 +77,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     for view, state in states_of(status):
         found += [(one.kind, one.about, one.text) for one in view.alarms(state)]
     alarms = (_alarm(kind, about, text) for kind, about, text in found)
-    return sorted(_handled(status, alarms), key=lambda alarm: _ORDER.index(alarm.severity))
+    return sorted(_handle(status, alarms), key=lambda alarm: _ORDER.index(alarm.severity))
 
 
 def _alarm(kind: str, about: About, text: str) -> Alarm:
@@ -100,10 +100,10 @@ def activity(status: Status) -> list[Alarm]:
         most = f" ({recent.most_denied})" if recent.most_denied else ""
         text = f"{counted(recent.denials, 'denial')} in the last minute{most}; rosrv audit summary --since 1m"
         found.insert(0, _alarm("denials", "audit", text))
-    return list(_handled(status, found))
+    return list(_handle(status, found))
 
 
-def _handled(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
+def _handle(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
     rows = {row.kind: row for row in status.handled_alarms}
     for alarm in alarms:
         row = rows.get(alarm.kind)

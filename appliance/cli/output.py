@@ -110,11 +110,11 @@ def row_lines(parts: Iterable[str], width: int | None, gap: str = _GAP) -> list[
     if width is None:
         return lines
     return [
-        folded for number, line in enumerate(lines) for folded in _folded(line.rstrip(), width, bool(number))
+        folded for number, line in enumerate(lines) for folded in _fold(line.rstrip(), width, bool(number))
     ]
 
 
-def _folded(line: str, width: int, indented: bool) -> list[str]:
+def _fold(line: str, width: int, indented: bool) -> list[str]:
     if len(line) <= width:
         return [line]
     return textwrap.wrap(

@@ -52,13 +52,13 @@ def joined(core: Verbs, *features: Verbs) -> Verbs:
     for name, added in itertools.chain.from_iterable(verbs.items() for verbs in features):
         names = [known for known, _verb in table]
         if name in names:
-            table[names.index(name)] = (name, _extended(name, dict(table)[name], added))
+            table[names.index(name)] = (name, _extend(name, dict(table)[name], added))
         else:
             table.insert(_place(names, added.after), (name, added))
     return dict(table)
 
 
-def _extended(name: str, known: Verb | Group, added: Verb | Group) -> Group:
+def _extend(name: str, known: Verb | Group, added: Verb | Group) -> Group:
     if isinstance(known, Group) and isinstance(added, Group):
         return Group(known.help or added.help, joined(known.verbs, added.verbs), known.after or added.after)
     raise ValueError(f"the verb {name} of a feature is already defined")

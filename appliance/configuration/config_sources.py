@@ -229,7 +229,7 @@ class _Gathered:
                 place = f"{file}:{key.start_mark.line + 1}"
                 name = str(key.value)
                 if name in seen:
-                    self._mistakes.append(Mistake(place, f"{_dotted((*path, name))} is given twice"))
+                    self._mistakes.append(Mistake(place, f"{_dotted_path((*path, name))} is given twice"))
                 seen.add(name)
                 self._places[*path, name] = place
                 self._note_places(file, value, (*path, name))
@@ -250,7 +250,7 @@ class _Gathered:
         if kind in ("unexpected_keyword_argument", "invalid_key"):
             return Mistake(place, _unknown_key(path))
         if kind == "missing":
-            return Mistake(place, f"{_dotted(path)} must be given")
+            return Mistake(place, f"{_dotted_path(path)} must be given")
         if kind == "value_error" and context:  # our own message
             return Mistake(place, f"{_about(path, place)}{context['error']}")
         wanted = must_be(error)
@@ -276,10 +276,10 @@ class _Gathered:
 
 
 def _about(path: KeyPath, place: str) -> str:
-    return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted(path)}: "
+    return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted_path(path)}: "
 
 
-def _dotted(path: KeyPath) -> str:
+def _dotted_path(path: KeyPath) -> str:
     return ".".join(map(str, path))
 
 
@@ -293,10 +293,12 @@ def _unknown_key(path: KeyPath) -> str:
         return f"{path[0]} is not a section any more: {_REMOVED[path[0]]}"
     known = sorted(_keys_at(Settings, path[:-1]))
     near = functools.partial(difflib.get_close_matches, str(path[-1]), known, n=1)
-    elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]  # on another level
+    elsewhere = [
+        _dotted_path(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]
+    ]  # on another level
     nearest = near(cutoff=0.75) or elsewhere[:1] or near(cutoff=0.5)
     advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
-    return f"unknown key {_dotted(path)}: {advice}"
+    return f"unknown key {_dotted_path(path)}: {advice}"
 
 
 def _with_absolute_paths(section: _Section) -> _Section:

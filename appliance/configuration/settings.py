@@ -86,12 +86,12 @@ class Unasked(str):
     __slots__ = ()
 
 
-def _checked_address(text: str) -> str:
+def _check_address(text: str) -> str:
     split_address(text)
     return text
 
 
-def _checked_endpoint(text: str | None) -> str | None:
+def _check_endpoint(text: str | None) -> str | None:
     if text is None:
         return None
     example = "for example 192.168.1.20 or robot.example.org"
@@ -114,13 +114,13 @@ def _none_if_empty(value: object) -> object:
     return None if value == "" else value  # compose passes an unset variable as ""
 
 
-def _checked_topic(text: str) -> str:
+def _check_topic(text: str) -> str:
     if text and _NODE_NAME.fullmatch(text) is None:
         raise ValueError(f"{text!r} is not a global topic name, for example /rosrv/heartbeat")
     return text
 
 
-def _checked_name(text: str) -> str:
+def _check_name(text: str) -> str:
     if _NODE_NAME.fullmatch(text) is None:
         raise ValueError(f"{text!r} is not a global node name, for example /rosrv")
     return text
@@ -130,8 +130,8 @@ def _off_as_text(value: object) -> object:
     return "off" if value is False else value  # YAML reads a bare `off` as false
 
 
-def _checked_api(text: str) -> str:
-    return text if text == "off" else _checked_address(text)
+def _check_api(text: str) -> str:
+    return text if text == "off" else _check_address(text)
 
 
 @section
@@ -232,7 +232,7 @@ class Relay:
         default=20.0,
         description="milliseconds after which a tick of a guard, or a message that it judged, is late: an alarm",
     )
-    heartbeat: Annotated[str, AfterValidator(_checked_topic)] = key(
+    heartbeat: Annotated[str, AfterValidator(_check_topic)] = key(
         default="",
         description="topic (std_msgs/Bool) of the heartbeat, a square wave of 10 Hz while every guard can act",
     )
@@ -291,7 +291,7 @@ class Ipsec:
     endpoint: Annotated[
         str | None,
         BeforeValidator(_none_if_empty),
-        AfterValidator(_checked_endpoint),
+        AfterValidator(_check_endpoint),
     ] = key(
         default=None,
         description="address or name at which hosts reach the appliance from outside, for their kits;"
@@ -378,7 +378,7 @@ class Settings:
         le=1_000_000,
         description="slices of a parametric specification: bindings monitored at the same time, about 700 bytes each",
     )
-    publish_as: Annotated[str, AfterValidator(_checked_name)] = key(
+    publish_as: Annotated[str, AfterValidator(_check_name)] = key(
         default="/rosrv", description="the node name under which monitors publish"
     )
     monitors_on_rosout: bool = key(
@@ -400,7 +400,7 @@ class Settings:
         description="directory of all data that must survive a restart; only `up` and `selftest` read this key, others"
         " use --state or ROSRV_STATE",
     )
-    listen: Annotated[str, AfterValidator(_checked_address)] = key(
+    listen: Annotated[str, AfterValidator(_check_address)] = key(
         default="0.0.0.0:11311", description="address where nodes find their master"
     )
     rosmaster_port: int = key(
@@ -422,7 +422,7 @@ class Settings:
         default="full",
         description="`monitored` tells nodes each other's real URIs; needs relaying: monitored",
     )
-    api: Annotated[str, BeforeValidator(_off_as_text), AfterValidator(_checked_api)] = key(
+    api: Annotated[str, BeforeValidator(_off_as_text), AfterValidator(_check_api)] = key(
         default_factory=lambda: Unasked("127.0.0.1:8443"),
         json_schema_extra={"default": "127.0.0.1:8443"},
         description="HOST:PORT of REST, or off; by default, another free port if this one is in use",

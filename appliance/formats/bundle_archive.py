@@ -61,7 +61,7 @@ def is_bundle_file(name: str) -> bool:
 def pack(files: Mapping[str, bytes]) -> bytes:
     """Return the archive. Raises `BundleArchiveError` if the files are not a valid bundle."""
     contents_of(files)
-    return _packed(files)
+    return _pack(files)
 
 
 def unpack(archive: bytes) -> BundleContents:
@@ -81,7 +81,7 @@ def unpack(archive: bytes) -> BundleContents:
     except (tarfile.TarError, OSError, ValueError, OverflowError) as error:
         raise BundleArchiveError(f"the archive is not a valid tar file: {error}") from error
     contents = contents_of(files)
-    if _packed(files) != archive:
+    if _pack(files) != archive:
         raise BundleArchiveError("the archive was not made by rosrv-fleet bundle add: make it again")
     return contents
 
@@ -130,7 +130,7 @@ def _text(name: str, data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _packed(files: Mapping[str, bytes]) -> bytes:
+def _pack(files: Mapping[str, bytes]) -> bytes:
     output = io.BytesIO()
     with tarfile.open(fileobj=output, mode="w", format=tarfile.USTAR_FORMAT) as tar:
         for name in sorted(files):

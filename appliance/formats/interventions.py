@@ -235,7 +235,7 @@ class Interventions:
         named = (detail.get(name) for name in ("name", "address", "token"))
         what = str(record.resource or next(filter(None, named), None) or record.host or "")
         change = CHANGES[record.event]
-        before, after = (_filled(text, detail) for text in change[:2])
+        before, after = (_fill(text, detail) for text in change[:2])
         sha256_before, sha256_after = (_hash(detail.get(name)) for name in change[2:])
         if change.text_after:
             sha256_before = self._earlier((record.event, what), sha256_before, sha256_after)
@@ -303,7 +303,7 @@ def _changed_lines(change: StateChange, detail: _Detail) -> Iterator[str]:
         yield "(too many changed lines for the record: compare the texts of both SHA-256)"
 
 
-def _filled(text: str, detail: _Detail) -> str:
+def _fill(text: str, detail: _Detail) -> str:
     """Return the text with the fields of a record, or an empty one if the record lacks one of them."""
     names = [name for _, name, _, _ in Formatter().parse(text) if name]
     if any(name not in detail for name in names):

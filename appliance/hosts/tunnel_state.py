@@ -83,7 +83,7 @@ class Tunnels:
         self._enclosed: messages.TunnelsEnclosed | None = None
         self._answered = asyncio.Event()
         self._opening = asyncio.Lock()
-        self._link = Link(self._received, self._lost)
+        self._link = Link(self._on_message, self._lost)
         self._certificate: bytes | None = None
         self._needed: messages.CertificateNeeded | None = None
         self._own_end = math.inf  # of charon's certificate, in seconds since the epoch
@@ -248,7 +248,7 @@ class Tunnels:
         if address is not None and address in self._blocked():
             self.state_anew()
 
-    def _received(self, message: object) -> None:
+    def _on_message(self, message: object) -> None:
         match message:
             case messages.CertificateNeeded():
                 self._spawn(message)
@@ -261,7 +261,7 @@ class Tunnels:
             case messages.TunnelRefused(remote, reason):
                 self._trail.happened("tunnel refused", reason, decision="deny", host=remote)
             case messages.TunnelsReported(taken, rows):
-                self._reported(rows)
+                self._on_report(rows)
                 # An unknown number is of an earlier process; if the clock was set back, it may be the greater one.
                 if taken in self._stated:
                     for number in [statement for statement in self._stated if statement <= taken]:
@@ -324,7 +324,7 @@ class Tunnels:
             )
             self._came_from(remote)
 
-    def _reported(self, rows: list[messages.TunnelSeen]) -> None:
+    def _on_report(self, rows: list[messages.TunnelSeen]) -> None:
         now = clock.wall()
         standing = {row.name: row for row in rows if row.name in self._table.rows}
         for name in set(self.seen) - set(standing):

@@ -80,7 +80,7 @@ def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | 
     require_private(path)
     data = path.read_bytes()
     encrypted = is_encrypted(data)
-    key = _decoded(path, data, passphrase if encrypted else None, encrypted=encrypted)
+    key = _decode(path, data, passphrase if encrypted else None, encrypted=encrypted)
     found = _kind(path, key)
     if found != kind:
         raise SignerKeyError(
@@ -92,7 +92,7 @@ def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | 
     return key
 
 
-def _decoded(path: Path, data: bytes, passphrase: bytes | None, *, encrypted: bool) -> Key:
+def _decode(path: Path, data: bytes, passphrase: bytes | None, *, encrypted: bool) -> Key:
     if encrypted and passphrase is None:
         raise SignerKeyError(
             f"{path} is encrypted: name the file that has its passphrase by {PASSPHRASE_SETTING} or"

@@ -146,7 +146,7 @@ def protection(
     ]
     inside = "loopback" if strict is None else f"{strict} of this machine"
     head = "    chain local {\n        type filter hook output priority filter; policy accept;\n"
-    chain = f"{head}{_indented(local)}    }}\n" if local else ""
+    chain = f"{head}{_indent(local)}    }}\n" if local else ""
     return (
         "#!/usr/sbin/nft -f\n"
         f"# Closes the ROS ports of this machine ({ports}) to all but {inside} and the appliance\n"
@@ -157,18 +157,18 @@ def protection(
         f"table inet {TABLE} {{\n"
         "    chain input {\n"
         "        type filter hook input priority filter; policy accept;\n"
-        f"{_indented(rules)}"
+        f"{_indent(rules)}"
         "    }\n"
         "    chain leaving {\n"
         "        type filter hook postrouting priority 300; policy accept;\n"
-        f"{_indented(leaving)}"
+        f"{_indent(leaving)}"
         "    }\n"
         f"{chain}"
         "}\n"
     )
 
 
-def _indented(rules: Sequence[str]) -> str:
+def _indent(rules: Sequence[str]) -> str:
     return "".join(f"        {rule}\n" for rule in rules)
 
 

@@ -79,7 +79,7 @@ def can_end_connections(namespace: Namespace) -> bool:
 
     def attempt() -> bool:
         with _diagnosis() as diag:
-            return bool(_diagnosed(diag, _SOCK_DESTROY, nothing, 1, _OF_NO_SOCKET)[1])
+            return bool(_diagnose(diag, _SOCK_DESTROY, nothing, 1, _OF_NO_SOCKET)[1])
 
     try:
         return namespace.run(attempt)
@@ -251,7 +251,7 @@ def _shut_down(one: TcpSocket, owner: SocketOwner | None) -> bool:
     with contextlib.suppress(OSError):
         process = os.pidfd_open(owner.pid)
         try:
-            copy = _copied(process, owner.descriptor)
+            copy = _copy(process, owner.descriptor)
         finally:
             os.close(process)
         with socket.socket(fileno=copy) as taken:
@@ -261,7 +261,7 @@ def _shut_down(one: TcpSocket, owner: SocketOwner | None) -> bool:
     return False
 
 
-def _copied(process: int, descriptor: int) -> int:
+def _copy(process: int, descriptor: int) -> int:
     copy = int(_libc().syscall(_PIDFD_GETFD, process, descriptor, 0))
     if copy < 0:
         raise OSError(ctypes.get_errno(), "pidfd_getfd")
@@ -279,17 +279,17 @@ def _destroy(diag: socket.socket, one: TcpSocket, number: int) -> bool:
     For a connection that has ended the kernel finds the listener of its port, and would destroy that. So the cookie of
     the connection itself comes first.
     """
-    answer, _ = _diagnosed(diag, _SOCK_DIAG_BY_FAMILY, one, number, _NO_COOKIE)
+    answer, _ = _diagnose(diag, _SOCK_DIAG_BY_FAMILY, one, number, _NO_COOKIE)
     if answer is None:
         return False
     state, cookie = _FOUND.unpack_from(answer)
     if state in _ENDED_STATES:
         return False
-    _, code = _diagnosed(diag, _SOCK_DESTROY, one, number, cookie)
+    _, code = _diagnose(diag, _SOCK_DESTROY, one, number, cookie)
     return not code
 
 
-def _diagnosed(
+def _diagnose(
     diag: socket.socket, kind: int, one: TcpSocket, number: int, cookie: int
 ) -> tuple[bytes | None, int]:
     """Return what the kernel tells of a connection, and the error if it is gone. Raises `OSError` for others."""

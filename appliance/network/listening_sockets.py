@@ -49,11 +49,11 @@ class TcpSocket(NamedTuple):
     @property
     def peer_address(self) -> str:
         """The peer's address, as IPv4 if it is mapped into IPv6."""
-        return _unmapped(self.peer)
+        return _unmap(self.peer)
 
     @property
     def local_address(self) -> str:
-        return _unmapped(self.address)
+        return _unmap(self.address)
 
 
 def tcp_sockets() -> list[TcpSocket]:
@@ -96,7 +96,7 @@ def _address(text: str) -> str:
     return str(ipaddress.ip_address(b"".join(int(word, 16).to_bytes(4, sys.byteorder) for word in words)))
 
 
-def _unmapped(text: str) -> str:
+def _unmap(text: str) -> str:
     address = ipaddress.ip_address(text)
     mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
     return str(mapped or address)

@@ -45,7 +45,7 @@ class PortHolder(NamedTuple):
 def port_holder(port: int) -> PortHolder | None:
     """Return a process that listens on the port in the thread's network namespace; None if none is visible."""
     owners = owners_of(listening_inodes(port))
-    return next((_described(Path("/proc", str(owner.pid))) for owner in owners.values()), None)
+    return next((_describe(Path("/proc", str(owner.pid))) for owner in owners.values()), None)
 
 
 def described(ports: list[int]) -> str:
@@ -54,7 +54,7 @@ def described(ports: list[int]) -> str:
     return f"{port_holder(ports[0]) or 'a program'} holds TCP {held}"
 
 
-def _described(process: Path) -> PortHolder:
+def _describe(process: Path) -> PortHolder:
     command, unit = b"", ""
     with suppress(OSError):
         command = (process / "cmdline").read_bytes()

@@ -218,7 +218,7 @@ class HostGroups:
         parts: list[str] = []
         length = 0
         for word, *limits in self.units(words):
-            part = " ".join([self._spelled_out(word), *(limit.text for limit in limits)])
+            part = " ".join([self._spell_out(word), *(limit.text for limit in limits)])
             if parts and length + len(part) > _SHOWN_LIMIT:
                 parts.append("…")
                 break
@@ -226,7 +226,7 @@ class HostGroups:
             length += len(part) + 2
         return ", ".join(parts)
 
-    def _spelled_out(self, word: Word) -> str:
+    def _spell_out(self, word: Word) -> str:
         text = word.text if len(word.text) <= _SHOWN_LIMIT else word.text[:_SHOWN_LIMIT] + "…"
         name = known_name(text)
         if name is not None:

@@ -423,12 +423,12 @@ class Policy:
 
     def _what(self, request: Request, may: str) -> str:
         phrase = BY_CATEGORY[request.category].phrases[request.category]
-        return f"{self.standing(request.host).text} {may} {phrase} {_shortened(request.resource)}"
+        return f"{self.standing(request.host).text} {may} {phrase} {_shorten(request.resource)}"
 
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
         if decider.extension:
-            deed = f"{decider.phrases[request.category]} {_shortened(request.resource)}"
+            deed = f"{decider.phrases[request.category]} {_shorten(request.resource)}"
             return Decision(True, None, f"no [{decider.name}] section: every host may {deed}")
         reason = (
             f"{self._what(request, 'may not')}: the policy has no [{decider.name}] section, so no host may"
@@ -481,11 +481,11 @@ def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
     return replace(decision, told=told)
 
 
-def _shortened(text: str, limit: int = 60) -> str:
+def _shorten(text: str, limit: int = 60) -> str:
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return shown if shown.isprintable() else quoted(text, limit)
 
 
 def place_of(rule: Rule) -> str:
     file = rule.file.rpartition("/")[2]
-    return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"
+    return f"[{rule.section}] {_shorten(rule.key, 50)} ({_shorten(file, 30)}:{rule.line})"

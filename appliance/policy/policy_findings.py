@@ -84,8 +84,8 @@ class Findings:
 
 def quoted(text: str, limit: int = 60) -> str:
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
-    return '"' + "".join(c if c.isprintable() and c != '"' else _escaped(c) for c in shown) + '"'
+    return '"' + "".join(c if c.isprintable() and c != '"' else _escape(c) for c in shown) + '"'
 
 
-def _escaped(character: str) -> str:
+def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode() if character != '"' else '\\"'

@@ -66,7 +66,7 @@ class DataPlane:
         self._pending = PendingConnections(loop.clock, self._table.quota_class, self.memory.headers)
         self.ports = ListeningPorts(
             self._context,
-            arrived=self._arrived,
+            arrived=self._on_arrival,
             turned_away=lambda key, host, reason: self._reporter.refused(key, NOTHING, host, "", reason),
             make_room=self._make_connection_room,
         )
@@ -411,14 +411,14 @@ class DataPlane:
 
     # --- peers --------------------------------------------------------------------------------------------
 
-    def _arrived(self, key: str, sock: socket.socket, host: str) -> None:
+    def _on_arrival(self, key: str, sock: socket.socket, host: str) -> None:
         incoming = IncomingConnection(
             self._context,
             sock,
             key,
             host,
             pending=self._pending,
-            introduced=self._introduced,
+            introduced=self._on_introduction,
             failed=self._incoming_failed,
         )
         self.incoming_connections.add(incoming)
@@ -454,7 +454,7 @@ class DataPlane:
             caller_id = fields.get("callerid", "")
             self._reporter.refused(incoming.key, asked_for(fields), incoming.host, caller_id, reason)
 
-    def _introduced(self, incoming: IncomingConnection) -> None:
+    def _on_introduction(self, incoming: IncomingConnection) -> None:
         if self._link is not None:
             self._link.catch_up()
         if incoming in self.incoming_connections:

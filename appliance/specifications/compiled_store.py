@@ -116,12 +116,12 @@ def toolchain(processor: Path = Path("/proc/cpuinfo")) -> str:
             digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
         for name in LIBRARIES:
             digest.update(f"{name} {version(name)}".encode())
-        digest.update("\n".join(_described(processor.read_text(errors="replace").splitlines())).encode())
+        digest.update("\n".join(_describe(processor.read_text(errors="replace").splitlines())).encode())
     except (OSError, PackageNotFoundError):
         return ""
     return digest.hexdigest()
 
 
-def _described(lines: Iterable[str]) -> list[str]:
+def _describe(lines: Iterable[str]) -> list[str]:
     """Return what the processors can do, once each."""
     return sorted({line for line in lines if line.partition("\t")[0].partition(":")[0].strip() in _PROCESSOR})

@@ -100,7 +100,7 @@ class SpecificationCompiler:
         require_bounded(sources)
         question = _wanted(sources, broken, at_start=at_start, lints=lints)
         if at_start:
-            answer = await self._asked_once(question, messages.ContentsFound)
+            answer = await self._ask_once(question, messages.ContentsFound)
         else:
             answer = await self._ordered(question, messages.ContentsFound)
         return checked(answer.contents, sources, site_keys)
@@ -125,12 +125,12 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        answer = await self._asked_once(
+        answer = await self._ask_once(
             lambda number: messages.PartsWanted(number, compiled, wanted), messages.PartsMade
         )
         return answer.parts
 
-    async def _asked_once(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
+    async def _ask_once(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
         wanted = question(0)
         last, answer = self._kept.get(kind, (None, None))
         if last == wanted and isinstance(answer, kind):

@@ -266,7 +266,7 @@ class EndTable:
         for row in self._store.ends():
             end = _End(row.at, row.since, bool(row.late), stored=True, date=row.date)
             if last is not None and taken_over:
-                end = _inherited(end, last, away_seconds, now)
+                end = _inherit(end, last, away_seconds, now)
             elif last is not None and now < last.age:
                 end = end._replace(at=end.at + now - last.age, since=end.since + now - last.age)
             self._ends.setdefault(row.kind, {})[row.name] = end
@@ -296,7 +296,7 @@ def _row(kind: str, name: str, end: _End) -> EndRow:
     return EndRow(kind, name, end.at, end.since, int(end.late), end.date)
 
 
-def _inherited(end: _End, last: _Reading, away_seconds: float | None, now: int) -> _End:
+def _inherit(end: _End, last: _Reading, away_seconds: float | None, now: int) -> _End:
     """Return the end of another appliance, with its last reading, by the clocks of this one.
 
     If this appliance did not follow the other one before, the difference of the clocks may include time off. Then an

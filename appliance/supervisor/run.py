@@ -67,10 +67,10 @@ def built_when_free(build: Callable[[], T], manager: ServiceManager, admin: sock
         return build()
     except PortInUseError as error:
         reason = str(error)
-    return asyncio.run(_built_later(build, reason, manager, admin))
+    return asyncio.run(_build_later(build, reason, manager, admin))
 
 
-async def _built_later(
+async def _build_later(
     build: Callable[[], T], reason: str, manager: ServiceManager, admin: socket.socket
 ) -> T | None:
     stopped, loop = asyncio.Event(), asyncio.get_running_loop()
@@ -81,12 +81,12 @@ async def _built_later(
         while True:
             try:
                 async with _said(f"waits: {reason}", manager, admin):
-                    return await _retried(build, reason, stopped)
+                    return await _retry(build, reason, stopped)
             except PortInUseError as error:
                 reason = str(error)
 
 
-async def _retried(build: Callable[[], T], reason: str, stopped: asyncio.Event) -> T | None:
+async def _retry(build: Callable[[], T], reason: str, stopped: asyncio.Event) -> T | None:
     """Return what `build` returns, or None if `stopped` is set. Raises `PortInUseError` for another reason."""
     began = clock.now()
     while True:

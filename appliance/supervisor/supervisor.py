@@ -154,7 +154,7 @@ class Supervisor:
         self._watchdog = IsolationWatchdog(
             isolation or NoIsolation(), self._tell_control, self._record_restored
         )
-        self.reports = ProcessCallbacks(self._received, self._violated, self.died)
+        self.reports = ProcessCallbacks(self._on_message, self._on_violation, self.died)
         self._work = work or NoMachineWork()
         self._gives_back = gives_back
         self.stopping = asyncio.Event()
@@ -338,17 +338,17 @@ class Supervisor:
 
     # --- messages of children -----------------------------------------------------------------------------
 
-    def _received(self, process: ProcessHandle, message: object, descriptors: tuple[int, ...]) -> None:
+    def _on_message(self, process: ProcessHandle, message: object, descriptors: tuple[int, ...]) -> None:
         decisive = self._gate.accepts.get(process.role, ())
         allowed = _FROM_ANY + decisive + _FROM.get(process.role, ())
         if not isinstance(message, allowed):
             for descriptor in descriptors:
                 os.close(descriptor)
-            self._violated(process, f"sent {type(message).__name__}, which it may not send")
+            self._on_violation(process, f"sent {type(message).__name__}, which it may not send")
             return
         match message:
             case messages.Walled():
-                self._sandboxed(process, message)
+                self._on_sandboxed(process, message)
             case messages.Pong():
                 process.note_answer()
             case messages.Ready(detail):
@@ -374,10 +374,10 @@ class Supervisor:
             process.send(messages.HeartbeatGiven(line=True), (line,))
             os.close(line)
 
-    def _sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
+    def _on_sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
         """Note the limits of a process, which only its first message may report."""
         if process.sandbox is not None:
-            self._violated(process, "reported its sandbox twice")
+            self._on_violation(process, "reported its sandbox twice")
             return
         process.sandbox = sandbox
         lacks = tuple(_printable(lack) for lack in sandbox.lacks)
@@ -452,7 +452,7 @@ class Supervisor:
     def _keep(self, process: ProcessHandle, name: str, descriptor: int) -> None:
         if name == ADMIN:
             os.close(descriptor)
-            self._violated(process, "sent a socket under the name of the admin socket")
+            self._on_violation(process, "sent a socket under the name of the admin socket")
             return
         try:
             self.kept.keep(name, descriptor)
@@ -473,7 +473,7 @@ class Supervisor:
         try:
             said = msgspec.convert(detail, ControlReady)
         except msgspec.ValidationError as error:
-            self._violated(process, f"reported ready without an address: {error}")
+            self._on_violation(process, f"reported ready without an address: {error}")
             return
         self._serving = process
         self._tell_deaths()
@@ -573,12 +573,12 @@ class Supervisor:
     def _answer(self, process: ProcessHandle, work: Coroutine[object, object, None]) -> None:
         if self._unanswered >= _MAX_UNANSWERED:
             work.close()
-            self._violated(process, f"sent more than {_MAX_UNANSWERED} requests at once")
+            self._on_violation(process, f"sent more than {_MAX_UNANSWERED} requests at once")
             return
         self._unanswered += 1
-        self._spawn(work).add_done_callback(self._answered)
+        self._spawn(work).add_done_callback(self._on_answer)
 
-    def _answered(self, _task: asyncio.Task[None]) -> None:
+    def _on_answer(self, _task: asyncio.Task[None]) -> None:
         self._unanswered -= 1
 
     async def _route(self, process: ProcessHandle, host: str) -> None:
@@ -625,15 +625,15 @@ class Supervisor:
     def _spawn(self, work: Coroutine[object, object, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._finished)
+        task.add_done_callback(self._on_finish)
         return task
 
-    def _finished(self, task: asyncio.Task[None]) -> None:
+    def _on_finish(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             _log_fault(task.get_loop(), {"message": "a task failed", "exception": error})
 
-    def _violated(self, process: ProcessHandle, what: str) -> None:
+    def _on_violation(self, process: ProcessHandle, what: str) -> None:
         log.critical("process is killed", role=process.role, pid=process.pid, reason=f"it {what}")
         process.reason = f"the supervisor killed it, because it {what}"
         process.kill()

@@ -107,7 +107,7 @@ def work(job: bytes) -> bytes:
                 f"the worker has version {_version()}, the command {envelope.version}; install the same"
             )
         else:
-            with _limited(_SECONDS + _SECONDS_PER_MB * envelope.job.recording.size / 1e6) as seconds:
+            with _limit(_SECONDS + _SECONDS_PER_MB * envelope.job.recording.size / 1e6) as seconds:
                 result = _result(envelope.job)
     except SpecificationError as error:
         result = Failure(_text(str(error)), [_text(str(finding)) for finding in error.findings])
@@ -121,7 +121,7 @@ def work(job: bytes) -> bytes:
 
 
 @contextmanager
-def _limited(seconds: float) -> Iterator[float]:
+def _limit(seconds: float) -> Iterator[float]:
     """Raise `_TooLong` in the block when it has used the processor for this time.
 
     Each message has limits, but timers and few bytes can make many messages slow. Unlike elapsed time, processor time

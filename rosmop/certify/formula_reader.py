@@ -116,19 +116,19 @@ def formula(text: str, events: Sequence[str], grammar: Grammar) -> Node:
     unary, levels = grammar
     signs = {"(", ")", "[", "]", ",", *unary, *(sign for level in levels for sign in level)}
     words = WordReader(text, [sign for sign in signs if not sign.isidentifier()])
-    node = _joined(words, events, grammar, len(levels) - 1, 0)
+    node = _join(words, events, grammar, len(levels) - 1, 0)
     words.end()
     return node
 
 
-def _joined(words: WordReader, events: Sequence[str], grammar: Grammar, level: int, depth: int) -> Node:
+def _join(words: WordReader, events: Sequence[str], grammar: Grammar, level: int, depth: int) -> Node:
     if level < 0:
         return _operand(words, events, grammar, depth)
-    node = _joined(words, events, grammar, level - 1, depth)
+    node = _join(words, events, grammar, level - 1, depth)
     while words.word in grammar[1][level]:
         operator = grammar[1][level][words.take()]
         _unbounded(words, grammar)
-        node = (operator, node, _joined(words, events, grammar, level - 1, depth))
+        node = (operator, node, _join(words, events, grammar, level - 1, depth))
     return node
 
 
@@ -141,7 +141,7 @@ def _operand(words: WordReader, events: Sequence[str], grammar: Grammar, depth: 
         _unbounded(words, grammar)
         return (operator, _operand(words, events, grammar, depth + 1))
     if words.accept("("):
-        node = _joined(words, events, grammar, len(levels) - 1, depth + 1)
+        node = _join(words, events, grammar, len(levels) - 1, depth + 1)
         words.expect(")")
         return node
     word = words.take()

@@ -535,10 +535,10 @@ class FlowAnalysis:
             why = frozenset({("nearest", self._site)}) if nan else EMPTY
             return AbstractValue(math.inf if nan else UNKNOWN, why, inputs=inputs)
         if word != name and arguments and isinstance(node.arguments[0].type, value_types.FloatingType):
-            return self._calculated(node, word, arguments, inputs)
+            return self._calculate(node, word, arguments, inputs)
         return AbstractValue(inputs=inputs)
 
-    def _calculated(
+    def _calculate(
         self, node: nodes.Call, word: str, arguments: Sequence[AbstractValue], inputs: frozenset[str]
     ) -> AbstractValue:
         """Return the result of a function of `<math.h>` of floating-point numbers."""

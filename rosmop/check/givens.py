@@ -77,13 +77,13 @@ def _number(kind: value_types.Type, text: str, position: Position) -> int | floa
 def with_topics(specification: tree.Specification, given: Mapping[str, str]) -> tree.Specification:
     topics = {one.name: one.topic for one in specification.givens if isinstance(one, tree.TopicDeclaration)}
     topics |= {name: topic for name, topic in given.items() if name in topics}
-    renamed: tree.Specification = _renamed(specification, topics) if topics else specification
+    renamed: tree.Specification = _rename(specification, topics) if topics else specification
     return renamed
 
 
-def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
+def _rename(node: Any, topics: Mapping[str, str]) -> Any:
     if isinstance(node, tuple):
-        return tuple(_renamed(part, topics) for part in node)
+        return tuple(_rename(part, topics) for part in node)
     if not isinstance(node, tree.SyntaxNode) or isinstance(node, tree.TopicDeclaration):
         return node
     changed: dict[str, Any] = {}
@@ -91,7 +91,7 @@ def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
         if field.name == "topic":
             changed[field.name] = topics.get(part, part)
         elif isinstance(part, tuple | tree.SyntaxNode):
-            changed[field.name] = _renamed(part, topics)
+            changed[field.name] = _rename(part, topics)
     return replace(node, **changed)
 
 

@@ -123,7 +123,7 @@ def _put_together(function: str, operands: Operands) -> Value:
         ):
             hint = "; there is no pointer arithmetic: write `std::string(…).substr(1)`"
             raise operands.refused("+", hint)
-    texts = (_joined(operands, operands.left), _joined(operands, operands.right))
+    texts = (_join(operands, operands.left), _join(operands, operands.right))
     return operands.value(nodes.Call(value_types.STRING, function, texts, operands.site))
 
 
@@ -134,7 +134,7 @@ def _text_hint(left: Value, right: Value) -> str:
     return "; write an index, `[0]`" if isinstance(other.type, value_types.VectorType) else ""
 
 
-def _joined(operands: Operands, value: Value) -> nodes.Expression:
+def _join(operands: Operands, value: Value) -> nodes.Expression:
     if isinstance(value.type, value_types.IntegerType) and value.type == value_types.CHAR:
         return nodes.Call(value_types.STRING, "t_byte", (value.form,))
     if value_types.is_number(value.type):

@@ -101,7 +101,7 @@ class _Rewriting:
                 return false; }}"""
         members += f" bool {p}violates(double late) {{ return {'!' if self._requires else ''}({test}); }}"
         clear = f"{p}any = false;" if self._within is None else f"{p}values.clear(); {p}times.clear();"
-        made = self._parsed(
+        made = self._parse(
             f"{members} event e() /t std_msgs/Empty '{{}}' {{ }} void keep() {{ double value = 0;"
             f" if ({p}open && value == value) {{ {keep} }} }}"
             f" void opens() {{ if (!{p}open) {{ {clear} {p}open = true; }} }}"
@@ -166,7 +166,7 @@ class _Rewriting:
             if alias != self._alias:
                 self._refuse(f"`@{alias}` is not the message that this pattern names; write `@{self._alias}`")
         expression = _REFERENCE.sub(rf"{_INSIDE}\2", condition)
-        made = self._parsed(f"bool f() {{ return {expression}; }}")
+        made = self._parse(f"bool f() {{ return {expression}; }}")
         [returned] = made.functions[0].body.statements
         assert isinstance(returned, tree.ReturnStatement)  # as written above
         test = returned.value
@@ -208,7 +208,7 @@ class _Rewriting:
             raise SpecificationError(error.findings) from None
         return within
 
-    def _parsed(self, members: str) -> tree.Specification:
+    def _parse(self, members: str) -> tree.Specification:
         position = self._node.formula_position
         try:
             [specification] = parse(f"s() {{ {members} }}", position.file).specifications

@@ -125,7 +125,7 @@ def initial(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator
 ) -> tuple[value_types.Type, nodes.Expression]:
     if name.name == ("auto",):
-        return _deduced(scope, declarator)
+        return _deduce(scope, declarator)
     kind = resolve(name, scope.messages)
     if kind == value_types.VOID:
         raise SpecificationError.at(name.position, "a variable cannot be void")
@@ -139,7 +139,7 @@ def initial(
     return kind, converted(scope, declarator.value, kind)
 
 
-def _deduced(scope: FunctionScope, declarator: tree.Declarator) -> tuple[value_types.Type, nodes.Expression]:
+def _deduce(scope: FunctionScope, declarator: tree.Declarator) -> tuple[value_types.Type, nodes.Expression]:
     if declarator.value is None or isinstance(declarator.value, tree.InitializerList) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
     value = scope.value_of(declarator.value)

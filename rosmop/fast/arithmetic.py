@@ -206,14 +206,14 @@ class ArithmeticCodegen(FunctionBuilder):
             return code + to_floating(one, other, signed=is_signed(source))
         assert isinstance(target, value_types.IntegerType)  # noqa: S101  a number has one of three types
         if isinstance(source, value_types.FloatingType):
-            return self._truncated(code + (F64_PROMOTE_F32 if one == F32 else b""), target)
+            return self._truncate(code + (F64_PROMOTE_F32 if one == F32 else b""), target)
         if one == other:
             return code + _narrowed(target)
         if other == I64:
             return code + (I64_EXTEND_I32_S if is_signed(source) else I64_EXTEND_I32_U)
         return code + I32_WRAP_I64 + _narrowed(target)
 
-    def _truncated(self, code: bytes, target: value_types.IntegerType) -> bytes:
+    def _truncate(self, code: bytes, target: value_types.IntegerType) -> bytes:
         if target.bits >= 32:
             return code + _TRUNCATE[64 if target.bits == 64 else 32, target.signed]
         code += I32_TRUNC_SAT_F64_S + self._set("cut")
@@ -229,10 +229,10 @@ class ArithmeticCodegen(FunctionBuilder):
         if operator in ("<<", ">>") and machine_type(node.right.type) != machine:
             right += I32_WRAP_I64 if machine == I32 else I64_EXTEND_I32_U
         if operator in ("/", "%") and machine in (I32, I64):
-            return self._divided(node, left, right)
+            return self._divide(node, left, right)
         return left + right + calculate(machine, operator, signed=is_signed(node.type))
 
-    def _divided(self, node: nodes.Arithmetic, left: bytes, right: bytes) -> bytes:
+    def _divide(self, node: nodes.Arithmetic, left: bytes, right: bytes) -> bytes:
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("dividend", "divisor"))
         code = left + self._set(one, machine) + right + self._set(other, machine)
@@ -313,10 +313,10 @@ class ArithmeticCodegen(FunctionBuilder):
 
     def _moment(self, node: nodes.Moment) -> bytes:
         both = self._value(node.left) + self._value(node.right)
-        return self._limited(node.type, both + calculate(I64, node.operator))
+        return self._limit(node.type, both + calculate(I64, node.operator))
 
     def _moment_of(self, node: nodes.MomentOf) -> bytes:
-        return self._limited(
+        return self._limit(
             node.type, self._of_parts(self._value(node.seconds), self._value(node.nanoseconds))
         )
 
@@ -329,7 +329,7 @@ class ArithmeticCodegen(FunctionBuilder):
         code += self._get(names[0], I64) + constant(I64, BILLION) + I64_MUL
         return code + self._get(names[1], I64) + I64_ADD
 
-    def _limited(self, kind: Type, code: bytes) -> bytes:
+    def _limit(self, kind: Type, code: bytes) -> bytes:
         least, most = (
             (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
         )
@@ -347,8 +347,8 @@ class ArithmeticCodegen(FunctionBuilder):
             value += I64_EXTEND_I32_S if is_signed(new.type) else I64_EXTEND_I32_U
         old = self._value(moment)
         if part.value == b"sec":
-            return self._limited(node.type, self._of_parts(value, old + self._nanoseconds()))
-        return self._limited(node.type, self._of_parts(old + self._seconds(), value))
+            return self._limit(node.type, self._of_parts(value, old + self._nanoseconds()))
+        return self._limit(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
         code, value = self._set("moment", I64), self._get("moment", I64)
@@ -363,7 +363,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return rest + whole + constant(I64, BILLION) + I64_DIV_S
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
-        code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
+        code = self._limit(kind, moment) + self._seconds() + self._set("whole", I64)
         low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
         return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR
 

@@ -194,7 +194,7 @@ def written(
     exports = {f"settle {number}": number for number in settled}
     exports |= {feed.name: len(wholes) + place for place, feed in enumerate(feeds.values())}
     wholes += [(_PARAMETERS, I64, code) for code in codes]
-    code = _assembled(wholes, exports, writer.constants, memory)
+    code = _assemble(wholes, exports, writer.constants, memory)
     return WasmModule(
         code,
         memory,
@@ -227,7 +227,7 @@ def written_of(compiled: Compiled) -> WasmModule:
     return written(compiled.functions, components, ValueCodec(compiled.messages), compiled.stamped)
 
 
-def _assembled(
+def _assemble(
     functions: Sequence[tuple[Sequence[int], int, bytes]],
     exports: Mapping[str, int],
     constants: Mapping[bytes, int],

@@ -92,14 +92,14 @@ def part_of(compiled: Compiled, names: Collection[str], shadows: Collection[str]
     acting = alone.without(shadows)
     module = written_of(acting)
     check_steps(acting, module)
-    return SetPart(alone, _translated(module))
+    return SetPart(alone, _translate(module))
 
 
 def fast_path_of(compiled: Compiled) -> WasmFastPath:
-    return WasmFastPath(_translated(written_of(compiled)))
+    return WasmFastPath(_translate(written_of(compiled)))
 
 
-def _translated(module: WasmModule) -> CompiledModule:
+def _translate(module: WasmModule) -> CompiledModule:
     return CompiledModule(
         code=translated(module.code, module.memory), memory=module.memory, frames=module.frames,
         effects=module.effects, feeds=module.feeds, cells=module.cells, throttles=module.throttles,

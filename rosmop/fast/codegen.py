@@ -610,14 +610,12 @@ class _FunctionCodegen(StringCodegen):
         code += constant(F64, inf) + self._set(least, F64)
         begin, end, zero = self._get(first, I64), self._get(last, I64), constant(I64, 0)
         wraps = begin + end + compare(I64, ">")
-        straight = self._scanned(vector, place, (begin, end), least)
-        around = self._scanned(vector, place, (begin, count), least)
-        around += self._scanned(vector, place, (zero, end), least)
+        straight = self._scan(vector, place, (begin, end), least)
+        around = self._scan(vector, place, (begin, count), least)
+        around += self._scan(vector, place, (zero, end), least)
         return code + self._when(wraps, lambda: around, lambda: straight) + self._get(least, F64)
 
-    def _scanned(
-        self, vector: nodes.Expression, place: bytes, limits: tuple[bytes, bytes], least: str
-    ) -> bytes:
+    def _scan(self, vector: nodes.Expression, place: bytes, limits: tuple[bytes, bytes], least: str) -> bytes:
         kind, size = self._writer.element(vector.type)
         at, left, each = (f"{what} {len(self._locals)}" for what in ("element", "left", "each"))
         code = place + limits[0] + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD + self._set(at)

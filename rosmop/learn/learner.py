@@ -91,17 +91,17 @@ def _topic(name: str, rows: list[Candidate], known: LearntFacts) -> str:
     fields = ", ".join(f"{path}:{short}" for path, short in names.items())
     lines = [f"// {topic} ({kind}): {on(rows[0].support)}.", f"{name}() {{"]
     scalars = [row for row in checks if not row.folded]
-    declared = _once(piece for row in scalars for piece in _filled(row, row.state, names))
-    first = _once(piece for row in scalars for piece in _filled(row, row.first, names))
-    then = _once(piece for row in scalars for piece in _filled(row, row.then, names))
+    declared = _once(piece for row in scalars for piece in _fill(row, row.state, names))
+    first = _once(piece for row in scalars for piece in _fill(row, row.first, names))
+    then = _once(piece for row in scalars for piece in _fill(row, row.then, names))
     own = f"{known.short[topic]}_"
     timed = any("elapsed" in row.condition for row in checks)
     begun = any("begun" in text for row in checks for text in (row.condition, *row.first))
     clock = timed or any("now" in text for row in checks for text in (row.condition, *row.first))
     state = [*declared, *["double {t}before = 0.0;"] * timed, *["bool {t}begun = false;"] * begun]
     lines += [f"    {line.replace('{t}', own)}" for line in state] + [""] * bool(state)
-    lines += _wrapped(f"    event message({parameters}) {topic} {kind}")
-    lines += _wrapped(f"            '{{{fields}}}' {{")
+    lines += _wrap(f"    event message({parameters}) {topic} {kind}")
+    lines += _wrap(f"            '{{{fields}}}' {{")
     body = ["double now = ros::Time::now().toSec();"] * clock
     if timed:
         body.append(f"double elapsed = std::max(now - {{t}}before, {number(period)});")
@@ -131,7 +131,7 @@ def _property(row: Candidate) -> list[str]:
 
 
 def _check(row: Candidate, names: Mapping[str, str]) -> list[str]:
-    (condition,) = _filled(row, (row.condition,), names)
+    (condition,) = _fill(row, (row.condition,), names)
     size = f"{_short(row, names)}.size()"
     if row.length is not None and row.element is None:
         condition = f"{size} != {row.length} || {condition}"
@@ -147,7 +147,7 @@ def _loop(rows: list[Candidate], names: Mapping[str, str]) -> list[str]:
         f"for (int i = 0; i < {_short(rows[0], names)}.size(); i++) {{"
     ]
     for row in rows:
-        (condition,) = _filled(row, (row.condition,), names)
+        (condition,) = _fill(row, (row.condition,), names)
         lines += [f"    {line}" for line in _alarm(condition, [_warning(row, names), "break;"])]
     return [*lines, "}"]
 
@@ -163,7 +163,7 @@ def _warning(row: Candidate, names: Mapping[str, str]) -> str:
     text = f"{formatted(row.topic)} {formatted(row.says)}"
     if not row.shown:
         return f'ROS_WARN_THROTTLE({_TOLD_EVERY}, "{text}");'
-    (shown,) = _filled(row, (row.shown,), names)
+    (shown,) = _fill(row, (row.shown,), names)
     form = "%s" if shown.endswith("c_str()") else "%ld" if shown.startswith("(long)") else "%g"
     return f'ROS_WARN_THROTTLE({_TOLD_EVERY}, "{text}: {form}", {shown});'
 
@@ -175,7 +175,7 @@ def _comment(row: Candidate) -> str:
     return one_line(text)
 
 
-def _wrapped(line: str) -> list[str]:
+def _wrap(line: str) -> list[str]:
     indent = " " * 12
     return textwrap.wrap(line, 118, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
@@ -184,7 +184,7 @@ def _once(pieces: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(pieces))
 
 
-def _filled(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
+def _fill(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
     value = _short(row, names)
     name = value
     if row.element is not None:

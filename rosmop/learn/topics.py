@@ -78,10 +78,10 @@ class TopicContent(msgspec.Struct):
     def merged(self, other: "TopicContent") -> "TopicContent":
         result = TopicContent(
             merged_rows(self.numbers, other.numbers, Series.merged),
-            merged_rows(self.elements, other.elements, _merged_elements),
+            merged_rows(self.elements, other.elements, _merge_elements),
             merged_rows(self.sets, other.sets, ValueSeries.merged),
             merged_rows(self.lengths, other.lengths, ValueSeries.merged),
-            merged_rows(self.moves, other.moves, _merged_moves),
+            merged_rows(self.moves, other.moves, _merge_moves),
             self.ages.merged(other.ages), self.leads.merged(other.leads), self.counts.merged(other.counts),
             self.backward or other.backward,
         )  # fmt: skip
@@ -98,12 +98,12 @@ class TopicContent(msgspec.Struct):
         return self.sets[path] if path in self.sets else self.numbers[path].values
 
 
-def _merged_elements(one: list[Series], other: list[Series]) -> list[Series]:
+def _merge_elements(one: list[Series], other: list[Series]) -> list[Series]:
     # Arrays of different lengths are left out afterwards, by `limit`.
     return [a.merged(b) for a, b in zip(one, other, strict=False)]
 
 
-def _merged_moves(one: Moves, other: Moves) -> Moves:
+def _merge_moves(one: Moves, other: Moves) -> Moves:
     return merged_rows(one, other, int.__add__)
 
 

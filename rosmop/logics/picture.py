@@ -56,17 +56,17 @@ def to_dot(compiled: CompiledProperty) -> str | None:
     if diagram is None:
         return None
     lines = [
-        f"digraph {_quoted(compiled.logic)} {{",
+        f"digraph {_quote(compiled.logic)} {{",
         "  rankdir=LR;",
         "  node [shape=box, style=rounded];",
         '  start [shape=point, label=""];',
         f"  start -> {diagram.initial};",
     ]
     for number, box in diagram.states.items():
-        label = _quoted(f"{box.name}\\n{box.other_categories}" if box.other_categories else box.name)
+        label = _quote(f"{box.name}\\n{box.other_categories}" if box.other_categories else box.name)
         lines.append(f"  {number} [label={label}{', peripheries=2' if box.double else ''}];")
     lines += [
-        f"  {source} -> {target} [label={_quoted(events)}];"
+        f"  {source} -> {target} [label={_quote(events)}];"
         for (source, target), events in diagram.edges.items()
     ]
     return "\n".join([*lines, "}", ""])
@@ -92,7 +92,7 @@ def _name(compiled: CompiledProperty, state: int) -> str:
     return MODES[state % len(MODES)] if isinstance(compiled, TimedPattern) else str(state)
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return '"' + text.replace('"', '\\"') + '"'
 
 
@@ -134,7 +134,7 @@ def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
             _edge(states[source], states[target], events)
             for (source, target), events in diagram.edges.items()
         ]
-        parts += [_drawn(state) for state in states.values()]
+        parts += [_draw(state) for state in states.values()]
         top = max(state.y for state in states.values()) + _ROW
         right = max(right, *(state.x for state in states.values()))
     if not parts:
@@ -177,7 +177,7 @@ def _placed(diagram: Diagram, top: int) -> dict[int, _State]:
     return states
 
 
-def _drawn(state: _State) -> str:
+def _draw(state: _State) -> str:
     inner = ""
     if state.double:
         inner = (
@@ -197,16 +197,16 @@ def _edge(at: _State, to: _State, events: str) -> str:
     if at is to:
         x, y = at.x + _WIDTH // 2, at.y
         path = f"M{x - 20} {y}C{x - 35} {y - 34} {x + 35} {y - 34} {x + 20} {y}"
-        return _labelled(path, x, y - 30, shown)
+        return _label(path, x, y - 30, shown)
     if to.x > at.x:
         x1, y1, x2, y2 = at.x + _WIDTH, at.y + _HEIGHT // 2, to.x, to.y + _HEIGHT // 2
         path = f"M{x1} {y1}C{x1 + 60} {y1} {x2 - 60} {y2} {x2} {y2}"
-        return _labelled(path, (x1 + x2) // 2, (y1 + y2) // 2 - 6, shown)
+        return _label(path, (x1 + x2) // 2, (y1 + y2) // 2 - 6, shown)
     x1, y1, x2, y2 = at.x + _WIDTH // 2, at.y + _HEIGHT, to.x + _WIDTH // 2, to.y + _HEIGHT
     depth = max(y1, y2) + 40
-    return _labelled(f"M{x1} {y1}C{x1} {depth} {x2} {depth} {x2} {y2}", (x1 + x2) // 2, depth - 6, shown)
+    return _label(f"M{x1} {y1}C{x1} {depth} {x2} {depth} {x2} {y2}", (x1 + x2) // 2, depth - 6, shown)
 
 
-def _labelled(path: str, x: int, y: int, label: str) -> str:
+def _label(path: str, x: int, y: int, label: str) -> str:
     text = f'<text class="event" x="{x}" y="{y}" {_EVENT}>{label}</text>'
     return f'<path class="edge" d="{path}" {_LINE}/>{text}'

@@ -241,7 +241,7 @@ class Validation:
         if topic not in self._module.feeds:
             return ProofFinding(topic, name, IN_PYTHON)
         try:
-            return ProofFinding(topic, name, self._compared(self._pair(topic, event, place)))
+            return ProofFinding(topic, name, self._compare(self._pair(topic, event, place)))
         except DiffersError as error:
             return ProofFinding(topic, name, f"not equal: {error}", differs=True)
         except NotProvedError as error:
@@ -273,16 +273,16 @@ class Validation:
         if of_budget is not None:
             raise DiffersError(f"{BUDGET_ONLY}, for {of_budget}")
 
-    def _compared(self, event: EventPair) -> str:
+    def _compare(self, event: EventPair) -> str:
         states, before = self._states(event), self._runs.compared
         self._search(event, islice(states, _FIRST_STATES))
-        answer = self._decided(event, states)
+        answer = self._decide(event, states)
         if answer == EQUAL and self._runs.compared == before:
             self._search(event, states)
             return EQUAL if self._runs.compared > before else LEFT
         return answer
 
-    def _decided(self, event: EventPair, states: Iterable[EventState]) -> str:
+    def _decide(self, event: EventPair, states: Iterable[EventState]) -> str:
         effort = Effort(self._patience)
         try:
             return self._answer(event, effort, states)

@@ -119,7 +119,7 @@ class Loops:
         while True:
             sizes = [len(log) for log in logs]
             again, left = body(State(state.alive, state.slots | constants))
-            back = _joined(again)
+            back = _join(again)
             changed = {
                 key: head(number, key, before)
                 for key, before in state.slots.items()
@@ -219,7 +219,7 @@ def _same(one: object, other: object) -> bool:
     return type(one) is type(other) and bool(one == other)
 
 
-def _joined(states: Sequence[State]) -> State:
+def _join(states: Sequence[State]) -> State:
     alive = [state for state in states if not z3.is_false(state.alive)]
     if not alive:
         return State(z3.BoolVal(False), {})
@@ -230,6 +230,6 @@ def _joined(states: Sequence[State]) -> State:
 
 
 def become(state: State, states: Sequence[State]) -> State:
-    end = _joined(states)
+    end = _join(states)
     state.alive, state.slots = end.alive, end.slots or state.slots
     return state

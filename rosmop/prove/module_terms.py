@@ -224,7 +224,7 @@ class ModuleExecution:
             else:
                 if rest.startswith(("div_", "rem_")):
                     self._divides(rest, state, stack)
-                stack.append(_calculated(family, rest, instruction.operands, stack))
+                stack.append(_calculate(family, rest, instruction.operands, stack))
 
     def _divides(self, name: str, state: State, stack: Sequence[Value]) -> None:
         left, right = _bits(stack[-2]), _bits(stack[-1])
@@ -526,7 +526,7 @@ def _truth(value: Value) -> Term:
     return as_term(value) if z3.is_bool(value) else opposite(_bits(value) == 0)
 
 
-def _calculated(family: str, name: str, operands: Sequence[float], stack: list[Value]) -> Value:
+def _calculate(family: str, name: str, operands: Sequence[float], stack: list[Value]) -> Value:
     if name == "const":
         bits = int(family[1:])
         return integer(int(operands[0]), bits) if family[0] == "i" else floating(operands[0], bits)
@@ -562,7 +562,7 @@ def _converting(to: Callable[..., Term], sort: Sort) -> Callable[[Term], Term]:
     return lambda value: to(NEAREST, _bits(value), sort)
 
 
-def _shifted(operation: Callable[[Term, Term], Term]) -> Callable[[Term, Term], Term]:
+def _shift(operation: Callable[[Term, Term], Term]) -> Callable[[Term, Term], Term]:
     return lambda value, amount: operation(value, amount & (amount.size() - 1))
 
 
@@ -640,9 +640,9 @@ _OF_INTEGERS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
         "and": lambda left, right: left & right,
         "or": lambda left, right: left | right,
         "xor": lambda left, right: left ^ right,
-        "shl": _shifted(lambda left, right: left << right),
-        "shr_s": _shifted(lambda left, right: left >> right),
-        "shr_u": _shifted(z3.LShR),
+        "shl": _shift(lambda left, right: left << right),
+        "shr_s": _shift(lambda left, right: left >> right),
+        "shr_u": _shift(z3.LShR),
     }
 )
 _OF_FLOATS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(

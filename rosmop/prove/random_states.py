@@ -124,7 +124,7 @@ class RandomStates:
         else:  # the same message again, or with a few other numbers
             for _ in range(random.choice((0, 1, 1, 2))):
                 self._fields = self._changed(self._fields, self._kind)
-            message = self._encoded()
+            message = self._encode()
         self._now = state.now + random.choice((0, 10**6, 10**8))
         variables = {name: after[name] for name in self._kinds}
         for name in random.sample([*variables], k=min(len(variables), random.choice((0, 1, 1, 2)))):
@@ -138,7 +138,7 @@ class RandomStates:
         self._zeros = random.choice((0.0, 0.75))
         self._fields = self._value(self._kind)
         self._zeros = 0.0
-        raw, chance = bytearray(self._encoded()), random.random()
+        raw, chance = bytearray(self._encode()), random.random()
         if chance < 0.04:
             del raw[random.randrange(len(raw) + 1) :]
         elif chance < 0.08 and len(raw) >= 4:
@@ -148,7 +148,7 @@ class RandomStates:
             raw += bytes(random.randrange(1, 20))
         return bytes(raw)
 
-    def _encoded(self) -> bytes:
+    def _encode(self) -> bytes:
         raw = bytearray()
         self._values.encoder(self._kind)(self._fields, raw)
         return bytes(raw)

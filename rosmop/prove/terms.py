@@ -236,7 +236,7 @@ class Abstraction:
             waiting.pop()
             if term.get_id() not in known:
                 new = [known[part.get_id()][1] for part in parts]
-                abstract = _abstracted(term, new, floats=self._floats)
+                abstract = _abstract(term, new, floats=self._floats)
                 known[term.get_id()] = term, abstract
                 if term.decl().kind() in _COMMUTATIVE and abstract.decl().kind() == z3.Z3_OP_UNINTERPRETED:
                     *mode, one, other = new
@@ -244,7 +244,7 @@ class Abstraction:
         return [*(known[term.get_id()][1] for term in begin), *self._laws]
 
 
-def _abstracted(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
+def _abstract(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
     kind, parts = term.decl().kind(), term.children()
     sorts = [part.sort() for part in (*parts, term)]
     if floats and any(sort.kind() in _FLOATING for sort in sorts):

@@ -129,7 +129,7 @@ class BoundedMcap:
         chunk = next(self._stream(self._file), None)
         if not isinstance(chunk, Chunk):
             raise ValueError("its index does not fit its chunks")
-        data = _unpacked(chunk)
+        data = _unpack(chunk)
         self._charge(len(chunk.data) + len(data))
         return breakup_chunk(replace(chunk, compression="", data=data))
 
@@ -143,7 +143,7 @@ class BoundedMcap:
             raise ValueError(f"it unpacks to more than {PER_BYTE} times its size")
 
 
-def _unpacked(chunk: Chunk) -> bytes:
+def _unpack(chunk: Chunk) -> bytes:
     limit = regular_files.LARGEST_CHUNK
     if chunk.compression == "lz4":
         data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, limit + 1)

@@ -199,7 +199,7 @@ class MonitorExecution:
             for monitor in judging:
                 alone = judge([monitor]) if len(judging) > 1 else None
                 if alone is None:
-                    self._exceeded(monitor, lane.topic, outcome)
+                    self._on_excess(monitor, lane.topic, outcome)
                     continue
                 outcome.events = (*outcome.events, *alone.events)
                 outcome.log = [*outcome.log, *alone.log]
@@ -234,7 +234,7 @@ class MonitorExecution:
             judging += [monitor] if judges else []
         return judging, heard
 
-    def _exceeded(self, monitor: MonitorInstance, channel: str, outcome: Outcome) -> None:
+    def _on_excess(self, monitor: MonitorInstance, channel: str, outcome: Outcome) -> None:
         """Note that a message of an observed topic, of which the monitor has seen nothing, is over its budget.
 
         The state is that of the message before. It counts on if the ages of all events of the topic do.

@@ -659,13 +659,13 @@ class _Maker:
 
     def _moment(self, node: nodes.Moment) -> _Value:
         result = self._both(_CALCULATED[node.operator], node.left, node.right)
-        return self._then(result, _limited(node.type, node.site))
+        return self._then(result, _limit(node.type, node.site))
 
     def _moment_of(self, node: nodes.MomentOf) -> _Value:
         result = self._both(
             lambda seconds, nanoseconds: seconds * BILLION + nanoseconds, node.seconds, node.nanoseconds
         )
-        return self._then(result, _limited(node.type, node.site))
+        return self._then(result, _limit(node.type, node.site))
 
     def _compare(self, node: nodes.Compare) -> _Value:
         kind, compare = node.left.type, _CALCULATED[node.operator]
@@ -883,7 +883,7 @@ def wrapping(kind: value_types.IntegerType) -> Callable[[int], int]:
     return lambda value: (value + half & mask) - half
 
 
-def _limited(kind: Type, site: int) -> Callable[[int], int]:
+def _limit(kind: Type, site: int) -> Callable[[int], int]:
     limit = times.time if kind == value_types.TIME else times.duration
     return lambda nanoseconds: limit(nanoseconds, site)
 

@@ -135,7 +135,7 @@ class Slices:
         self._first: Slice
         self._holder: Holder = None
         self._now = 0
-        self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
+        self._known = {domain: _Known() for domain in _join(_domain(event) for event in code.events)}
         self.quota: Quota[Binding] = Quota(self.limit)
         self._ended: Quota[tuple[int, Key]] = Quota(self.limit)
         self._forgotten = 0
@@ -621,7 +621,7 @@ def _key(values: Mapping[int, Value], domain: int) -> Key:
     return (True, *(values[number] for number in _members(domain)))
 
 
-def _joined(domains: Iterator[int]) -> list[int]:
+def _join(domains: Iterator[int]) -> list[int]:
     found: set[int] = set()
     for domain in domains:
         found |= {domain, *(domain | other for other in found)}

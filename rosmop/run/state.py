@@ -82,7 +82,7 @@ def states_of(
     lost: dict[str, str] = {}
     for group in groups:
         try:
-            states = _decoded(group)
+            states = _decode(group)
         except (ValueError, struct.error, LookupError, TypeError) as error:
             states = f"its state cannot be read: {error}"
         if isinstance(states, PartSnapshot):
@@ -103,7 +103,7 @@ _DECODER: msgspec.msgpack.Decoder[list[MonitorSnapshot] | PartSnapshot | str] = 
 _NAMES = msgspec.msgpack.Decoder(CellNames | None)
 
 
-def _decoded(group: GroupSnapshot) -> list[MonitorSnapshot] | PartSnapshot | str:
+def _decode(group: GroupSnapshot) -> list[MonitorSnapshot] | PartSnapshot | str:
     _, names_of, base, cells = group
     states, names = _DECODER.decode(base), _NAMES.decode(names_of)
     if not isinstance(states, list) or cells is None or names is None:

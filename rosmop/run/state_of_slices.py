@@ -65,11 +65,11 @@ class SliceParts:
                 self._take(self._parts[number], binding, None if holder is None else str(holder))
             except StateTooLargeError as error:
                 self._failed[number][binding] = str(error)
-        return {number: self._encoded(number) for number in dirty}
+        return {number: self._encode(number) for number in dirty}
 
     def all(self) -> list[bytes]:
         self.changed()
-        return [self._encoded(number) for number in range(BUCKETS)]
+        return [self._encode(number) for number in range(BUCKETS)]
 
     def _take(
         self, part: dict[Binding, tuple[int, bool, msgspec.Raw]], binding: Binding, holder: str | None
@@ -90,7 +90,7 @@ class SliceParts:
         record = SliceSnapshot(number, domain, [*key[1:]], holder, ended, *state)
         part[binding] = number, ended, msgspec.Raw(msgspec.msgpack.encode(record))
 
-    def _encoded(self, number: int) -> bytes:
+    def _encode(self, number: int) -> bytes:
         for reason in self._failed[number].values():
             return msgspec.msgpack.encode(reason)
         return msgspec.msgpack.encode(_Written([record for _, _, record in self._parts[number].values()]))

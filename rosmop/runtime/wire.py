@@ -116,7 +116,7 @@ def rows(
 def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
     if number > FEW:
         context.walk(number)
-    return _skipped(buffer, start, number, end, context)
+    return _skip(buffer, start, number, end, context)
 
 
 def skip_inner(
@@ -124,10 +124,10 @@ def skip_inner(
 ) -> int:
     """Like `skip` within a skipped element: there may be many such calls, so even a few elements are charged."""
     context.walk(number + 1)
-    return _skipped(buffer, start, number, end, context)
+    return _skip(buffer, start, number, end, context)
 
 
-def _skipped(
+def _skip(
     buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
 ) -> int:
     for first in range(0, number, PART):

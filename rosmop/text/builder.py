@@ -657,7 +657,7 @@ def _is_builtin(child: object) -> bool:
     return isinstance(child, Token) and child.type == "BUILTIN"
 
 
-def _unquoted(token: Token) -> str:
+def _unquote(token: Token) -> str:
     try:
         return _string_bytes(token[1:-1]).decode("utf-8", "replace")
     except _LiteralError:
@@ -674,7 +674,7 @@ def _string_bytes(inner: str) -> bytes:
     last = 0
     for found in _ESCAPE.finditer(inner):
         result += inner[last : found.start()].encode("utf-8", "surrogatepass")
-        result.append(_escaped(found[1]))
+        result.append(_escape(found[1]))
         last = found.end()
     return bytes(result + inner[last:].encode("utf-8", "surrogatepass"))
 
@@ -687,7 +687,7 @@ def _character_value(inner: str) -> int:
 
 
 def _resource(name: Token, kind: Token) -> tuple[str, str]:
-    names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (name, kind)]
+    names = [_unquote(child) if child.type == "STRING" else str(child) for child in (name, kind)]
     return names[0], names[1].replace("::", "/")
 
 
@@ -705,7 +705,7 @@ def _duration_ns(text: str) -> int:
     return int(result)
 
 
-def _escaped(code: str) -> int:
+def _escape(code: str) -> int:
     if code[0] == "x" and len(code) > 1:
         return int(code[1:], 16)
     if code[0] in "01234567":

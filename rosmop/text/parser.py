@@ -316,7 +316,7 @@ def parse(text: str, file: str) -> tree.SpecificationFile:
             start.within(text, broken.start()), "these bytes are not UTF-8; save the file as UTF-8"
         )
     _check_directives(text, file)
-    result = made(_built(text, file), roles)
+    result = made(_build(text, file), roles)
     if not result.specifications and not result.orders:
         raise SpecificationError.at(
             start, "there is no specification in this file; write `name() { event … }`"
@@ -324,7 +324,7 @@ def parse(text: str, file: str) -> tree.SpecificationFile:
     return result
 
 
-def _built(text: str, file: str) -> tree.TypedFile:
+def _build(text: str, file: str) -> tree.TypedFile:
     parsed = _parse(text, file)
     _check_depth(parsed, file)
     builder = TreeBuilder(file, text)
@@ -336,7 +336,7 @@ def _built(text: str, file: str) -> tree.TypedFile:
 @lru_cache(maxsize=1)
 def roles() -> Mapping[str, tree.RoleDeclaration]:
     """Return the roles that every file has."""
-    return {role.name: role for role in _built(ROLES, "the roles").roles}
+    return {role.name: role for role in _build(ROLES, "the roles").roles}
 
 
 def _parse(text: str, file: str) -> Tree[Token]:

@@ -169,7 +169,7 @@ class _Joining:
         self._exports[path] = set(exports)
         bound = f"const {','.join(head)};\n" if head else ""
         given = ",".join(f"{name}:{value}" for name, value in exports.items())
-        text = _tightened(body).strip()
+        text = _tighten(body).strip()
         self._scopes.append(f"{self._constant(path)}??=(()=>{{{bound}{text}\nreturn {{{given}}};}})();\n")
         self._open.pop()
 
@@ -213,7 +213,7 @@ class _Joining:
         return token._replace(text="$late")
 
 
-def _tightened(pieces: list[_Token]) -> str:
+def _tighten(pieces: list[_Token]) -> str:
     kept: list[_Token] = []
     gap = ""
     for piece in pieces:

@@ -76,7 +76,7 @@ class ControlLink:
         self._blocks_stated = blocks_stated
         self._running: list[LongRequest] = []
         self._lost = lost
-        self._link = Link(self._received, self._ended)
+        self._link = Link(self._on_message, self._ended)
         self._kept: deque[RestCalled] = deque()
         self._dropped = 0
         self._served = RestServed("")
@@ -208,7 +208,7 @@ class ControlLink:
     def close(self) -> None:
         self._link.close()
 
-    def _received(self, message: object) -> None:
+    def _on_message(self, message: object) -> None:
         match message:
             case RequestAnswered(number, answer):
                 self._link.answered(number, answer)

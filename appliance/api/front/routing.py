@@ -193,7 +193,7 @@ class Routes(APIRouter):
             good = {"content": content(kind), **({"headers": ETAG} if tagged else {})}
             options["responses"] = {200: {"description": "OK", **good}} | (options.get("responses") or {})
             options["response_model"] = None
-            endpoint = _encoded(endpoint)
+            endpoint = _encode(endpoint)
         super().add_api_route(path, endpoint, **options)
 
 
@@ -225,7 +225,7 @@ def _operations_at(request: Request) -> dict[str, Any]:
     return paths[max(fitting, key=len) + own] if fitting else {}
 
 
-def _encoded(endpoint: Callable[..., Awaitable[object]]) -> Callable[..., Awaitable[Response]]:
+def _encode(endpoint: Callable[..., Awaitable[object]]) -> Callable[..., Awaitable[Response]]:
     @functools.wraps(endpoint)
     async def answered(*arguments: object, **named: object) -> Response:
         given = await endpoint(*arguments, **named)

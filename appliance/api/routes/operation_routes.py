@@ -157,7 +157,7 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
     has_model = given is not Response
     options: dict[str, object] = {"response_model": given} if has_model else {"response_class": Response}
     router.add_api_route(
-        _converted(operation.path),
+        _convert(operation.path),
         endpoint,
         name=operation.name,
         description=inspect.cleandoc(operation.words),
@@ -169,7 +169,7 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
     )
 
 
-def _converted(path: str) -> str:
+def _convert(path: str) -> str:
     for name, converted in CONVERTORS.items():
         path = path.replace(name, converted)
     return path

@@ -94,7 +94,7 @@ def plain_record(record: AuditRecord) -> AuditRecord:
     if not isinstance(detail, dict):
         detail = {"value": detail}
     if len(_encoder.encode(detail)) > LARGEST_DETAIL:
-        detail = _shortened(detail)
+        detail = _shorten(detail)
     return AuditRecord(
         id=_text(record.id), time=_integer(record.time) or 0, event=_text(record.event),
         severity=record.severity if isinstance(record.severity, Severity) else Severity.NOTICE,
@@ -106,7 +106,7 @@ def plain_record(record: AuditRecord) -> AuditRecord:
     )  # fmt: skip
 
 
-def _shortened(detail: dict[str, object]) -> dict[str, object]:
+def _shorten(detail: dict[str, object]) -> dict[str, object]:
     sizes = {key: len(_encoder.encode({key: value})) for key, value in detail.items()}
     kept, room = {}, LARGEST_DETAIL // 4
     for key in sorted(sizes, key=sizes.__getitem__):

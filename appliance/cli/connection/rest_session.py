@@ -47,7 +47,7 @@ class RestClient:
     ) -> None:
         """Raises `ValueError` if a token must not be sent to this URL. The default transport is the network."""
         self.url, secure = _place_of(url)
-        self._token = _checked_token(token)
+        self._token = _check_token(token)
         if ca_file is not None and not secure:
             raise ValueError(f"--api-ca is for https, but {self.url} is clear text")
         self._client = httpx.Client(
@@ -210,7 +210,7 @@ def _place_of(url: str) -> tuple[str, bool]:
     return f"{parts.scheme}://{parts.netloc}", parts.scheme == "https"
 
 
-def _checked_token(token: str | None) -> str:
+def _check_token(token: str | None) -> str:
     text = (token or "").strip()
     if not text:
         raise ValueError(f"no access token: put it into the environment as ROSRV_TOKEN; {_MAKE}")

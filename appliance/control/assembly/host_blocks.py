@@ -42,7 +42,7 @@ class BlockTable:
         self._store = store
         self._ends = ends
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
-        self.reasons: Mapping[Address, str] = self._described()
+        self.reasons: Mapping[Address, str] = self._describe()
         self.uses = HostUses()
         self._listeners: list[Callable[[], None]] = []
 
@@ -87,11 +87,11 @@ class BlockTable:
         return row
 
     def _changed(self) -> None:
-        self.reasons = self._described()
+        self.reasons = self._describe()
         for changed in self._listeners:
             changed()
 
-    def _described(self) -> dict[Address, str]:
+    def _describe(self) -> dict[Address, str]:
         return {address: self._description(row) for address, row in self._rows.items()}
 
     def _description(self, row: HostBlockRow) -> str:

@@ -165,7 +165,7 @@ class Policies(Revisions[RevisionRow]):
         within, note = request.confirm_within, reloaded_by(who)
         async with self.changing(request.expected):
             try:
-                policy, signature = await self._prepared(lambda: read_policy(self.file), str(self.file), who)
+                policy, signature = await self._prepare(lambda: read_policy(self.file), str(self.file), who)
             except PolicyRefusedError as error:
                 self._note_refused(error.findings[0])
                 raise
@@ -180,10 +180,10 @@ class Policies(Revisions[RevisionRow]):
         """Begin rights again that a wrong clock ended, as each load does."""
         self.ends.forget(self.changes, *self.ends.names(self.changes))
         self.time_passed()
-        return self._loaded(self.revision, 0)
+        return self._load(self.revision, 0)
 
     async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
-        await asyncio.to_thread(self._tested, lambda: (text, signature), "policy.ini", self.known, cases)
+        await asyncio.to_thread(self._test, lambda: (text, signature), "policy.ini", self.known, cases)
 
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a given text into force. Raises `PolicyRefusedError` and `RevisionChangedError`.
@@ -200,7 +200,7 @@ class Policies(Revisions[RevisionRow]):
             if now.who != DISK and (now.text, now.signature) == given:
                 return self._unchanged()
             name = f"revision {self.revision + 1}"
-            policy, signature = await self._prepared(lambda: given, name, who, cases)
+            policy, signature = await self._prepare(lambda: given, name, who, cases)
             return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
 
     def hosts_changed(self) -> int:
@@ -284,7 +284,7 @@ class Policies(Revisions[RevisionRow]):
 
     # --- inside ---
 
-    async def _prepared(
+    async def _prepare(
         self, read: Callable[[], tuple[str, str]], file: str, who: str, cases: PolicyCases | None = None
     ) -> tuple[Policy, str]:
         """Prepare in a thread, so that nodes are not delayed; return the policy with its signature."""
@@ -292,7 +292,7 @@ class Policies(Revisions[RevisionRow]):
         try:
             while True:
                 known = self.known
-                policy, signature = await asyncio.to_thread(self._tested, read, file, known, cases)
+                policy, signature = await asyncio.to_thread(self._test, read, file, known, cases)
                 now = self.known
                 if (now.hosts, now.own) == (known.hosts, known.own):
                     break
@@ -328,7 +328,7 @@ class Policies(Revisions[RevisionRow]):
             revision=self.revision,
         )
 
-    def _tested(
+    def _test(
         self,
         read: Callable[[], tuple[str, str]],
         file: str,
@@ -377,7 +377,7 @@ class Policies(Revisions[RevisionRow]):
             revoked=revoked,
             warnings=[*lost, *map(str, policy.warnings)][:100],
         )
-        return self._loaded(before, revoked, lost)
+        return self._load(before, revoked, lost)
 
     def _enforce(self, policy: Policy) -> int:
         before = self.policy() if self.policy else None
@@ -428,7 +428,7 @@ class Policies(Revisions[RevisionRow]):
                 self.ends.forget(self.changes, name)
                 self.ends.set(self.changes, name, 0.0)
 
-    def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
+    def _load(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
         warnings = [*lost, *map(str, self.current.warnings)]
         return Loaded(self.revision, before, warnings, revoked, self.confirm_by)
 

@@ -154,7 +154,7 @@ class ControlLifeline:
         self._heard: Heard = self.queue
 
     def attach(self) -> None:
-        self.channel.attach(asyncio.get_running_loop(), self._received, self._closed)
+        self.channel.attach(asyncio.get_running_loop(), self._on_message, self._on_close)
 
     def hear(self, heard: Heard) -> None:
         early, self._early, self._heard = self._early, {}, heard
@@ -213,13 +213,13 @@ class ControlLifeline:
         try:
             self.channel.send(message, descriptors)
         except ChannelClosedError:
-            self._closed()
+            self._on_close()
 
-    def _closed(self) -> None:
+    def _on_close(self) -> None:
         _log.warning("the link to the supervisor is closed")
         self._stopping.set()
 
-    def _received(self, message: object, descriptors: tuple[int, ...]) -> None:
+    def _on_message(self, message: object, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.Ping(number):
                 self.say(messages.Pong(number))

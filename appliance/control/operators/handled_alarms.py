@@ -34,7 +34,7 @@ class HandledAlarms:
         }
         if len(kept) < len(self._rows):
             self._keep(kept)
-        return msgspec.structs.replace(status, handled_alarms=[self._dated(row) for row in kept.values()])
+        return msgspec.structs.replace(status, handled_alarms=[self._date(row) for row in kept.values()])
 
     def state(self, kind: str) -> str:
         row = self._rows.get(kind)
@@ -62,7 +62,7 @@ class HandledAlarms:
         self._keep({other: row for other, row in self._rows.items() if other != kind})
         return True
 
-    def _dated(self, row: HandledAlarm) -> HandledAlarm:
+    def _date(self, row: HandledAlarm) -> HandledAlarm:
         until = None if row.until is None else self._ends.date(SILENCES, row.kind)
         return msgspec.structs.replace(row, until=until)
 

@@ -79,7 +79,7 @@ class TokenOrders:
 
     def usable(self) -> list[TokenKept]:
         """Return the usable tokens, as the api gets them; the api also checks `expires`."""
-        tokens = {row.id: self._dated(row) for row in self._rows.values() if self._is_usable(row)}
+        tokens = {row.id: self._date(row) for row in self._rows.values() if self._is_usable(row)}
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
@@ -253,13 +253,13 @@ class TokenOrders:
     def _is_usable(self, row: TokenRow) -> bool:
         return row.revoked is None and not self._ends.passed(TOKENS, row.id)
 
-    def _dated(self, row: TokenRow) -> TokenRow:
+    def _date(self, row: TokenRow) -> TokenRow:
         """Return the token with its end by the present system clock."""
         date = self._ends.date(TOKENS, row.id)
         return row if date is None or abs(date - row.expires) < _SAME_DATE else row._replace(expires=date)
 
     def _shown(self, row: TokenRow) -> answers.Token:
-        return answers.Token(*_fields(self._dated(row)), self._uses.get(row.id), self._is_usable(row))
+        return answers.Token(*_fields(self._date(row)), self._uses.get(row.id), self._is_usable(row))
 
 
 def _require_lifetime(seconds: float) -> None:

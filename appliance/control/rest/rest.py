@@ -134,7 +134,7 @@ class RestLink:
         self._tokens = tokens
         self._askers = RequestAuthenticator(tokens, require_proof=require_proof)
         self._trail = trail
-        self._link = Link(self._received, self._lost, self._took)
+        self._link = Link(self._on_message, self._lost, self._took)
         self._connected = connected
         self._uses = uses
         self._waiting: deque[RequestMade] = deque()
@@ -151,7 +151,7 @@ class RestLink:
         self._withdrawn = {}
         self.state_tokens()
 
-    def _received(self, message: object) -> None:
+    def _on_message(self, message: object) -> None:
         match message:
             case RequestMade(number):
                 if len(self._waiting) >= _MAX_WAITING:

@@ -127,7 +127,7 @@ class AdoptPart:
             waiting=lambda: registrar.subscribers.delivery.waiting,
             silence=registrar.silence,
             speak=registrar.speak,
-            passed=self._passed,
+            passed=self._on_step,
             stored=self._stored,
         )
         self._one = asyncio.Lock()
@@ -273,7 +273,7 @@ class AdoptPart:
         answer = await self._registrar.call(host, local, method, params)
         return answer if isinstance(answer, list) else [0, "no answer", 0]
 
-    async def _passed(self, step: str) -> None:
+    async def _on_step(self, step: str) -> None:
         log.info("adoption", step=step)
         self._save()
 

@@ -73,7 +73,7 @@ async def release_dead(state: Path) -> GiveBackReport:
     except StartError as error:
         raise NetworkError(str(error)) from None
     try:
-        with _opened(state) as store:
+        with _open(state) as store:
             return await _release(state, store)
     except (AdoptError, StoreError) as error:
         raise NetworkError(str(error)) from None
@@ -115,7 +115,7 @@ def port_of_master(state: Path) -> int:
 
 
 @contextlib.contextmanager
-def _opened(state: Path) -> Iterator[StateStore]:
+def _open(state: Path) -> Iterator[StateStore]:
     """Open control's state as its owner, so that no file of root is left in it."""
     folder = state / "control"
     try:
@@ -246,7 +246,7 @@ def release(
         else:
             if not force:
                 _stand(appliance, within)
-            report = _ordered(appliance, state)
+            report = _order(appliance, state)
         remove_drop_ins()
     except NetworkError as error:
         typer.echo(f"{_VERB}: {error}", err=True)
@@ -278,7 +278,7 @@ def release(
         say("The appliance runs on without them: sudo systemctl stop rosrv, or rosrv adopt")
 
 
-def _ordered(appliance: Appliance, state: Path) -> GiveBackReport:
+def _order(appliance: Appliance, state: Path) -> GiveBackReport:
     try:
         with ordered(state, RELEASE):
             answer = appliance.ask(ReleaseOrder())

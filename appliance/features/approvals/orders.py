@@ -97,7 +97,7 @@ class ApprovalOrders:
         policy, host = self._policy(), address_of(wanted.host)
         decision = policy.decide(Request(host, wanted.caller_id, Category.CALL, wanted.service))
         if decision.allowed and decision.asks is not None:
-            decision = self._decided(decision, wanted, host)
+            decision = self._decide(decision, wanted, host)
         record = self._trail.decided(asker, "call", Category.CALL, wanted.service, decision)
         if not decision.allowed:
             return answer(denial_text(decision, record, policy.tell))
@@ -105,7 +105,7 @@ class ApprovalOrders:
             return answer(NOT_RECORDED)
         return answer("")
 
-    def _decided(self, decision: Decision, wanted: RequestHeld, host: Address) -> Decision:
+    def _decide(self, decision: Decision, wanted: RequestHeld, host: Address) -> Decision:
         call = HeldCall(host, Category.CALL, wanted.service, wanted.digest)
         entry = self._table.find(call)
         approved = entry is not None and entry.state is ApprovalState.APPROVED

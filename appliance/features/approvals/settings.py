@@ -11,7 +11,7 @@ from appliance.configuration.sections import FeatureSection, key, section, split
 _HTTPS = 443
 
 
-def _checked_url(text: str) -> str:
+def _check_url(text: str) -> str:
     try:
         parts = urlsplit(text)
         parts.port  # noqa: B018  raises for an invalid one
@@ -24,13 +24,13 @@ def _checked_url(text: str) -> str:
     return text
 
 
-def _checked_address(text: str) -> str:
+def _check_address(text: str) -> str:
     split_receiver(f"tcp://{text}")
     return text
 
 
-def _checked_console(text: str) -> str:
-    if text and (urlsplit(_checked_url(text)).path or "?" in text):
+def _check_console(text: str) -> str:
+    if text and (urlsplit(_check_url(text)).path or "?" in text):
         raise ValueError(f"{text!r} must be https://HOST:PORT without a path, as browsers open the console")
     return text
 
@@ -40,10 +40,10 @@ class ApprovalHook(FeatureSection):
     """Tells a web hook of each call that waits for an approval; off unless `url` is given. It never approves."""
 
     place: ClassVar[str] = "approval_hook"
-    url: Annotated[str, check(_checked_url)] | None = key(
+    url: Annotated[str, check(_check_url)] | None = key(
         default=None, description="https URL that gets a POST for each call that begins to wait"
     )
-    address: Annotated[str, check(_checked_address)] | None = key(
+    address: Annotated[str, check(_check_address)] | None = key(
         default=None, description="ADDRESS:PORT of the URL's host; names are not looked up"
     )
     secret_file: Path | None = key(
@@ -54,7 +54,7 @@ class ApprovalHook(FeatureSection):
         default=None,
         description="authority of the receiver's certificate (PEM); default: those the system trusts",
     )
-    console: Annotated[str, check(_checked_console)] = key(
+    console: Annotated[str, check(_check_console)] = key(
         default="",
         description="https://HOST:PORT at which browsers open the console, for the link in the POST",
     )

@@ -150,8 +150,8 @@ def _cells(row: EqualRecords, host_in_words: HostInWords) -> tuple[Text, ...]:
     return (
         Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
         Text(printable(record.event), style="bold red" if alarming else ""),
-        Text(_joined(_host(record, host_in_words), record.caller_id, _by(record))),
-        Text(_joined(requested(record), _monitor(record), record.resource)),
+        Text(_join(_host(record, host_in_words), record.caller_id, _by(record))),
+        Text(_join(requested(record), _monitor(record), record.resource)),
         Text(_why(record) if row.records == 1 else _why_of_several(row)),
     )
 
@@ -191,7 +191,7 @@ def _why_of_several(row: EqualRecords) -> str:
     return f"{row.count} times, last: {_why(newest)}" if row.value else f"{row.count} times"
 
 
-def _joined(*parts: str | None) -> str:
+def _join(*parts: str | None) -> str:
     return " ".join(printable(part) for part in parts if part)
 
 
@@ -336,13 +336,13 @@ def verify(
     with Errors():
         source = audit_of(appliance.way)
         partner = None if other is None else _files(source, other)
-        result = _verified(source, key, checkpoints)
+        result = _verify(source, key, checkpoints)
         if partner is None or other is None:
             _print_result(result, print_verification, as_json_lines=appliance.as_json)
             return
         own, of_other = partner
         found, printed = pair_verification()(
-            own.path, result, of_other.path, other, lambda: _verified(of_other, other_key, other_checkpoints)
+            own.path, result, of_other.path, other, lambda: _verify(of_other, other_key, other_checkpoints)
         )
         _print_result(found, printed, as_json_lines=appliance.as_json)
 
@@ -355,7 +355,7 @@ def _files(source: AuditSource, other: Path) -> tuple[FileLog, FileLog]:
     return source, FileLog(other)
 
 
-def _verified(source: AuditSource, key: Path | None, checkpoints: Path | None) -> Verification:
+def _verify(source: AuditSource, key: Path | None, checkpoints: Path | None) -> Verification:
     copies = None if checkpoints is None else read_copies(checkpoints)
     public_key = None if key is None else read_public_key(key)
     began = clock.now()

@@ -333,12 +333,10 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         without contents of messages and without `chain`, because only complete records can be proven.
         """
         wanted = await desk.named(bearer, wanted)
-        exported = _as_csv if form == "csv" else _exported
+        exported = _as_csv if form == "csv" else _export
         found = await desk.read(bearer, exported, desk.path, wanted, bearer, services.settings.name)
         give_back = services.exports.take(bearer, "exports")
-        return StreamResponse(
-            StreamingResponse(in_thread(_joined(found)), media_type=_FORMS[form]), give_back
-        )
+        return StreamResponse(StreamingResponse(in_thread(_join(found)), media_type=_FORMS[form]), give_back)
 
 
 def _add_one(router: Routes, desk: LogReader) -> None:
@@ -380,7 +378,7 @@ async def _follow(
                     await services.stopping.wait()
 
 
-def _exported(path: Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:
+def _export(path: Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:
     if reads_contents(bearer):
         return _begun(evidence_line(*record, robot) for record in evidence(path, wanted))
     shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
@@ -398,7 +396,7 @@ def _begun(entries: Iterator[_T]) -> Iterator[_T]:
     return iter(()) if first is None else itertools.chain((first,), entries)
 
 
-def _joined(lines: Iterator[str]) -> Iterator[str]:
+def _join(lines: Iterator[str]) -> Iterator[str]:
     while piece := "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE)):
         yield piece
 

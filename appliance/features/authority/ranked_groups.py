@@ -89,7 +89,7 @@ class RankedGroups:
         self._drivers: dict[str, RankedDriver] = {}  # by topic
         self._freed_by = ""
         self._lost: asyncio.Queue[RankReported] = asyncio.Queue()
-        relay.ranks.listeners.append(self._reported)
+        relay.ranks.listeners.append(self._on_report)
 
     def policy_changed(self) -> None:
         """Publish the drivers of the groups that have a rank now, and forget all others."""
@@ -136,7 +136,7 @@ class RankedGroups:
             if group is not None and driver is not None and driver.report == lost:
                 await self._stop(driver.host, {lost.topic}, f"{group.name}: {driver.why(group)}")
 
-    def _reported(self, report: RankReported) -> None:
+    def _on_report(self, report: RankReported) -> None:
         group = self._policy().commanded(report.topic)
         if group is None or not group.ranks:
             return

@@ -42,13 +42,13 @@ def frame_size(frame: ClientFrame) -> int:
 
 
 def is_text(frame: ClientFrame) -> bool:
-    return _joined(frame)[0] == _TEXT
+    return _join(frame)[0] == _TEXT
 
 
 def content(frame: ClientFrame) -> bytes:
-    data = _joined(frame)
+    data = _join(frame)
     return data[_HEAD_BYTES.get(data[1], 2) :]
 
 
-def _joined(frame: ClientFrame) -> bytes:
+def _join(frame: ClientFrame) -> bytes:
     return frame if isinstance(frame, bytes) else b"".join(frame)

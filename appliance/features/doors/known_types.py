@@ -216,17 +216,17 @@ class KnownTypes:
 
     def key(self, header: Mapping[str, str]) -> TypeKey:
         """Return the type of a connection; a definition is parsed once."""
-        return self._parsed(_TextKey.of(header), header)[0]
+        return self._parse(_TextKey.of(header), header)[0]
 
     def learn(self, header: Mapping[str, str]) -> KnownType:
         """Return the type of the messages of a connection."""
         text = _TextKey.of(header)
-        key, definitions = self._parsed(text, header)
+        key, definitions = self._parse(text, header)
         if self.defines(key):
             return self.message(key.name)
         if (known := self._heard.find(text)) is not None:
             return known
-        known = self._once(text, lambda: self._learned(key, definitions, header))
+        known = self._once(text, lambda: self._learn(key, definitions, header))
         self._heard.keep(text, known, beyond=False)
         return known
 
@@ -242,7 +242,7 @@ class KnownTypes:
                 self._failed.popitem(last=False)
             raise
 
-    def _parsed(self, text: _TextKey, header: Mapping[str, str]) -> tuple[TypeKey, Definitions | None]:
+    def _parse(self, text: _TextKey, header: Mapping[str, str]) -> tuple[TypeKey, Definitions | None]:
         """Return the type, and its definitions if they were parsed just now."""
         if (key := self._read.get(text)) is not None:
             self._read.move_to_end(text)
@@ -278,7 +278,7 @@ class KnownTypes:
         taken, self._differing = self._differing, []
         return taken
 
-    def _learned(self, key: TypeKey, definitions: Definitions | None, header: Mapping[str, str]) -> KnownType:
+    def _learn(self, key: TypeKey, definitions: Definitions | None, header: Mapping[str, str]) -> KnownType:
         if definitions is None:
             definitions = Definitions.from_full_text(key.name, header.get("message_definition", ""))
         if definitions.md5sum(key.name) != key.md5sum:

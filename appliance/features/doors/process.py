@@ -221,7 +221,7 @@ class DoorProcess:
             Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),
             door_link.DoorLink,
             said=self._heard,
-            linked=self._linked,
+            linked=self._on_link,
             lost=lambda _reason: self._network.lost() if self._network is not None else None,
             took=self._took,
         )
@@ -264,7 +264,7 @@ class DoorProcess:
 
     # --- control ---
 
-    def _linked(self) -> None:
+    def _on_link(self) -> None:
         self._counted, self._shown = door_link.DoorCounted(), []  # this control has no counts yet
         name, added = ("", 0.0) if self._given is None else (self._given.name, self._given.added)
         self._child.tell(door_link.DoorStarted(name, added, self._listens))
@@ -295,9 +295,9 @@ class DoorProcess:
             case door_link.TicketEnded(ticket, replaced):
                 self._end_tickets(lambda one: one == ticket, replaced=replaced)
             case _:
-                self._answered(message)
+                self._on_answer(message)
 
-    def _answered(self, message: object) -> None:
+    def _on_answer(self, message: object) -> None:
         match message:
             case door_link.HostsGiven(number, hosts):
                 self._hosts.given(number, hosts)

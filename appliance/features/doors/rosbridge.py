@@ -145,7 +145,7 @@ class Rosbridge:
             return []
 
     def _advertise(self, operation: AdvertiseOp) -> list[DoorRequest]:
-        topic, size = self._resolved(operation.topic), len(bytes(operation.will))
+        topic, size = self._resolve_name(operation.topic), len(bytes(operation.will))
         if size > self._limits.will_bytes:
             raise OperationError(f"the will has {size} bytes; at most {self._limits.will_bytes}")
         kind = type_name(operation.type)
@@ -166,7 +166,7 @@ class Rosbridge:
         known.clients.add(client)
 
     def _unadvertise(self, operation: UnadvertiseOp) -> list[DoorRequest]:
-        topic = self._resolved(operation.topic)
+        topic = self._resolve_name(operation.topic)
         known = self._advertised.get(topic)
         if known is None:
             return []
@@ -177,7 +177,7 @@ class Rosbridge:
         return [UnadvertiseTopic(topic, operation.id)]
 
     def _publish(self, operation: PublishOp) -> list[DoorRequest]:
-        topic = self._resolved(operation.topic)
+        topic = self._resolve_name(operation.topic)
         publish = PublishMessage(topic, operation.msg, operation.id)
         known = self._advertised.get(topic)
         if known is not None and known.refused is None:
@@ -190,7 +190,7 @@ class Rosbridge:
         return [AdvertiseTopic(topic, None, operation.latch, queue, operation.id), publish]
 
     def _subscribe(self, operation: SubscribeOp) -> list[DoorRequest]:
-        topic = self._resolved(operation.topic)
+        topic = self._resolve_name(operation.topic)
         kind = None if operation.type is None else type_name(operation.type)
         _check_room(self._subscriptions, operation.topic, self._limits.topics, "topics are subscribed")
         subscription = self._subscriptions.setdefault(operation.topic, _Subscription(topic))
@@ -249,7 +249,7 @@ class Rosbridge:
             self._fail_call(call, f"{waiting} for answers; repeat it later")
             return []
         try:
-            service = self._resolved(name)
+            service = self._resolve_name(name)
         except PeerError as error:
             self._fail_call(call, str(error))
             return []
@@ -260,13 +260,13 @@ class Rosbridge:
         return [CallOfService(service, self._number, values, seconds, reply_to)]
 
     def _offer(self, operation: AdvertiseServiceOp) -> list[DoorRequest]:
-        service, kind = self._resolved(operation.service), type_name(operation.type)
+        service, kind = self._resolve_name(operation.service), type_name(operation.type)
         _check_room(self._services, service, self._limits.services, "services are offered")
         self._services[service] = operation.service
         return [OfferService(service, kind, operation.id)]
 
     def _withdraw(self, operation: UnadvertiseServiceOp) -> list[DoorRequest]:
-        service = self._resolved(operation.service)
+        service = self._resolve_name(operation.service)
         if self._services.pop(service, None) is None:
             raise OperationError(f"this client does not offer the service {quoted(operation.service)}")
         self._asked = {call: name for call, name in self._asked.items() if name != service}
@@ -283,7 +283,7 @@ class Rosbridge:
         self._level = _LEVELS.index(operation.level)
         return []
 
-    def _resolved(self, name: str) -> str:
+    def _resolve_name(self, name: str) -> str:
         return resolve(name, self._node)
 
     # --- answers and refusals ---

@@ -253,9 +253,9 @@ class BundleGate:
             self._offered = message
             self._there.set()
         elif isinstance(message, BundlePollReported):
-            self._reported(message)
+            self._on_report(message)
 
-    def _reported(self, message: BundlePollReported) -> None:
+    def _on_report(self, message: BundlePollReported) -> None:
         if message.rejected and message.trouble != self._poll.trouble:
             self._trail.happened("bundle metadata rejected", message.trouble, collector=self._fleet.collector)
         self._poll = message
@@ -368,7 +368,7 @@ class BundleGate:
         try:
             await self._put_in_force(trial, contents)
             self._held = frozenset(self._monitors.rollout.held - before.failing)
-            reason = await self._watched(before)
+            reason = await self._watch(before)
         except _REFUSALS as error:
             reason = str(error)
         if reason:
@@ -406,7 +406,7 @@ class BundleGate:
         await self._policies.load_with(load, trial.who, _cases(contents))
         await self._hosts().take_bundle(contents.hosts or "\n", trial.who)
 
-    async def _watched(self, before: RobotHealth) -> str:
+    async def _watch(self, before: RobotHealth) -> str:
         deadline = clock.now() + self._fleet.bundles.confirm_seconds
         there = (self._policies.revision, self._monitors.revision)
         while True:

@@ -66,7 +66,7 @@ class Poller:
     def step(self) -> float:
         stated = self.stated()
         if stated is None:
-            return _jittered(_BACK_OFF[0])
+            return _jitter(_BACK_OFF[0])
         pause = self._checked(stated)
         self._report(self.stated() or stated)
         return pause
@@ -95,7 +95,7 @@ class Poller:
             _log.warning("the collector's bundles are verified again")
         self._failures = 0
         self.progress = BundlePollReported(self.clock(), offered=offers)
-        return _jittered(min(self.interval, pause))
+        return _jitter(min(self.interval, pause))
 
     def _failed(self, error: Exception) -> float:
         if not self._failures:
@@ -105,7 +105,7 @@ class Poller:
         self.progress = BundlePollReported(
             self.progress.checked, str(error)[:1000], isinstance(error, BundleRejectedError)
         )
-        return _jittered(min(pause, self.interval))
+        return _jitter(min(pause, self.interval))
 
     def _report(self, stated: BundleStated) -> None:
         refused = stated.refused
@@ -128,11 +128,11 @@ class Poller:
             body = msgspec.json.encode(report)
             self.connection.put(REPORT, iter([body]), len(body), [("Content-Type", "application/json")])
         except CollectorError as error:
-            self._retry_at = self.report_due = now + _jittered(_REPORT_AGAIN_SECONDS)
+            self._retry_at = self.report_due = now + _jitter(_REPORT_AGAIN_SECONDS)
             if not self.progress.trouble:
                 self.progress = BundlePollReported(self.progress.checked, str(error)[:1000])
             return
-        self._reported, self.report_due = report, now + _jittered(_REPORT_SECONDS)
+        self._reported, self.report_due = report, now + _jitter(_REPORT_SECONDS)
 
 
 def _fate_of(report: RobotReport) -> RobotReport:
@@ -151,7 +151,7 @@ def _offered(bundle: VerifiedBundle) -> BundleOffered:
     return BundleOffered(str(bundle.path), bundle.sha256, bundle.contents)
 
 
-def _jittered(seconds: float) -> float:
+def _jitter(seconds: float) -> float:
     """Vary a pause, so that robots do not ask at the same time."""
     return seconds * random.uniform(1 - _JITTER, 1 + _JITTER)  # noqa: S311  spreads load, protects nothing
 
@@ -226,7 +226,7 @@ class _Process:
             lifeline,
             BundleLink,
             said=self._said,
-            linked=self._linked,
+            linked=self._on_link,
             lost=lambda _why: self._lost(),
         )
         self._stated: BundleStated | None = None
@@ -254,7 +254,7 @@ class _Process:
         if isinstance(message, BundleStated):
             self._stated = message
 
-    def _linked(self) -> None:
+    def _on_link(self) -> None:
         self._told = None
         self._tell()
 

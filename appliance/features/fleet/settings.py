@@ -21,12 +21,12 @@ def split_collector(text: str) -> tuple[str, int]:
     return host, port
 
 
-def _checked_collector(text: str) -> str:
+def _check_collector(text: str) -> str:
     split_collector(text)
     return text
 
 
-def _checked_word(text: str) -> str:
+def _check_word(text: str) -> str:
     if text and not _WORD.fullmatch(text):
         raise ValueError(
             f"{text!r} is not a name of lower-case letters, digits and -, for example arm-robots"
@@ -41,10 +41,10 @@ class Bundles:
     root: Path | None = key(
         default=None, description="the trusted root metadata (root.json) that the fleet's operator gives out"
     )
-    site: Annotated[str, check(_checked_word)] = key(
+    site: Annotated[str, check(_check_word)] = key(
         default="", description="the site that this robot belongs to"
     )
-    group: Annotated[str, check(_checked_word)] = key(
+    group: Annotated[str, check(_check_word)] = key(
         default="", description="the robot group: the robots that get the same bundles"
     )
     interval: Annotated[float, rules(ge=1, le=86_400, allow_inf_nan=False)] = key(
@@ -72,7 +72,7 @@ class Fleet(FeatureSection):
     `rosrv fleet join` gives `collector`, `robot` and the files; keys here override them.
     """
 
-    collector: Annotated[str, check(_checked_collector)] | None = key(
+    collector: Annotated[str, check(_check_collector)] | None = key(
         default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
     )
     name: str | None = key(

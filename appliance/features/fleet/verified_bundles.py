@@ -118,7 +118,7 @@ class VerifiedBundles:
 
     def refresh(self) -> None:
         self._updater = None
-        with _translated():
+        with _translate():
             self._metadata.mkdir(mode=0o700, parents=True, exist_ok=True)
             for left in self._metadata.glob(_UNFINISHED):
                 left.unlink(missing_ok=True)
@@ -156,7 +156,7 @@ class VerifiedBundles:
             raise BundleRejectedError(f"the collector selects an invalid bundle: {error}") from error
         if (path.site, path.group) != self._place:
             raise BundleRejectedError(f"the collector selects {path}, which is for other robots")
-        with _translated():
+        with _translate():
             try:
                 target = self._updater.get_targetinfo(str(path))
             finally:
@@ -169,7 +169,7 @@ class VerifiedBundles:
     def get(self, selected: SelectedBundle) -> VerifiedBundle:
         if self._updater is None:
             raise RuntimeError("refresh the metadata first")
-        with _translated():
+        with _translate():
             self._updater.download_target(selected.target, str(self._download))
             archive = self._download.read_bytes()
             self._download.unlink()
@@ -210,7 +210,7 @@ def _limits() -> UpdaterConfig:
 
 
 @contextmanager
-def _translated() -> Iterator[None]:
+def _translate() -> Iterator[None]:
     try:
         yield
     except (RepositoryError, DownloadLengthMismatchError) as error:

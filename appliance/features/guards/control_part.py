@@ -94,7 +94,7 @@ class DriverChecks:
         except BaseException:
             self._check = before
             raise
-        monitors.records.told.append(self._reported)
+        monitors.records.told.append(self._on_report)
         self._asked_at, self._until = clock.now(), clock.now() + seconds + _FURTHER_SECONDS
         self._relays = relays
         if not monitors.switches.enabled(NAME):
@@ -147,14 +147,14 @@ class DriverChecks:
             _log.warning("the monitor of a driver check is not removed yet", error=str(error))
             await asyncio.sleep(1)
 
-    def _reported(self, event: MonitorEvent) -> None:
+    def _on_report(self, event: MonitorEvent) -> None:
         found = _LINE.search(event.text) if (event.kind, event.monitor) == ("log", NAME) else None
         if found and self._under_way():
             self._end(found["outcome"], float(found["seconds"]))
 
     def _end(self, outcome: str, seconds: float | None, why: str = "") -> None:
         self._ended.set()
-        self._monitors.records.told.remove(self._reported)
+        self._monitors.records.told.remove(self._on_report)
         check, text = self._check, sentence_of(outcome, seconds, why)
         self._check = DriverCheck(check.command, check.by, outcome, seconds, text)
         self._trail.happened(

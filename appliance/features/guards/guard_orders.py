@@ -346,7 +346,7 @@ class GuardOrders:
         monitors, name = self._monitors, request.name
         if origin_of(self._guard(name)[1]) == "current":
             return monitors.replaced(monitors.revision).in_lines()
-        new = self._upgraded(name, request.topics)
+        new = self._upgrade(name, request.topics)
         order = admin.MonitorLoad(
             {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
             confirm_within=request.confirm_within, shadow=monitors.switches.in_shadow(name), hold=request.hold,
@@ -368,7 +368,7 @@ class GuardOrders:
         else:
             present, text, _constants = self._changed(name, request.values)
             if request.upgrade:
-                new = self._upgraded(name, request.topics)
+                new = self._upgrade(name, request.topics)
                 text, kept = new.text, new.warnings
             file = "" if text == present else monitors.checked.monitors[name]
             row = self._row(name, self._guards()[name])
@@ -424,7 +424,7 @@ class GuardOrders:
             raise SenselessError(str(error)) from error
         return file, text
 
-    def _upgraded(self, name: str, topics: Mapping[str, str]) -> Upgrade:
+    def _upgrade(self, name: str, topics: Mapping[str, str]) -> Upgrade:
         preset, text = self._guard(name)
         try:
             in_force = {

@@ -271,7 +271,7 @@ def _written(head: Head, body: str) -> str:
 
 def head_of(text: str) -> Head | None:
     """Return what the `preset` statement of a text says, or nothing if the text does not begin with one."""
-    statement, _rest = _divided(text)
+    statement, _rest = _divide(text)
     words = statement.partition("{")[0].rstrip("; ").split()
     if words[:1] != ["preset"] or len(words) < 3 or not words[2].isdecimal():
         return None
@@ -287,10 +287,10 @@ def head_of(text: str) -> Head | None:
 
 def body_of(text: str) -> str:
     """Return the text behind its `preset` statement."""
-    return _divided(text)[1]
+    return _divide(text)[1]
 
 
-def _divided(text: str) -> tuple[str, str]:
+def _divide(text: str) -> tuple[str, str]:
     """Return the `preset` statement without remarks and its end, or the first line; and the text behind it."""
     first, _, rest = text.partition("\n")
     if not first.startswith("preset ") or " as " not in first.partition("//")[0]:

@@ -118,7 +118,7 @@ def enforce(
     policy = compiled_with(change.text, body.file, context_of(body))
     period = recorded_period(appliance, since)
     live = live_now(appliance)
-    found = _compared(policy, period, live)
+    found = _compare(policy, period, live)
     _show(appliance, found, period, change)
     if output is not None:
         try:
@@ -132,7 +132,7 @@ def enforce(
     _load(appliance, body, change, confirmed, written=output)
 
 
-def _compared(policy: Policy, period: RecordedPeriod, live: list[LiveRight]) -> _Comparison:
+def _compare(policy: Policy, period: RecordedPeriod, live: list[LiveRight]) -> _Comparison:
     counts: Counter[tuple[Request, str]] = Counter()
     number = 0
     for recorded in period.requests():

@@ -41,7 +41,7 @@ def why(appliance: Appliance, record: RecordArgument) -> None:
 
     Example: rosrv audit why 18e9aa02efc40abb0e51
     """
-    found = _explained(appliance, record)
+    found = _explain(appliance, record)
     if appliance.as_json:
         say_json(found)
         return
@@ -51,7 +51,7 @@ def why(appliance: Appliance, record: RecordArgument) -> None:
         say(printable(found.refusal), "yellow")
 
 
-def _explained(appliance: Appliance, record: str) -> Why:
+def _explain(appliance: Appliance, record: str) -> Why:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
 

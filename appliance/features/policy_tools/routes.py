@@ -126,7 +126,7 @@ def _of_policy(services: Services) -> Routes:
         current = await ask(control, PolicyWanted(), bearer)
         async with services.judging.turn(bearer):
             asked = msgspec.structs.asdict(question)
-            return _explained(await asyncio.to_thread(explanation, current=current, **asked))
+            return _explain(await asyncio.to_thread(explanation, current=current, **asked))
 
     @router.get("/explain", operation_id="explain")
     async def explain_request(
@@ -251,7 +251,7 @@ def _case(case: CaseResult) -> Case:
     )
 
 
-def _explained(found: DecisionExplanation) -> Explained:
+def _explain(found: DecisionExplanation) -> Explained:
     decision = found.decision
     return Explained(
         **found.request.fields(),
@@ -268,7 +268,7 @@ def _explained(found: DecisionExplanation) -> Explained:
             )
             for rule in found.lost
         ],
-        node=_explained(found.node) if found.node is not None else None,
-        command=_explained(found.command) if found.command is not None else None,
+        node=_explain(found.node) if found.node is not None else None,
+        command=_explain(found.command) if found.command is not None else None,
         allowed=found.allowed,
     )

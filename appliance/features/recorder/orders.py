@@ -233,7 +233,7 @@ class RecordingOrders:
             case recorder_link.RecordingClosed(recording):
                 self._open.pop(recording.id, None)
                 self._plan.closed(recording)
-                self._closed(recording)
+                self._on_close(recording)
                 self._note(recording.id)
             case recorder_link.RecordingMissed(trigger, reason, planned):
                 self._open.pop(planned, None)
@@ -270,7 +270,7 @@ class RecordingOrders:
         self._notes.add(task)
         task.add_done_callback(self._notes.discard)
 
-    def _closed(self, recording: Recording) -> None:
+    def _on_close(self, recording: Recording) -> None:
         self._kept[recording.id] = recording
         self._trail.happened(
             "recording closed",

@@ -75,7 +75,7 @@ class Recorder:
                 _log.error("control's request failed", order=type(message).__name__, reason=str(error))
         try:
             for trigger, planned in self._new_triggers():
-                self._triggered(trigger, planned)
+                self._on_trigger(trigger, planned)
         except LogUnreadableError as error:
             _log.error("cannot read the audit log; retrying", reason=str(error))
         for making in tuple(self._making):
@@ -124,7 +124,7 @@ class Recorder:
         if making is None:
             self._answers.append(recorder_link.RecordingRefused(wanted.number, why_not))
             if wanted.trigger.what == "service":  # a node may ignore the refusal, so it is also recorded
-                self._missed(wanted.trigger, why_not)
+                self._on_missed(wanted.trigger, why_not)
         else:
             progress = making.progress
             self._answers.append(
@@ -191,7 +191,7 @@ class Recorder:
                 if trigger is None:
                     continue
                 if "not_recorded" in record.detail:
-                    self._missed(trigger, str(record.detail["not_recorded"]))
+                    self._on_missed(trigger, str(record.detail["not_recorded"]))
                 else:
                     found.append((trigger, str(record.detail.get("recording", ""))))
         return found
@@ -220,13 +220,13 @@ class Recorder:
             _log.error("cannot read which recordings were promised", reason=str(error))
             return
         for planned, trigger in unmade.items():
-            self._missed(trigger, "the appliance stopped before it was written", planned)
+            self._on_missed(trigger, "the appliance stopped before it was written", planned)
 
-    def _triggered(self, trigger: Trigger, planned: str) -> None:
+    def _on_trigger(self, trigger: Trigger, planned: str) -> None:
         if planned and self._store.knows(planned):
             kept = self._store.find(planned)
             if kept is not None and trigger.time > kept.ended:
-                self._missed(
+                self._on_missed(
                     trigger, f"recording {planned} had ended: {kept.why_not or 'its time expired'}", planned
                 )
             return
@@ -238,9 +238,9 @@ class Recorder:
             return
         making, why_not = self._record(trigger, planned=planned)
         if making is None:
-            self._missed(trigger, why_not, planned)
+            self._on_missed(trigger, why_not, planned)
 
-    def _missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
+    def _on_missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
         """Unless a recording was planned, repeat the report only every ten minutes."""
         now, kind = self._clock(), (trigger.charged_to, trigger.what)
         if (

@@ -118,7 +118,7 @@ def show(appliance: Appliance, recording: _Id) -> None:
     Example: rosrv record show 1879f3c2a4b5d6e7f012
     """
     body = appliance.answer_or_exit(recording_requests.RecordingWanted(recording))
-    for line in _described(body, appliance.host_in_words):
+    for line in _describe(body, appliance.host_in_words):
         say(line)
 
 
@@ -155,7 +155,7 @@ def show_timeline(
     if appliance.as_json:
         say_json(found)
         return
-    for line in _drawn(found, appliance.host_in_words):
+    for line in _draw(found, appliance.host_in_words):
         say(line)
 
 
@@ -322,7 +322,7 @@ def _sender(sender: Sender, host_in_words: HostInWords) -> str:
     return " ".join(filter(None, (sender.node, sender.host and host_in_words(sender.host))))
 
 
-def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
+def _draw(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
     yield f"{found.id}  {_moment(found.since)} to {_moment(found.until)}"
     lanes = [(flow.topic, flow.counts, "message", flow.senders) for flow in found.topics]
     lanes += [(mark.kind, mark.counts, "event", []) for mark in found.marks]
@@ -384,7 +384,7 @@ def _summary(recording: Recording) -> str:
     )
 
 
-def _described(recording: Recording, host_in_words: HostInWords) -> Iterator[str]:
+def _describe(recording: Recording, host_in_words: HostInWords) -> Iterator[str]:
     yield f"{recording.id}  {_summary(recording)}"
     yield f"  from {_moment(recording.began)} to {_moment(recording.ended)}"
     yield f"  policy revision {recording.policy}, specifications revision {recording.monitors}"

@@ -141,7 +141,7 @@ class SsoOrders:
     def __init__(
         self, trail: AuditTrail, ends: EndTable, changed: Callable[[], None], *, configured: bool
     ) -> None:
-        self.link = Link(self._received)
+        self.link = Link(self._on_message)
         self.sessions = SessionTable(ends, changed)
         self._trail = trail
         self._changed = changed
@@ -234,7 +234,7 @@ class SsoOrders:
             raise UnavailableError("the process of single sign-on gave another answer: try again")
         return answer
 
-    def _received(self, message: object) -> None:
+    def _on_message(self, message: object) -> None:
         if isinstance(message, SignOnBegun | SignOnConfirmed | SignOnFailed):
             self.link.answered(message.number, message)
         else:

@@ -28,7 +28,7 @@ def name_of(text: str) -> str:
     Two texts have one name only if Unicode's form C of both is the same. The end of a long name is its SHA-256.
     """
     data = unicodedata.normalize("NFC", text).encode("utf-8", "surrogatepass")
-    name = _escaped(_ESCAPED, data)
+    name = _escape(_ESCAPED, data)
     if len(name) <= _LONGEST_NAME:
         return name
     start = name[: _LONGEST_NAME - _DIGITS - 1].rpartition("%")
@@ -38,10 +38,10 @@ def name_of(text: str) -> str:
 
 def subject_of(text: str) -> str:
     """Return a `sub` in printable ASCII. It is the identity of a person, so no two texts have one."""
-    return _escaped(_UNPRINTABLE, text.encode("utf-8", "surrogatepass"))
+    return _escape(_UNPRINTABLE, text.encode("utf-8", "surrogatepass"))
 
 
-def _escaped(pattern: re.Pattern[bytes], data: bytes) -> str:
+def _escape(pattern: re.Pattern[bytes], data: bytes) -> str:
     return pattern.sub(lambda found: b"%%%02X" % found[0][0], data).decode("ascii")
 
 

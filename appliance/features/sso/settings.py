@@ -39,7 +39,7 @@ def origin_of(url: str) -> Origin:
     return parts.scheme, host, port
 
 
-def _checked_issuer(text: str) -> str:
+def _check_issuer(text: str) -> str:
     origin_of(text)
     if "?" in text:
         raise ValueError(
@@ -48,7 +48,7 @@ def _checked_issuer(text: str) -> str:
     return text
 
 
-def _checked_url(text: str) -> str:
+def _check_url(text: str) -> str:
     if text:
         origin_of(text)
         if urlsplit(text).path or "?" in text:
@@ -58,27 +58,27 @@ def _checked_url(text: str) -> str:
     return text
 
 
-def _checked_address(text: str) -> str:
+def _check_address(text: str) -> str:
     split_receiver(f"tcp://{text}")
     return text
 
 
-def _checked_proxy(text: str) -> str:
+def _check_proxy(text: str) -> str:
     protocol, _slashes, place = text.partition("://")
     if protocol != "http":
         raise ValueError(f"{text!r} is not http://ADDRESS:PORT, for example http://10.0.0.3:3128")
-    _checked_address(place)
+    _check_address(place)
     return text
 
 
-def _checked_domain(text: str) -> str:
+def _check_domain(text: str) -> str:
     labels = text.split(".")
     if len(labels) < 2 or not all(map(_DOMAIN_LABEL.fullmatch, labels)):
         raise ValueError(f"{text!r} is not a domain in lower case, for example example.org")
     return text
 
 
-def _checked_door_group(text: str) -> str:
+def _check_door_group(text: str) -> str:
     if not _DOOR_GROUP.fullmatch(text):
         raise ValueError(f"{text!r} is not a name of a door group: use letters, digits and . _ -")
     return text
@@ -97,13 +97,13 @@ _Values = Annotated[
 class Sso(FeatureSection):
     """Single sign-on by OpenID Connect for the console and REST; off unless `issuer` is given. Tokens remain valid."""
 
-    issuer: Annotated[str, check(_checked_issuer)] | None = key(
+    issuer: Annotated[str, check(_check_issuer)] | None = key(
         default=None, description="the provider's issuer URL, exactly as in its discovery document"
     )
-    address: Annotated[str, check(_checked_address)] | None = key(
+    address: Annotated[str, check(_check_address)] | None = key(
         default=None, description="ADDRESS:PORT of the provider; names are not looked up. Or give `proxy`"
     )
-    proxy: Annotated[str, check(_checked_proxy)] | None = key(
+    proxy: Annotated[str, check(_check_proxy)] | None = key(
         default=None,
         description="http://ADDRESS:PORT of a proxy (CONNECT) that reaches a provider with many addresses",
     )
@@ -121,7 +121,7 @@ class Sso(FeatureSection):
         max_length=40,
         description="the provider's name on the console's button",
     )
-    url: Annotated[str, check(_checked_url)] = key(
+    url: Annotated[str, check(_check_url)] = key(
         default="",
         description="https://HOST:PORT at which browsers open the console; the provider must permit the redirect URI"
         " `URL/console`",
@@ -148,10 +148,10 @@ class Sso(FeatureSection):
         description="values of `roles_claim` that give each role; the highest role counts, and without a role no person"
         " signs in",
     )
-    doors: dict[Annotated[str, check(_checked_door_group)], _Values] = key(
+    doors: dict[Annotated[str, check(_check_door_group)], _Values] = key(
         default_factory=dict, description="values of `roles_claim` that give each group of doors"
     )
-    domains: list[Annotated[str, check(_checked_domain)]] = key(
+    domains: list[Annotated[str, check(_check_domain)]] = key(
         default=[],
         description="domains of verified e-mail addresses that may sign in; without it, any address, or none",
     )

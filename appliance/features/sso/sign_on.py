@@ -124,7 +124,7 @@ def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
     if len(text) > _LONGEST_HEADER:
         raise _refused(f"its header has more than {_LONGEST_HEADER} characters")
     try:
-        header = json.loads(_decoded(text))
+        header = json.loads(_decode(text))
     except (ValueError, RecursionError):
         raise _refused("its header is not JSON") from None
     if not isinstance(header, dict) or not isinstance(header.get("kid", ""), str):
@@ -155,7 +155,7 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
         raise _refused(f"it names {named}, and the provider has {len(fitting)} keys that fit")
     public = {name: fitting[0][name] for name in _PUBLIC if name in fitting[0]}
     try:
-        if not curve and 8 * len(_decoded(public["n"]).lstrip(b"\0")) < _LEAST_RSA_BITS:
+        if not curve and 8 * len(_decode(public["n"]).lstrip(b"\0")) < _LEAST_RSA_BITS:
             raise _refused(
                 f"the provider's key has less than {_LEAST_RSA_BITS} bits: let it use a longer one"
             )
@@ -164,7 +164,7 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
         raise _refused(f"the provider's key cannot be used: {error}") from None
 
 
-def _decoded(text: str) -> bytes:
+def _decode(text: str) -> bytes:
     return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
 
 

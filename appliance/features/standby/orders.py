@@ -114,7 +114,7 @@ class StandbyAdministration:
             standby_requests.StandbyWanted: self._state
         }
         if orders:
-            self._answers[standby_requests.StandbyPromote] = self._promoted
+            self._answers[standby_requests.StandbyPromote] = self._promote
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         del who
@@ -129,7 +129,7 @@ class StandbyAdministration:
     async def _state(self) -> StandbyState:
         return _state_of(self._source)
 
-    async def _promoted(self) -> StandbyState:
+    async def _promote(self) -> StandbyState:
         await self._source.hand_over()
         return _state_of(self._source)
 

@@ -199,7 +199,7 @@ class PassiveRest:
         self._administration = administration
         self._tokens = tokens
         self._askers = RequestAuthenticator(tokens, require_proof=False)
-        self._link = Link(self._received)
+        self._link = Link(self._on_message)
         self.pin = ""
         self._serving: dict[int, asyncio.Task[None]] = {}
 
@@ -222,7 +222,7 @@ class PassiveRest:
                 self._state_tokens()
             await asyncio.sleep(_READ_SECONDS)
 
-    def _received(self, message: object) -> None:
+    def _on_message(self, message: object) -> None:
         if isinstance(message, RestServed):
             self.pin = message.pin
         if isinstance(message, ConnectionPassed):

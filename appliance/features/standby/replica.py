@@ -54,7 +54,7 @@ class Replica:
         self._rows = 0
         self.unsynced = ""
         """Why the last `sync` failed, or empty."""
-        with self._explained():
+        with self._explain():
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA synchronous=NORMAL")
             (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
@@ -66,19 +66,19 @@ class Replica:
         """Store a message, or leave the state as it was."""
         with self._lock:
             try:
-                with self._explained():
+                with self._explain():
                     self._take(message)
             except BaseException:
                 self._roll_back()
                 raise
 
     def has_hosts(self) -> bool:
-        with self._lock, self._explained():
+        with self._lock, self._explain():
             query = "SELECT EXISTS (SELECT 1 FROM host WHERE revoked IS NULL)"
             return bool(self._connection.execute(query).fetchone()[0])
 
     def setting(self, name: str) -> str:
-        with self._lock, self._explained():
+        with self._lock, self._explain():
             found = self._connection.execute("SELECT value FROM setting WHERE name = ?", (name,)).fetchone()
             return str(found[0]) if found else ""
 
@@ -161,7 +161,7 @@ class Replica:
             self._connection.execute("ROLLBACK")
 
     @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _explain(self) -> Iterator[None]:
         try:
             yield
         except (ChangeError, sqlite3.IntegrityError) as error:

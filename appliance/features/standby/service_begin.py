@@ -76,7 +76,7 @@ class TakeoverRecorder:
         if own is None or own.epoch != epoch:
             state = await asyncio.to_thread(self._store.settings)
             checkpoint, reason = await asyncio.to_thread(self._others_checkpoint, state)
-            named = _decoded(state.get(_LAST_TAKEOVER, ""), EpochOf)
+            named = _decode(state.get(_LAST_TAKEOVER, ""), EpochOf)
             previous = max((one for one in (own, named) if one is not None), key=_epoch, default=None)
             self._trail.happened(
                 "took over",
@@ -141,7 +141,7 @@ class TakeoverRecorder:
         stored = state.get(_CHECKPOINT + self._other)
         if not stored:
             return None, f"no checkpoint of {self._other} was replicated"
-        found = _decoded(stored, SignedCheckpoint)
+        found = _decode(stored, SignedCheckpoint)
         if found is None or found.fault() is not None:
             fault = "it is not a checkpoint" if found is None else "its signature is wrong"
             return None, f"the replicated checkpoint of {self._other} is not valid: {fault}"
@@ -164,7 +164,7 @@ def _epoch(takeover: EpochOf) -> int:
     return takeover.epoch
 
 
-def _decoded(text: str, kind: type[_T]) -> _T | None:
+def _decode(text: str, kind: type[_T]) -> _T | None:
     try:
         return msgspec.json.decode(text, type=kind)
     except (ValueError, RecursionError):

@@ -163,12 +163,12 @@ class _Log:
         if not all(isinstance(value, int) for row in self._rows for value in row[:2]):
             raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
         self.unreadable: list[int] = []
-        self.takeovers = [_Takeover(self, *told) for told in self._decoded(TOOK_OVER, TookOver)]
-        self.handovers = list(self._decoded(_HANDED_OVER, HandedOver))
+        self.takeovers = [_Takeover(self, *told) for told in self._decode(TOOK_OVER, TookOver)]
+        self.handovers = list(self._decode(_HANDED_OVER, HandedOver))
         self.names = {takeover.detail.appliance for takeover in self.takeovers}
         self.epochs = {takeover.epoch for takeover in self.takeovers}
 
-    def _decoded(self, event: str, kind: type[_T]) -> Iterator[tuple[int, int, _T]]:
+    def _decode(self, event: str, kind: type[_T]) -> Iterator[tuple[int, int, _T]]:
         for row in self._rows:
             if row.event == event:
                 try:

@@ -165,7 +165,7 @@ def survey(
     except SurveyError as error:
         typer.echo(f"rosrv survey: {error}", err=True)
         raise typer.Exit(1) from None
-    drafted = _drafted(inventory, required=policy is not None) if output or policy else None
+    drafted = _draft(inventory, required=policy is not None) if output or policy else None
     if output is not None:
         write_new(output, page(inventory, drafted), verb=_VERB)
     if policy is not None and tests is not None and drafted is not None:
@@ -182,7 +182,7 @@ def survey(
         typer.echo(f"rosrv survey: no rule can be written for {name!r}", err=True)
 
 
-def _drafted(inventory: GraphInventory, *, required: bool) -> PolicyDraft | None:
+def _draft(inventory: GraphInventory, *, required: bool) -> PolicyDraft | None:
     try:
         return draft(inventory, names_of_hosts())
     except (DraftError, PolicyError) as error:

@@ -55,7 +55,7 @@ class Formatter:
                 return whole
         named |= {"cut": "detail"} if detail else {}
         room = max(0, self._longest - len(_message(head, ELEMENT, named, "")) - 1)
-        return _message(head, ELEMENT, named, _shortened(text, room))
+        return _message(head, ELEMENT, named, _shorten(text, room))
 
     def checkpoint(self, signed: SignedCheckpoint) -> bytes:
         """Return a message that `rosrv audit verify --checkpoints` finds in the receiver's file."""
@@ -94,7 +94,7 @@ def _ascii(text: str) -> str:
     return printable(text).encode("ascii", "backslashreplace").decode("ascii")
 
 
-def _shortened(text: str, room: int) -> str:
+def _shorten(text: str, room: int) -> str:
     if len(text) <= room:
         return text
     return text[: room - len(_CUT)] + _CUT if room > len(_CUT) else ""

@@ -159,7 +159,7 @@ def _runs(entries: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[
 _AT_ONCE = 20  # messages in one request
 
 
-def _resolved(topic: str) -> str:
+def _resolve_name(topic: str) -> str:
     """Resolve a name like the stock tools: `odom` is /odom."""
     try:
         return resolve(topic, "")
@@ -174,7 +174,7 @@ _Topic = Annotated[
         help="Its name, such as /cmd_vel",
         show_default=False,
         autocompletion=completion.topics,
-        callback=_resolved,
+        callback=_resolve_name,
     ),
 ]
 
@@ -226,7 +226,7 @@ def info(appliance: Appliance, topic: _Topic) -> None:
     if appliance.as_json:
         say_json(found)
     else:
-        for line in _described(found, {node.name for node in body.nodes if node.uncallable}):
+        for line in _describe(found, {node.name for node in body.nodes if node.uncallable}):
             say(line)
 
 
@@ -282,7 +282,7 @@ def _to_seconds(text: str) -> str:
 _UNCALLABLE = "it cannot be called (NAT), and gets later publishers when it subscribes again"
 
 
-def _described(topic: Topic, uncallable: Collection[str] = ()) -> Iterator[str]:
+def _describe(topic: Topic, uncallable: Collection[str] = ()) -> Iterator[str]:
     yield f"{printable(topic.name)}  {printable(topic.type)}"
     for publisher in topic.publishers:
         rate = f"{publisher.messages_per_second:.1f} Hz, {publisher.bytes_per_second:.0f} bytes/s"

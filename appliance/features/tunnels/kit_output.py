@@ -76,7 +76,7 @@ def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Out
         yield Output(out, name, sys.stdout.buffer)
         return
     path = out or Path(name)
-    with _opened(path) as file:
+    with _open(path) as file:
         output = Output(path, path.name, file)
         try:
             yield output
@@ -85,7 +85,7 @@ def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Out
                 path.unlink()
 
 
-def _opened(path: Path) -> BinaryIO:
+def _open(path: Path) -> BinaryIO:
     shown = printable(str(path))
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)

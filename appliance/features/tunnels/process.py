@@ -52,7 +52,7 @@ class TunnelProcess:
     """Handles messages of the supervisor and of control."""
 
     def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
-        self._child = Child(lifeline, messages.TunnelLink, said=self._control_said, linked=self._linked)
+        self._child = Child(lifeline, messages.TunnelLink, said=self._control_said, linked=self._on_link)
         self._directory = directory
         self._key = key
         self._ended = self._child.ended
@@ -86,7 +86,7 @@ class TunnelProcess:
 
     # --- messages of control ---
 
-    def _linked(self) -> None:
+    def _on_link(self) -> None:
         self._ask()
         if self._vici is not None:
             self._say_what_it_is(self._vici)
@@ -221,9 +221,9 @@ class TunnelProcess:
     def _spawn(self, work: Awaitable[None]) -> None:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
-        task.add_done_callback(self._finished)
+        task.add_done_callback(self._on_finish)
 
-    def _finished(self, task: "asyncio.Future[None]") -> None:
+    def _on_finish(self, task: "asyncio.Future[None]") -> None:
         self._tasks.discard(task)
         if task.cancelled() or self._ended.is_set():
             return

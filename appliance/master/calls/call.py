@@ -73,7 +73,7 @@ def _text(value: Value, _caller_id: str) -> str:
 
 
 def _name(value: Value, caller_id: str) -> str:
-    return names.resolve(_filled(value), caller_id)
+    return names.resolve(_fill(value), caller_id)
 
 
 def _subgraph(value: Value, caller_id: str) -> str:
@@ -82,11 +82,11 @@ def _subgraph(value: Value, caller_id: str) -> str:
 
 
 def _key(value: Value, caller_id: str) -> str:
-    return names.resolve_parameter(_filled(value), caller_id)
+    return names.resolve_parameter(_fill(value), caller_id)
 
 
 def _search_key(value: Value, caller_id: str) -> str:
-    text = _filled(value)
+    text = _fill(value)
     if text.startswith("~"):
         raise InvalidNameError(f"{text!r} is private: searchParam takes a relative or global name")
     names.resolve_parameter(text, caller_id)
@@ -94,19 +94,19 @@ def _search_key(value: Value, caller_id: str) -> str:
 
 
 def _type(value: Value, _caller_id: str) -> str:
-    text = _filled(value)
+    text = _fill(value)
     if not names.is_valid_type_name(text):
         raise InvalidNameError(f"{text[:80]!r} is not the name of a message type: write package/Type")
     return text
 
 
 def _node_api(value: Value, _caller_id: str) -> ApiUri:
-    text = _filled(value)
+    text = _fill(value)
     return ApiUri(text, parse_node_uri(text))
 
 
 def _service_api(value: Value, _caller_id: str) -> ApiUri:
-    text = _filled(value)
+    text = _fill(value)
     return ApiUri(text, parse_service_uri(text))
 
 
@@ -180,7 +180,7 @@ def check_arity(parameters: Sequence[CallParameter[object]], values: Sequence[Va
         raise ProtocolError("Error: bad call arity")
 
 
-def _filled(value: Value) -> str:
+def _fill(value: Value) -> str:
     if not isinstance(value, str) or not value:
         raise ProtocolError("must be a non-empty string")
     return value

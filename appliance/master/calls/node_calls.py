@@ -51,13 +51,13 @@ class NodeCalls:
             return [0, f"the appliance relays only TCPROS; the subscriber offers {offered}", []]
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # always connected through the relay
         if not own and not self.relay.carries_topic(topic):
-            return await self._negotiated_directly(target, topic, caller)
+            return await self._negotiate_directly(target, topic, caller)
         self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
         address = self.addresses.address_for(caller.peer)
         port = self.relay.port(target, Kind.PUBLICATION, topic)
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
-    async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
+    async def _negotiate_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
         """Return the node's own port, at its peer address; the host in the node's answer is ignored."""
         try:
             answer = await self.nodes.call(target, "requestTopic", caller.caller_id, topic, [["TCPROS"]])

@@ -199,11 +199,11 @@ class ParameterCalls:
                     outcomes += await self._send(waiting)
                     waiting, weight = [], 0
                 try:
-                    reserved = self._reserved(write, measured)
+                    reserved = self._reserve(write, measured)
                 except LimitReachedError:  # earlier writes may free room, so send them first
                     outcomes += await self._send(waiting)
                     waiting, weight = [], 0
-                    reserved = self._reserved(write, measured)
+                    reserved = self._reserve(write, measured)
             except (ProtocolError, LimitReachedError) as error:
                 outcomes += [*await self._send(waiting), error]
                 waiting, weight = [], 0
@@ -212,7 +212,7 @@ class ParameterCalls:
             weight += NAME_WEIGHT + len(write.key) + measured
         return outcomes + await self._send(waiting)
 
-    def _reserved(self, write: ParameterWrite, weight: int) -> Reservation | None:
+    def _reserve(self, write: ParameterWrite, weight: int) -> Reservation | None:
         if write.value is None:
             return None
         host: Address = APPLIANCE if write.caller.own else write.caller.peer.host
@@ -222,7 +222,7 @@ class ParameterCalls:
         self, waiting: list[tuple[ParameterWrite, Reservation | None]]
     ) -> list[Answer | Exception]:
         try:
-            outcomes = await self._call_rosmaster([_wanted(write) for write, _reserved in waiting])
+            outcomes = await self._call_rosmaster([_wanted(write) for write, _reserve in waiting])
         finally:
             for _write, reserved in waiting:
                 if reserved is not None:

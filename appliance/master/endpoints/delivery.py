@@ -247,7 +247,7 @@ class _List:
         self.wanted = publishers
 
     def remove(self, publishers: frozenset[str]) -> None:
-        self._untold = _united(self._untold, publishers)
+        self._untold = _union(self._untold, publishers)
 
     def next(self) -> tuple[str, ...]:
         """Return the list to send next: the wanted one, or first that without the publishers to remove."""
@@ -270,13 +270,13 @@ class _List:
     def sent(self, taken: "_Taken", *, arrived: bool) -> bool:
         """Note whether a list arrived; return whether a newer one must be sent."""
         if not arrived:
-            self._untold = _united(self._untold, taken.removes)
+            self._untold = _union(self._untold, taken.removes)
             return False
         now = clock.now()
         if now >= self._free:
             self._removed = frozenset()
         if taken.removes is None or taken.removes:
-            self._removed = _united(self._removed, taken.removes)
+            self._removed = _union(self._removed, taken.removes)
             self._free = now + _APART_SECONDS
         return taken.publishers != self.wanted
 
@@ -298,7 +298,7 @@ def _call(topic: str, publishers: tuple[str, ...]) -> NodeCall:
     return NodeCall("publisherUpdate", (topic, list(publishers)))
 
 
-def _united(some: frozenset[str] | None, others: frozenset[str] | None) -> frozenset[str] | None:
+def _union(some: frozenset[str] | None, others: frozenset[str] | None) -> frozenset[str] | None:
     return None if some is None or others is None else some | others
 
 

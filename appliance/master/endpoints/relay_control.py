@@ -166,7 +166,7 @@ class RelayControl:
 
     def __post_init__(self) -> None:
         self._posts = tuple(
-            RelayOutbox(index, partial(self._received, index), partial(self._lost, index))
+            RelayOutbox(index, partial(self._on_message, index), partial(self._lost, index))
             for index in range(self.allocation.relays)
         )
         self.taps = TapRequests(lambda topic: self._post(TOPIC, topic).send)
@@ -404,7 +404,7 @@ class RelayControl:
 
     # --- what the relays say ---
 
-    def _received(self, index: int, message: messages.Message) -> None:
+    def _on_message(self, index: int, message: messages.Message) -> None:
         post = self._posts[index]
         match message:
             case _ if isinstance(message, messages.UpstreamWanted | OwnCall):

@@ -102,7 +102,7 @@ class IptablesBackend:
         def inside() -> None:
             with _ONE_AT_A_TIME, _xtables_lock():
                 for family in _families():
-                    with _opened(family) as table:
+                    with _open(family) as table:
                         work(table)
 
         self._namespace.run(inside)
@@ -136,7 +136,7 @@ def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], N
         if used:
             with _ONE_AT_A_TIME, _xtables_lock():
                 for family in used:
-                    with _opened(family, name) as table:
+                    with _open(family, name) as table:
                         work(table)
 
     namespace.run(inside)
@@ -350,7 +350,7 @@ def _comment(rule: "iptc.Rule") -> str:
 
 
 @contextlib.contextmanager
-def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
+def _open(family: Family, name: str = "filter") -> Iterator[_Table]:
     library = _library()
     program = "ip6tables" if family == 6 else "iptables"
     table = None

@@ -85,7 +85,7 @@ def _messages(data: bytes) -> Iterator[tuple[int, dict[int, bytes]]]:
             return
         if kind >> 8 == _SUBSYSTEM:
             yield kind & 0xFF, dict(_attributes(data[place + _HEAD.size : place + length]))
-        place += _aligned(length)
+        place += _align(length)
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -95,10 +95,10 @@ def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
         if length < _ATTRIBUTE.size:
             return
         yield kind & 0x3FFF, data[place + _ATTRIBUTE.size : place + length]
-        place += _aligned(length)
+        place += _align(length)
 
 
-def _aligned(length: int) -> int:
+def _align(length: int) -> int:
     return (length + 3) & ~3
 
 

@@ -124,7 +124,7 @@ class IncomingConnection:
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
         self._stream = BufferedSocket(
-            context.loop, sock, self._received, lambda _reason: failed(self, ""), payer=context.payer(host)
+            context.loop, sock, self._on_data, lambda _reason: failed(self, ""), payer=context.payer(host)
         )
         self._received_bytes = 0
         pending.enter(self, host)
@@ -147,7 +147,7 @@ class IncomingConnection:
     def make_room(self) -> None:
         self._failed(self, "it waited longest when the limit of connections was reached")
 
-    def _received(self, data: bytes) -> None:
+    def _on_data(self, data: bytes) -> None:
         if not data:
             self._failed(self, "")
             return
@@ -184,7 +184,7 @@ class RefusedConnection:
         self.live = True
         self._ended = ended
         self._timer = context.loop.after(context.limits.farewell, self.close)
-        received, broken, payer = self._received, lambda _reason: self.close(), context.payer(host)
+        received, broken, payer = self._on_data, lambda _reason: self.close(), context.payer(host)
         self._stream = BufferedSocket(context.loop, sock, received, broken, payer=payer, drained=self._told)
         self._stream.send(encode_header({"error": reason}))
         if self.live and not self._stream.backlog:
@@ -203,6 +203,6 @@ class RefusedConnection:
     def _told(self) -> None:
         self._stream.finish()
 
-    def _received(self, data: bytes) -> None:
+    def _on_data(self, data: bytes) -> None:
         if not data:
             self.close()

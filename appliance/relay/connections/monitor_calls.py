@@ -100,10 +100,10 @@ class ServiceCalls:
         call.sock = BufferedSocket(
             self._context.loop,
             sock,
-            lambda data: self._received(number, data),
+            lambda data: self._on_data(number, data),
             lambda reason: self._end(number, reason),
             payer=message.host,
-            opened=lambda: self._opened(number, encode_header(header)),
+            opened=lambda: self._on_open(number, encode_header(header)),
         )
 
     def attach(self, connected: bool) -> None:
@@ -114,12 +114,12 @@ class ServiceCalls:
             if call.sock is None:
                 self._end(number, "the appliance's control has ended")
 
-    def _opened(self, number: int, header: bytes) -> None:
+    def _on_open(self, number: int, header: bytes) -> None:
         call = self._calls.get(number)
         if call is not None and call.sock is not None:
             call.sock.send(header + encode_frame(call.wanted.data))
 
-    def _received(self, number: int, data: bytes) -> None:
+    def _on_data(self, number: int, data: bytes) -> None:
         call = self._calls.get(number)
         if call is None:
             return

@@ -130,8 +130,8 @@ class NamedSubscribers:
             self._streams[name] = BufferedSocket(
                 self._context.loop,
                 sock,
-                partial(self._received, name),
-                partial(self._broken, name),
+                partial(self._on_data, name),
+                partial(self._on_break, name),
                 payer=self._context.payer(self._host),
                 opened=partial(self._connected, name),
             )
@@ -140,12 +140,12 @@ class NamedSubscribers:
         fields = {"callerid": name, "topic": self._topic, **self._accepted, "tcp_nodelay": "1"}
         self._streams[name].send(encode_header(fields))
 
-    def _received(self, name: str, data: bytes) -> None:
+    def _on_data(self, name: str, data: bytes) -> None:
         if not data:
             self._streams[name].close()
-            self._broken(name, "")
+            self._on_break(name, "")
 
-    def _broken(self, name: str, _reason: str) -> None:
+    def _on_break(self, name: str, _reason: str) -> None:
         self._streams.pop(name, None)
         self._try_again()
 
@@ -179,7 +179,7 @@ class Greeting:
         self._stream = BufferedSocket(
             context.loop,
             sock,
-            self._received,
+            self._on_data,
             lambda _reason: self._fail(),
             payer=context.payer(host),
             opened=lambda: self._stream.send(encode_header(fields)),
@@ -190,7 +190,7 @@ class Greeting:
         self._stream.close()
         self._held.set(0)
 
-    def _received(self, data: bytes) -> None:
+    def _on_data(self, data: bytes) -> None:
         if not data:
             self._fail()
             return

@@ -667,9 +667,9 @@ class RelayedTopic:
         if self._state is not TopicState.OPEN or self.latch.is_latching or self.flow.limits or commands:
             self._newcomers.members.clear()
         elif members := self._newcomers.take(following, self._clock()):
-            self.upstream.greet(lambda frames: self._greeted(members, following, frames))
+            self.upstream.greet(lambda frames: self._on_greeting(members, following, frames))
 
-    def _greeted(self, members: Collection[TopicSubscriber], before: int, frames: bytes) -> None:
+    def _on_greeting(self, members: Collection[TopicSubscriber], before: int, frames: bytes) -> None:
         is_stream = self.counters.following != before  # a message for all, which came over both connections
         self._newcomers.asked(self._clock(), greeted=bool(frames) or is_stream)
         if is_stream or not frames:

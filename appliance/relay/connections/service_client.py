@@ -323,11 +323,11 @@ class ServiceClient:
             return False
         caller = self.service.service, self.host, self.caller_id
         self._question = self._calls.held_requests.ask(
-            caller, self._header.get("type", ""), body, self._decided
+            caller, self._header.get("type", ""), body, self._on_decision
         )
         return True
 
-    def _decided(self, refused: str) -> None:
+    def _on_decision(self, refused: str) -> None:
         if self._live:
             self._exchange.settle(refused)
             self._advance()

@@ -193,7 +193,7 @@ class Subscriber:
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; drop a large one while the host has no memory: its rest could not be kept."""
         if self._flow is not None:
-            batch = self._flow.cut(batch, self._loop.clock(), self._limited)
+            batch = self._flow.cut(batch, self._loop.clock(), self._on_limit)
             self._flow.take(batch)
             if not batch.messages:
                 return 0
@@ -233,7 +233,7 @@ class Subscriber:
         if self.behind_since is None and self._queue.behind:
             self.behind_since = self._loop.clock()
 
-    def _limited(self, messages: int, size: int) -> None:
+    def _on_limit(self, messages: int, size: int) -> None:
         topic = self.topic
         self._reporter.limited(
             (topic.key, topic.topic, "subscriber", self.host, self.caller_id), messages, size

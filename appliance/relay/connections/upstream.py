@@ -114,7 +114,7 @@ class PublisherConnection(Upstream):
             return
         payer = self._context.payer(self._topic.host)
         stream = BufferedSocket(
-            self._loop, sock, self._header_received, self._broken, payer=payer, opened=self._connected
+            self._loop, sock, self._header_received, self._on_break, payer=payer, opened=self._connected
         )
         self._attempt = _Attempt(stream, HeaderParser(self._context.limits.header_bytes), (host, port))
         late = f"no answer from {host}:{port} within {self._context.limits.connect_seconds:g} s"
@@ -236,7 +236,7 @@ class PublisherConnection(Upstream):
         self._topic.upstream_opened(header)
         reader.start(attempt.parser.rest)
 
-    def _broken(self, reason: str) -> None:
+    def _on_break(self, reason: str) -> None:
         lose = self._turned_away if self.state is UpstreamState.GREETING else self._lose
         lose(f"no connection to the publisher: {reason}")
 

@@ -68,7 +68,7 @@ class UpstreamReader:
         """Take the data that came with the header, if any: they fit into an unused buffer."""
         if early and self._state is _State.WATCHED:
             self._buffer()[: len(early)] = early
-            self._received(len(early))
+            self._on_data(len(early))
 
     def pause(self, seconds: float) -> None:
         if self._pause is None:
@@ -127,14 +127,14 @@ class UpstreamReader:
                 return
             except OSError as error:
                 count = -(error.errno or 0)
-            self._received(count)
+            self._on_data(count)
         elif left.kind == RECEIVED:
-            self._received(left.end)
+            self._on_data(left.end)
         else:
             self._go_on_behind(left)
         self._arm()
 
-    def _received(self, count: int) -> None:
+    def _on_data(self, count: int) -> None:
         if count <= 0:
             broke = f"the connection to the publisher broke: {os.strerror(-count)}"
             self._lost(broke if count else "the publisher closed the connection", "")

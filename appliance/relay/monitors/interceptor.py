@@ -170,7 +170,7 @@ class Interceptor:
         self._keeper: StateKeeper | None = None
         self.observer = Observer(
             self.observations,
-            self._published,
+            self._on_publication,
             self.senders,
             held=self._tell_held,
             now=self.now,
@@ -430,7 +430,7 @@ class Interceptor:
     def cells_place(self, way: str) -> CellsPlace | None:
         return NOT_KEPT if self._keeper is None else self._keeper.cells_place(way)
 
-    def _published(self, message: Published) -> None:
+    def _on_publication(self, message: Published) -> None:
         self.keep_all()
         self._publish(message)
 
@@ -450,7 +450,7 @@ class Interceptor:
         now, due = self.now(), self.monitors.next_due
         view = memoryview(body)
         channel = self.monitors.channel_of(service, part)
-        outcome = self._walked(self.monitors, point, channel, body, now)
+        outcome = self._walk(self.monitors, point, channel, body, now)
         if outcome is None:
             self.invalidate_prepared()
             time_budget = self.time_budgets.of(point)
@@ -505,7 +505,7 @@ class Interceptor:
         rows = self.observer.rows(self.monitors, self.now())
         return rows + self._shadow_observer.rows(self.monitors, self.now())
 
-    def _walked(
+    def _walk(
         self, monitors: MonitorSet, point: ObservationPoint, way: str, body: bytes, now: int
     ) -> Outcome | None:
         observer = self.observer

@@ -171,11 +171,11 @@ class Observer:
                 line.monitor, line.level, line.text, point=point, time=outcome.time, observed=observed
             )
         for number, published in enumerate(outcome.published):
-            self._published(outcome, number, point, observed)
+            self._on_publication(outcome, number, point, observed)
             if (judged := outcome.judged.get(number)) is not None:
                 self._judged(judged, _of_publication(point, published.topic), published.data)
 
-    def _published(
+    def _on_publication(
         self, outcome: Outcome, number: int, point: ObservationPoint, observed: ObservedMessage | None
     ) -> None:
         published = outcome.published[number]

@@ -205,7 +205,7 @@ class TopicPipeline:
             before = bytes(body[:SHOWN]) if shows else b""
             observed = ObservedMessage(progress, position, bytes(body[:head]))
             monitors.hurry(interceptor.time_budgets.of(point).part(now, len(body)))
-            outcome = self._processed(monitors, body, now, observed, tried)
+            outcome = self._process(monitors, body, now, observed, tried)
             if monitors.tapped:
                 interceptor.shadow.wait(point, observed.at(number + looked))
             if outcome.events or outcome.log or outcome.faults or outcome.before:
@@ -228,7 +228,7 @@ class TopicPipeline:
                 break
         progress.position = position
 
-    def _processed(
+    def _process(
         self, monitors: MonitorSet, body: memoryview, now: int, observed: ObservedMessage, tried: Tried
     ) -> Outcome:
         point = self.point
@@ -238,7 +238,7 @@ class TopicPipeline:
             defect = self._interceptor.observer.defect(error, point, now, observed)
         if tried != "left" and (lane := monitors.lane(point[1])) is not None:  # it may be one of the lane
             self._defect = lane
-            return self._processed(monitors, body, now, observed, "left")
+            return self._process(monitors, body, now, observed, "left")
         return dropped(body, now, defect)
 
     def _block(self, batch: Batch, progress: BatchProgress) -> Batch | None:

@@ -99,7 +99,7 @@ def _grant_files(ruleset: int, sandbox: SandboxPlan, every: int) -> None:
         (sandbox.writes, every & ~_EXECUTE),
     )
     for paths, rights in grants:
-        for path, descriptor in _opened(paths):
+        for path, descriptor in _open(paths):
             folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
             granted = rights if folder else rights & _OF_FILES
             # struct landlock_path_beneath_attr is packed
@@ -107,7 +107,7 @@ def _grant_files(ruleset: int, sandbox: SandboxPlan, every: int) -> None:
             _require(system_call(_ADD_RULE, ruleset, _BENEATH, rule, 0), path)
 
 
-def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
+def _open(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
     for path in paths:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             descriptor = os.open(Path(path), os.O_PATH | os.O_CLOEXEC)

@@ -118,7 +118,7 @@ def load_config(path: Path) -> FleetConfig:
         if isinstance(fields, dict) and not fields.keys() & {"certificate", "key"}:
             data = str(fields.get("data", _DATA))
             fields = {"certificate": f"{data}/server.pem", "key": f"{data}/server.key"} | fields
-        found = msgspec.convert(fields, FleetConfig, dec_hook=_decoded)
+        found = msgspec.convert(fields, FleetConfig, dec_hook=_decode)
         if not 0 <= found.address[1] <= 65_535:
             raise ValueError(f"listen: {found.listen} has no valid port")
     except OSError as error:
@@ -141,7 +141,7 @@ def load_config(path: Path) -> FleetConfig:
     )
 
 
-def _decoded(kind: type, value: object) -> object:
+def _decode(kind: type, value: object) -> object:
     if kind is Path and isinstance(value, str):
         return Path(value)
     raise TypeError(f"expected a path, got {value!r}")

@@ -129,7 +129,7 @@ def search_statement(
         order = list(Severity)
         found.add("severity = ANY(%s)", [one.value for one in order[order.index(record.severity) :]])
     if record.text is not None:
-        found.add(_WORDS + " ILIKE %s", f"%{_escaped(checked_pattern('text', record.text))}%")
+        found.add(_WORDS + " ILIKE %s", f"%{_escape(checked_pattern('text', record.text))}%")
     if record.since is not None:
         found.add("time >= %s", record.since)
     if record.until is not None:
@@ -153,7 +153,7 @@ def logs_statement(robot: str | None) -> SearchStatement:
     return found.statement(head, " GROUP BY robot, log ORDER BY robot, log")
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return text.replace("\0", "\u2400").replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
 
 

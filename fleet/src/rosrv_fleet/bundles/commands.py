@@ -48,7 +48,7 @@ def init(repository: Repository = _HERE, keys: Keys = None, passphrase_file: Sec
 
     Example: rosrv-fleet bundle init --repository bundles
     """
-    with _opened(repository, keys, passphrase_file) as made:
+    with _open(repository, keys, passphrase_file) as made:
         made.init()
         say(f"{repository}: made; give root.json to the robots and timestamp.pem to the collector")
 
@@ -61,7 +61,7 @@ def delegate(
 
     Example: rosrv-fleet bundle delegate site-a/arms
     """
-    with _opened(repository, keys, passphrase_file) as opened:
+    with _open(repository, keys, passphrase_file) as opened:
         opened.delegate(*_split(place))
         say(f"{place}: delegated; its bundles are signed with a key of its own")
 
@@ -90,7 +90,7 @@ def add(
 
     Example: rosrv-fleet bundle add site-a/arms arms --ring canary=arm-1,arm-2 --ring rest=100%+4h
     """
-    with _opened(repository, keys, passphrase_file) as opened:
+    with _open(repository, keys, passphrase_file) as opened:
         files = _files_in(folder)
         findings = _findings_of(contents_of(files))
         if findings:
@@ -112,7 +112,7 @@ def withdraw(
 
     Example: rosrv-fleet bundle withdraw site-a/arms/12.tar
     """
-    with _opened(repository, keys, passphrase_file) as opened:
+    with _open(repository, keys, passphrase_file) as opened:
         opened.withdraw(BundlePath.parse(name))
         say(f"{name}: withdrawn; publish it: rosrv-fleet bundle publish FOLDER")
 
@@ -128,7 +128,7 @@ def sign(
 
     Example: rosrv-fleet bundle sign && rosrv-fleet bundle publish /srv/bundles
     """
-    with _opened(repository, keys, passphrase_file) as opened:
+    with _open(repository, keys, passphrase_file) as opened:
         if root:
             opened.renew_root()
         opened.sign()
@@ -148,7 +148,7 @@ def rotate(
 
     Example: rosrv-fleet bundle rotate site-a.arms
     """
-    with _opened(repository, keys, passphrase_file) as opened:
+    with _open(repository, keys, passphrase_file) as opened:
         opened.rotate(role)
         more = "; give the new timestamp.pem to the collector" if role == "timestamp" else ""
         say(f"{role}: has a new key{more}; publish it: rosrv-fleet bundle publish FOLDER")
@@ -160,7 +160,7 @@ def listed(repository: Repository = _HERE) -> None:
 
     Example: rosrv-fleet bundle list
     """
-    with _opened(repository, None, None) as opened:
+    with _open(repository, None, None) as opened:
         for path, target in opened.bundles():
             rings = ", ".join(f"{ring.name} after {ring.after} s" for ring in terms_of(target.custom).rings)
             say(f"{path}  {target.length} bytes  {rings}")
@@ -179,7 +179,7 @@ def publish(
 
     Example: rosrv-fleet bundle publish /srv/bundles
     """
-    with _opened(repository, None, None):
+    with _open(repository, None, None):
         state = read_publication(repository)
         _copy(repository / "targets", folder / "targets", "**/*.tar")
         _copy(repository / "metadata", folder / "metadata", "*.json", leave="snapshot")
@@ -189,7 +189,7 @@ def publish(
 
 
 @contextmanager
-def _opened(repository: Path, keys: Path | None, passphrase_file: Path | None) -> Iterator[BundleRepository]:
+def _open(repository: Path, keys: Path | None, passphrase_file: Path | None) -> Iterator[BundleRepository]:
     def passphrase(key: Path) -> str:
         if passphrase_file is not None:
             return read_given(passphrase_file, 4096).decode().partition("\n")[0]

@@ -102,7 +102,7 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
         """Return the newest timestamp."""
         if service.publisher.timestamp is None:
             raise HTTPException(404, service.publisher.trouble or "nothing is published")
-        return _tagged(request, service.publisher.timestamp, "application/json")
+        return _tag(request, service.publisher.timestamp, "application/json")
 
     @router.get(f"/{METADATA}/{{name}}")
     async def metadata(name: str, _robot: caller) -> Response:
@@ -125,7 +125,7 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
     async def selection(request: Request, site: str, group: str, robot: caller) -> Response:
         """Return the bundle that the robot should have; empty for none."""
         own = groups.of(robot, site, group)
-        return _tagged(request, service.selection(robot.name, own).encode(), "text/plain")
+        return _tag(request, service.selection(robot.name, own).encode(), "text/plain")
 
     @router.put(f"/{REPORT}", status_code=204)
     async def keep_report(request: Request, robot: caller) -> None:
@@ -155,7 +155,7 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
     return router
 
 
-def _tagged(request: Request, body: bytes, kind: str) -> Response:
+def _tag(request: Request, body: bytes, kind: str) -> Response:
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
     if request.headers.get("If-None-Match") == tag:

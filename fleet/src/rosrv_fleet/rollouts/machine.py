@@ -138,7 +138,7 @@ def advanced(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float
     if rollout.state != "running":
         return rollout
     if rollout.ring < 0:
-        return _opened(rollout, robots, now)
+        return _open(rollout, robots, now)
     unhealthy_ring = _unhealthy_ring(rollout, robots, now)
     if unhealthy_ring:
         return _stopped(rollout, unhealthy_ring)
@@ -157,7 +157,7 @@ def _healthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float
         return since
     if rollout.ring + 1 == len(rollout.terms.rings):
         return msgspec.structs.replace(since, state="done", why="in force in all rings")
-    return _opened(since, robots, now)
+    return _open(since, robots, now)
 
 
 def stopped(rollout: BundleRollout, why: str) -> BundleRollout:
@@ -204,7 +204,7 @@ def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) 
     return rows
 
 
-def _opened(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
+def _open(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
     index = rollout.ring + 1
     earliest = rollout.terms.signed + rollout.terms.rings[index].after
     if now < earliest:
