@@ -83,7 +83,8 @@ def save_record(state: Path, record: AdoptRecord) -> None:
         try:
             write_whole(file, data, 0o644)
         except OSError as error:
-            if not (is_full(error, state) and file.exists() and _overwritten(file, data)):
+            takes = record.phase is Phase.TAKING  # on a full disk nothing is granted, so nothing may be taken
+            if takes or not (is_full(error, state) and file.exists() and _overwritten(file, data)):
                 raise
     except OSError as error:
         raise NetworkError(f"{file} cannot be written: {error.strerror}") from error
