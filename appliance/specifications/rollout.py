@@ -195,7 +195,7 @@ class Rollout:
 
         After a `SpecificationsRefusedError`, nothing has changed.
         """
-        plan = self.allocation.plan(coming.checked, self.relays.live_resources())
+        before, plan = self._now, self.allocation.plan(coming.checked, self.relays.live_resources())
         await self._make(coming, _of(plan))
         try:
             take_effect()  # from here on, relays that give nothing up use the new specifications
@@ -215,6 +215,7 @@ class Rollout:
             raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
         except BaseException:
             self._forget()
+            self._now = before
             for relay in range(self.allocation.relays):
                 self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
             raise

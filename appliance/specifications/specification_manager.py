@@ -754,8 +754,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         with self.store.database.together():  # control may die during the change
             if row.revision != self.revision and self.revision:
                 given = {name: dict(values) for name, values in self.givens.said.items()}
+                after = {
+                    name: end.back for name, end in self.now.returns.items()
+                }  # else for good, after a rollback
                 ended = msgspec.structs.replace(
-                    kept_in(self.in_force), switches=dict(self.switches.said), given=given
+                    kept_in(self.in_force), switches=dict(self.switches.said) | after, given=given
                 )
                 self.store.save_monitor_revision(self.in_force._replace(sources=text_of(ended)))
             if row != self.in_force:

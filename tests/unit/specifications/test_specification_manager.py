@@ -95,6 +95,16 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
     assert (later.switches.states["a"], later.until("a")) == (False, None)
 
 
+async def test_a_monitor_that_was_disabled_for_a_time_is_enabled_after_a_rollback(desk: Desk) -> None:
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    await monitors.switch(admin.MonitorSwitch(["b"], False, for_seconds=3600), "eve")
+    whole = monitors.revision
+    await monitors.remove(admin.MonitorRemove(["b"]), "eve")
+    await monitors.roll_back(admin.MonitorRollback(whole), "eve")
+    assert (monitors.switches.states["b"], monitors.until("b")) == (True, None)
+
+
 async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
     gone = False
     monitors = await desk.monitors()
