@@ -118,7 +118,7 @@ class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy l
     A text with an error changes nothing: the answer (422) has every finding with its line and column.
     """
 
-    text: bodies.WholeText
+    text: Annotated[str, doc("the whole text, as written", min_length=1, max_length=2 << 20)]
     note: bodies.RevisionNote = ""
     confirm_within: Confirm = None
     expected: int | None = None

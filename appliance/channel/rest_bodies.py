@@ -35,7 +35,8 @@ Definitions = Annotated[
         max_length=1000,
     ),
 ]
-Note = Annotated[str, msgspec.Meta(max_length=200)]
+NOTE_LENGTH = 200
+Note = Annotated[str, msgspec.Meta(max_length=NOTE_LENGTH)]
 RevisionNote = Annotated[Note, doc("reason for the change, stored with the revision")]
 Signatures = Annotated[
     dict[MonitorName, Signature], doc("signatures by the names of files and definitions", max_length=2000)

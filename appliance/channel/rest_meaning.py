@@ -13,6 +13,7 @@ from urllib.parse import parse_qs, quote, unquote, urlencode
 import msgspec
 
 from appliance.base.timestamps import parse_date
+from appliance.base.validation_messages import refused_field
 from appliance.channel.admin import AdminRequest, operation_of
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.operations import OPERATIONS
@@ -62,6 +63,9 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[object
                     return order
     except NoOrderError:
         raise
+    except msgspec.ValidationError as error:
+        where, said = refused_field(error)
+        raise NoOrderError(f"{where.lstrip('.')}: {said}") from None
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise NoOrderError(f"the request is invalid: {type(error).__name__}") from None
     raise NoOrderError("this path takes no orders")

@@ -60,7 +60,7 @@ class AdminServer:
             text = f"not a request of this version: {error}"
             if str(error).startswith("Expected"):
                 where, said = refused_field(error)
-                text = f"{where.lstrip('.')}: {said}"
+                text = f"{where.lstrip('.')}: {said}" if where else said
             return admin.AdminAnswer(False, error=text, trouble="request")
         try:
             return await self._administration.carry_out(request, who=OPERATOR)

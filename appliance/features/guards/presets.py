@@ -15,6 +15,7 @@ from pathlib import Path
 from appliance.base.shipped import SHIPPED
 from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import meant
+from appliance.channel.rest_bodies import NOTE_LENGTH
 from rosmop.form.switch_words import Word
 from rosmop.types import given_lists
 from rosmop.types.roles import ANY_TYPE, types_of_roles
@@ -330,7 +331,7 @@ def described(text: str) -> str:
         return ""
     topics, types = topics_in(text), types_in(text)
     made_for = ", ".join(f"{name}={topic} {types.get(name, '')}".rstrip() for name, topic in topics.items())
-    return f"preset {head.preset} {head.version}: {made_for}"
+    return f"preset {head.preset} {head.version}: {made_for}"[:NOTE_LENGTH]
 
 
 def topics_in(text: str) -> dict[str, str]:

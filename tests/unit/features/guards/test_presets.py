@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.channel.rest_bodies import NOTE_LENGTH
 from appliance.features.guards.guard_order import PRECEDENCES
 from appliance.features.guards.presets import (
     FOLDER,
@@ -110,6 +111,7 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
         f"preset fence {PRESETS['fence'].version}: command=/base/cmd geometry_msgs/TwistStamped,"
         " by=/pose geometry_msgs/PoseStamped"
     )
+    assert len(described(text.replace("/base/cmd", "/arm_controller" * 20))) == NOTE_LENGTH
     made = preset_of(text)
     assert made is not None and (made.name, made.text, made.version) == (
         "fence",

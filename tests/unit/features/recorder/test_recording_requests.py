@@ -16,6 +16,14 @@ def test_an_order_has_no_relative_date(text: str) -> None:
         meant(asked)
 
 
+def test_a_date_beyond_its_bound_names_the_field() -> None:
+    recording = ClientRequest(
+        "10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", b'{"since": "1969-03-01"}'
+    )
+    with pytest.raises(NoOrderError, match="^since: must be at least 0"):
+        meant(recording)
+
+
 def test_a_date_is_nanoseconds() -> None:
     recording = ClientRequest(
         "10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", b'{"since": "2026-03-01"}'
