@@ -16,7 +16,7 @@ from roswire.message_text import PRIMITIVES
 
 MAX_ELEMENTS = 16
 MAX_CHARACTERS = 200
-MOST_BYTES = 32
+MAX_BYTES = 32
 MAX_FIELDS = 200
 _MAX_STEPS = 2_000
 CUT = "…"
@@ -134,7 +134,7 @@ class _CutError(Exception):
 
 
 def read_bytes(data: bytes) -> str:
-    return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
+    return data[:MAX_BYTES].hex() + _more(len(data) - MAX_BYTES)
 
 
 def _more(count: int) -> str:

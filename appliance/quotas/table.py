@@ -485,7 +485,7 @@ AUDIT_READ_KINDS = QuotaRow(
 )
 AUDIT_RATE = 64 << 10
 """Bytes a second by which a host's debt of audit records falls."""
-AUDIT_ROBOT_PART, AUDIT_NAMED_PART, AUDIT_NAMED_MOST = 4, 64, 256 << 20
+AUDIT_ROBOT_PART, AUDIT_NAMED_PART, MAX_AUDIT_NAMED = 4, 64, 256 << 20
 """The robot's part of the disk's free space is one of 4, that of an address or network of the policy one of 64, at most
 256 MiB.
 """

@@ -532,7 +532,7 @@ end:
        }
     /* The relay takes the connection, when it has carried out what control has told it. Who lacks something that is
        held back waits.
-       = appliance/relay/data_plane.py DataPlane._introduced
+       = appliance/relay/data_plane.py DataPlane._on_introduction
        = appliance/relay/transport/loop_channel.py LoopLink.catch_up
        = appliance/relay/connections/admission.py missing
        = appliance/relay/data_plane.py DataPlane._subscribe */
@@ -559,7 +559,7 @@ inline find_upstream(p) {
 }
 
 /* What the relay says.
-   = appliance/master/endpoints/relay_control.py RelayControl._received */
+   = appliance/master/endpoints/relay_control.py RelayControl._on_message */
 proctype RVMaster() POSSIBLE {
 end:
     do

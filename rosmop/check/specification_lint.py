@@ -11,7 +11,7 @@ from rosmop.form.findings import Diagnostic, Position
 from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.interface import Categories, ClockedProperty, CompiledProperty, FiniteProperty
 from rosmop.logics.property_lint import analyse
-from rosmop.run.state import MOST_BYTES
+from rosmop.run.state import MAX_STATE_BYTES
 from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
 from rosmop.types.messages import shown
@@ -33,8 +33,8 @@ def lint_size(size: int, position: Position) -> Iterator[Diagnostic]:
     if size > MAX_BYTES:
         text = f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB"
         yield Diagnostic(position, "error", text)
-    elif size > MOST_BYTES:
-        text = f"the variables take {size} bytes; a state of more than {MOST_BYTES >> 10} KiB is not kept, so"
+    elif size > MAX_STATE_BYTES:
+        text = f"the variables take {size} bytes; a state of more than {MAX_STATE_BYTES >> 10} KiB is not kept, so"
         yield Diagnostic(position, "warning", f"{text} a restart of the relay loses it")
 
 

@@ -25,7 +25,7 @@ from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
 from rosmop.types.value_types import Type, Value
 
-MOST_BYTES = 64 << 10
+MAX_STATE_BYTES = 64 << 10
 
 _CLOCK = struct.Struct("<qq")
 
@@ -61,8 +61,8 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
     data = msgspec.msgpack.encode(states)
-    if len(data) > MOST_BYTES:
-        raise StateTooLargeError(f"its state has {len(data)} bytes; {MOST_BYTES} are kept")
+    if len(data) > MAX_STATE_BYTES:
+        raise StateTooLargeError(f"its state has {len(data)} bytes; {MAX_STATE_BYTES} are kept")
     return data
 
 

@@ -24,11 +24,11 @@ from appliance.base import clock
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import (
     AUDIT_BYTES,
-    AUDIT_NAMED_MOST,
     AUDIT_NAMED_PART,
     AUDIT_RATE,
     AUDIT_RESERVE,
     AUDIT_ROBOT_PART,
+    MAX_AUDIT_NAMED,
 )
 
 RATE = AUDIT_RATE
@@ -99,7 +99,7 @@ class DiskParts:
         if group.robot:
             return free // AUDIT_ROBOT_PART
         free = free if self._retained is None else min(free, self._retained)
-        return min(AUDIT_NAMED_MOST, free // AUDIT_NAMED_PART)
+        return min(MAX_AUDIT_NAMED, free // AUDIT_NAMED_PART)
 
 
 def forgiven(owed: int, before: int, bound: int) -> int:

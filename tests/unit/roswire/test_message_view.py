@@ -1,7 +1,7 @@
 import struct
 
 from roswire.definitions import MAX_DEPTH, Definitions
-from roswire.message_view import CUT, MAX_CHARACTERS, MAX_ELEMENTS, MOST_BYTES, read_fields
+from roswire.message_view import CUT, MAX_BYTES, MAX_CHARACTERS, MAX_ELEMENTS, read_fields
 
 DEFINITIONS = Definitions.from_files(
     {
@@ -76,7 +76,7 @@ def test_a_shortened_array_does_not_hide_later_fields() -> None:
         == [*range(MAX_ELEMENTS), f"{CUT} {720 - MAX_ELEMENTS} more"]
     )
     assert fields["names"] == ["abc"] * MAX_ELEMENTS + [f"{CUT} {100 - MAX_ELEMENTS} more"]
-    assert fields["data"] == "01" * MOST_BYTES + f"{CUT} {5000 - MOST_BYTES} more"
+    assert fields["data"] == "01" * MAX_BYTES + f"{CUT} {5000 - MAX_BYTES} more"
     assert fields["last"] == 7
 
 
