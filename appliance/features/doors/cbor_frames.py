@@ -11,7 +11,7 @@ import msgspec
 
 from appliance.features.doors.message_reader import MessageValueError
 
-MAX_DEPTH = 70
+MAX_NESTING = 70
 """The deepest nesting; messages nest at most 64 levels deep."""
 
 MAX_ITEMS = 50_000
@@ -70,8 +70,8 @@ def _scan(frame: bytes) -> None:
             )
         if position + left[-1] > len(frame):
             raise MessageValueError(f"not CBOR: the frame ends inside the value at byte {start}")
-        if len(left) > MAX_DEPTH:
-            raise MessageValueError(f"a frame nested deeper than {MAX_DEPTH} levels: nest it less")
+        if len(left) > MAX_NESTING:
+            raise MessageValueError(f"a frame nested deeper than {MAX_NESTING} levels: nest it less")
         if items > MAX_ITEMS:
             raise MessageValueError(
                 f"a frame of more than {MAX_ITEMS} values; send numbers as a typed array (RFC 8746)"

@@ -13,7 +13,7 @@ PAGE = Path("docs/reference/rosbridge.md")
 _IS_BOUND = re.compile(r"MAX|LONGEST|LEAST|_SECONDS\b|_SECONDS$")
 
 SHOWN = {
-    "cbor_frames.MAX_DEPTH": "70 levels",
+    "cbor_frames.MAX_NESTING": "70 levels",
     "cbor_frames.MAX_ITEMS": "50,000 in CBOR",
     "cbor_frames.MAX_NUMBERS": "500,000 numbers",
     "connections.ConnectionLimits.connections": "`doors.connections`, 32",

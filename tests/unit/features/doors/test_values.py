@@ -12,7 +12,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from appliance.features.doors.cbor_frames import MAX_DEPTH, MAX_ITEMS, MAX_NUMBERS, json_of_cbor
+from appliance.features.doors.cbor_frames import MAX_ITEMS, MAX_NESTING, MAX_NUMBERS, json_of_cbor
 from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.values import MessageCodec, ValueLimits, cbor
 from roswire.definitions import MAX_DEPTH, Definitions
@@ -223,8 +223,8 @@ def test_a_hostile_message_takes_neither_time_nor_memory(text: str, data: bytes,
         (b"\x9b" + b"\xff" * 8, "ends inside the value"),
         (b"\xbb" + b"\x7f" * 8, "ends inside the value"),
         (b"\x5b" + b"\xff" * 8 + b"a", "ends inside the value"),
-        (b"\x81" * (MAX_DEPTH + 1) + b"\0", f"nested deeper than {MAX_DEPTH}"),
-        (b"\x81" * 1_000_000, f"nested deeper than {MAX_DEPTH}"),
+        (b"\x81" * (MAX_NESTING + 1) + b"\0", f"nested deeper than {MAX_NESTING}"),
+        (b"\x81" * 1_000_000, f"nested deeper than {MAX_NESTING}"),
         (b"\x9a\x00\x10\x00\x00" + b"\x80" * (1 << 20), f"more than {MAX_ITEMS} values"),
         (cbor2.dumps(2**70), "tag 2"),
         (b"\xd8\x23\x61(", "tag 35"),

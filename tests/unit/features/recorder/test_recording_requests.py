@@ -20,7 +20,7 @@ def test_a_date_beyond_its_bound_names_the_field() -> None:
     recording = ClientRequest(
         "10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", b'{"since": "1969-03-01"}'
     )
-    with pytest.raises(NoOrderError, match="^since: must be at least 0"):
+    with pytest.raises(NoOrderError, match=r"^since: must be at least 0"):
         meant(recording)
 
 
