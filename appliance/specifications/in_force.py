@@ -139,7 +139,7 @@ def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed
 
 
 def switched(now: InForce, names: Collection[str], to: Switch, *, timed: bool = False) -> InForce:
-    """Return the value after a switch; one that is `timed` returns to the switch before all timed ones."""
+    """Return the value after a switch. A `timed` switch returns to the one before all timed ones."""
     others = dict.fromkeys(names, to)
     require_whole({**now.states, **others}, now.checked)
     returns = {name: one for name, one in now.returns.items() if name not in others}

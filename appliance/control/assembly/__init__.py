@@ -1,1 +1,1 @@
-"""Parts of control that stand below its links and operators."""
+"""Parts of control that its links and operators use."""
