@@ -37,7 +37,8 @@ class InForce:
     """Specifications with everything that operators ordered about them.
 
     `number` is that of the revision; `acts` counts all switches and resumptions so far. `returns` are of switches for a
-    time. Unless it is confirmed in time, the revision gives way to the revision `back_to`.
+    time. Unless it is confirmed in time, the revision gives way to the revision `back_to`. `since` names what operators
+    have ordered since that one was in force: `deadman` for a switch, `deadman.vMax` for a constant.
     """
 
     number: int = 0
@@ -48,6 +49,7 @@ class InForce:
     acts: int = 0
     returns: Mapping[str, Return] = field(default_factory=dict)
     back_to: int | None = None
+    since: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "switches", self.switches.of(self.checked))
@@ -82,7 +84,8 @@ class Order:
 
     `within` is the time in which it must be confirmed. `author` is the author of the revision, unless it is `who`.
     `kept` are files that are not in the folder, `loaded` those that the operator named. `shadow` and `enable` name
-    files. `topics` and `constants` are given values. `switches` and `given` are for monitors that are not in force yet.
+    files. `topics` and `constants` are given values. `switches` and `given` are for monitors that are not in force yet,
+    and, if the order `undoes` a change, for all others as well.
     """
 
     sources: Sources
@@ -99,6 +102,7 @@ class Order:
     constants: Given = field(default_factory=dict)
     switches: Mapping[str, Switch] = field(default_factory=dict)
     given: Given = field(default_factory=dict)
+    undoes: bool = False
 
 
 class Coming(NamedTuple):
@@ -116,7 +120,9 @@ class Coming(NamedTuple):
 
 def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed: bool) -> Coming:
     """Return the next revision. With `signed`, the site signs the texts."""
-    constants = constants_of(order, checked, signed=signed)
+    constants, before = constants_of(order, checked, signed=signed), now
+    if order.undoes:
+        now = _undone(now, order)
     present = {name: to for name, to in now.states.items() if name in checked.switches}
     said = {**_absent(now, order.switches), **present, **now.switches.said}
     new = InForce(
@@ -132,10 +138,43 @@ def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed
     files = checked.monitors.items()
     put: dict[str, Switch] = {name: SHADOW for name, file in files if file in order.shadow}
     put |= {name: True for name, file in files if file in order.enable and new.states[name] is False}
-    new = replace(new, switches=new.switches.saying({**said, **put}))
+    one_more = order.within is not None and now.back_to is not None
+    ordered = put.keys() | {f"{name}.{constant}" for name, given in constants.items() for constant in given}
+    since = now.since - ordered if one_more else frozenset[str]()
+    new = replace(new, switches=new.switches.saying({**said, **put}), since=since)
     enabled = {name: True for name in checked.monitors if now.switches.enabled(name)}
+    if order.undoes:
+        return _with_differences(cleared(new), before)
     require_whole({**new.states, **enabled, **put}, checked)
     return cleared(new)._replace(put=put, given=constants)
+
+
+def _undone(now: InForce, order: Order) -> InForce:
+    """Return the value with the words of an order, except for what ends by itself or was ordered since."""
+    kept = now.since | now.returns.keys()
+    said = {name: to for name, to in now.switches.said.items() if name in kept}
+    values = {
+        monitor: {name: value for name, value in given.items() if f"{monitor}.{name}" in now.since}
+        for monitor, given in now.givens.said.items()
+    }
+    switches = now.switches.saying({**order.switches, **said})
+    return replace(now, switches=switches, givens=Givens(order.given).giving(values))
+
+
+def _with_differences(coming: Coming, before: InForce) -> Coming:
+    """Return it with the switches and values of `before` that it replaces."""
+    new = coming.now
+    put = {name: to for name, to in new.states.items() if before.states.get(name, to) != to}
+    given = {
+        name: {
+            one.name: one.value
+            for one in new.givens.states(new.checked, name)
+            if one.name in old and one.value != old[one.name]
+        }
+        for name in new.checked.monitors
+        if (old := {one.name: one.value for one in before.givens.states(before.checked, name)})
+    }
+    return coming._replace(put=put, given={name: values for name, values in given.items() if values})
 
 
 def switched(now: InForce, names: Collection[str], to: Switch, *, timed: bool = False) -> InForce:
@@ -147,16 +186,18 @@ def switched(now: InForce, names: Collection[str], to: Switch, *, timed: bool = 
         back = now.returns[name].back if name in now.returns else now.states[name] or True
         returns[name] = Return(back, to)
     switches = now.switches.saying({**now.switches.said, **others})
-    return replace(now, switches=switches, acts=now.acts + 1, returns=returns)
+    since = now.since | others.keys()
+    return replace(now, switches=switches, acts=now.acts + 1, returns=returns, since=since)
 
 
 def confirmed(now: InForce) -> InForce:
     returns = {name: one for name, one in now.returns.items() if one.of is not True}
-    return replace(now, returns=returns, back_to=None)
+    return replace(now, returns=returns, back_to=None, since=frozenset())
 
 
 def given(now: InForce, name: str, values: Mapping[str, GivenValue]) -> InForce:
-    return replace(now, givens=now.givens.giving({name: values}), acts=now.acts + 1)
+    since = now.since | {f"{name}.{constant}" for constant in values}
+    return replace(now, givens=now.givens.giving({name: values}), acts=now.acts + 1, since=since)
 
 
 def cleared(new: InForce) -> Coming:

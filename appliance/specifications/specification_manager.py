@@ -10,7 +10,8 @@
    protection off. After a restart, the return is due again.
 5. A load or switch of other monitors never takes an existing monitor out of force.
 6. Files that are not in the folder stay in force unless a reload prunes, so a missing file ends no protection.
-7. Each revision is stored with its last switches, so a rollback restores its monitors as they were.
+7. Each revision is stored with its last switches and constants. A rollback gives them to monitors that return; that of
+   an unconfirmed change to all, except for what operators ordered since.
 8. Each change gets a new tag, which never repeats; a change that expects another tag is refused.
 """
 
@@ -76,6 +77,7 @@ _STOPS = "monitor stops"
 _ACTS = "monitor acts"
 _GIVEN = "monitor given"
 _RETURNS = "monitor returns"
+_SINCE = "monitor orders since"
 ALLOCATION = "relays"
 TIMED = EndKind("timed switch")
 _LONGEST = 30 * 86_400.0  # seconds of a timed switch
@@ -167,6 +169,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             acts=int(settings.get(_ACTS, "0")),
             returns=msgspec.json.decode(settings.get(_RETURNS, "{}"), type=dict[str, Return]),
             back_to=int(unconfirmed[0]) if unconfirmed else None,
+            since=frozenset(json.loads(settings.get(_SINCE, "[]"))),
         )
         sources, checked, refused = await specifications_at_start(
             last,
@@ -438,7 +441,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
         """Bring a revision into force again: None is the previous revision, 0 no specifications.
 
-        The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start.
+        The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start. It
+        also brings back switches and constants, except for what operators ordered since.
         """
         async with self.changing(request.expected):
             row = NOTHING if request.revision == 0 else await self.wanted(request.revision)
@@ -448,7 +452,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 if who == UNCONFIRMED
                 else self._strictly
             )
-            order = Order(sources_of(row), who, note, consent=_ALL, switches=last.switches, given=last.given)
+            order = Order(
+                sources_of(row), who, note, consent=_ALL, switches=last.switches, given=last.given,
+                undoes=who == UNCONFIRMED,
+            )  # fmt: skip
             return await self._change(order, check)
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
@@ -641,7 +648,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._record_cleared(before, coming)
         self._record_loaded(before.sources, order.who, warnings, self.rollout.began(self.names()))
         for name, to in coming.put.items():
-            self._say_switched(name, to, order.who, ", as it was loaded", earlier=before.states.get(name))
+            how = ", as before the change" if order.undoes else ", as it was loaded"
+            self._say_switched(name, to, order.who, how, earlier=before.states.get(name))
         for name, values in coming.given.items():
             own = {state.name: state.default for state in self.givens.states(self.checked, name)}
             own |= {state.name: state.value for state in before.givens.states(before.checked, name)}
@@ -774,6 +782,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.store.save_setting(SWITCHES, json.dumps(dict(now.switches.said)))
         self.store.save_setting(_GIVEN, json.dumps(dict(now.givens.said)))
         self.store.save_setting(_RETURNS, msgspec.json.encode(now.returns).decode())
+        self.store.save_setting(_SINCE, json.dumps(sorted(now.since)))
 
     def _stays(self, problem: str) -> str:
         waits = self.confirm_by is not None or self.now.promoted

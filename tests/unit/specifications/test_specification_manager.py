@@ -1,7 +1,7 @@
 import asyncio
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from appliance.specifications.specification_files import (
 )
 from appliance.specifications.specification_manager import (
     DryRunUnderWayError,
+    SpecificationManager,
 )
 from appliance.specifications.specification_revisions import text_of
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
@@ -423,6 +424,76 @@ async def test_an_unconfirmed_change_goes_back_to_the_warnings_of_the_load(desk:
     async with asyncio.timeout(30):
         await desk.rolled_back.wait()
     assert (monitors.revision, monitors.checked.warnings) == (3, warnings)
+
+
+CAP = "cap() given { double speed = 1.0 m/s in 0..2; } { event said() /cmd std_msgs/String '{}' { } }"
+CHANGES: dict[str, Callable[[SpecificationManager, float], Awaitable[Any]]] = {
+    "in shadow mode": lambda now, within: now.load(
+        admin.MonitorLoad({"cap.rv": CAP + " "}, shadow=True, confirm_within=within), "eve"
+    ),
+    "another constant": lambda now, within: now.load(
+        admin.MonitorLoad({"cap.rv": CAP}, given={"cap": {"speed": 2.0}}, confirm_within=within), "eve"
+    ),
+    "the constant is out of range": lambda now, within: now.load(
+        admin.MonitorLoad({"cap.rv": CAP.replace("0..2", "1..2")}, confirm_within=within), "eve"
+    ),
+    "removed": lambda now, within: now.remove(
+        admin.MonitorRemove(["cap", "b"], confirm_within=within), "eve"
+    ),
+    "enabled": lambda now, within: now.load(
+        admin.MonitorLoad({"b.rv": B + " "}, confirm_within=within), "eve", enable=True
+    ),
+}
+
+
+def words_of(now: SpecificationManager) -> tuple[object, ...]:
+    return (
+        now.sources,
+        now.now.states,
+        now.givens.said,
+        [row.value for row in now.givens.states(now.checked, "cap")],
+    )
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("others", [[], [*CHANGES]])
+@pytest.mark.parametrize("change", CHANGES)
+async def test_an_unconfirmed_change_goes_back_with_all_its_switches_and_constants(
+    desk: Desk, change: str, others: list[str], restarted: bool
+) -> None:
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"cap.rv": CAP, "b.rv": B}), "eve")
+    await monitors.give(admin.MonitorGive("cap", {"speed": 0.3}), "eve")
+    await monitors.switch(admin.MonitorSwitch(["b"], False), "eve")
+    before = words_of(monitors)
+    for name in dict.fromkeys([change, *others]):
+        await CHANGES[name](monitors, 600.0)
+    assert words_of(monitors) != before
+    if restarted:
+        desk.kill()
+        monitors = await desk.monitors(restarted=True)
+    monitors.ends.set(monitors.unconfirmed, str(monitors.now.back_to), 0.0)
+    async with asyncio.timeout(30):
+        await desk.rolled_back.wait()
+    assert words_of(monitors) == before
+
+
+async def test_an_order_during_an_unconfirmed_change_outlasts_it(desk: Desk) -> None:
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"cap.rv": CAP, "b.rv": B}), "eve")
+    load = admin.MonitorLoad({"cap.rv": CAP, "b.rv": B}, shadow=True, confirm_within=600.0)
+    await monitors.load(load, "eve")
+    await monitors.give(admin.MonitorGive("cap", {"speed": 0.3}), "ann")
+    await monitors.switch(admin.MonitorSwitch(["a"], False), "ann")
+    desk.kill()
+    monitors = await desk.monitors(restarted=True)
+    monitors.ends.set(monitors.unconfirmed, str(monitors.now.back_to), 0.0)
+    async with asyncio.timeout(30):
+        await desk.rolled_back.wait()
+    assert monitors.now.states == {"a": False, "b": True, "cap": True}
+    assert monitors.givens.said == {"cap": {"speed": 0.3}}
+    switched = [fields["reason"] for event, fields in desk.trail.heard if event == "monitor enabled"]
+    assert switched[-2:] == ["b is enabled, as before the change", "cap is enabled, as before the change"]
 
 
 async def test_no_load_brings_a_further_error_beside_a_broken_file(desk: Desk) -> None:
