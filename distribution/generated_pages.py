@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -112,10 +113,10 @@ An *unknown host* is an address that no rule of the policy names, or that an ope
 one quota. The *kept* part is for hosts with a registration only, so the robot's own nodes find it free at any time.
 `[Ports]` and `[Limits]` are sections of the policy; the other settings are keys of `appliance.yaml`.
 
-The [margins](#margins-the-honest-use-that-comes-closest) compare each quota with a large robot (200 nodes on one
-machine and 5,000 parameters, started 20 times in a row) and with many browsers. They are computed, not measured.
+The [margins](#margins-the-honest-use-that-comes-closest) are those of a large robot (200 nodes on one machine and 5,000
+parameters, started 20 times in a row) and of many browsers: computed, not measured. Resources that allow at least twice
+such a use, or for which it has no number, are left out there.
 """
-
 _FREE = 512 << 20  # bytes of the disk, in the margin of audit records
 
 
@@ -132,29 +133,25 @@ def _tables() -> Iterator[str]:
         "Sizes",
         ("resource", "whole", "one host", "unknown hosts together", "kept", "setting"),
         lambda row: (
-            *(
-                f"{number:,}"
-                for number in (row.bounds.whole, row.bounds.host, row.bounds.unknown, row.bounds.kept)
-            ),
+            row.thing,
+            *(f"{one:,}" for one in (row.bounds.whole, row.bounds.host, row.bounds.unknown, row.bounds.kept)),
             _setting(row),
         ),
     )
     yield _table(
         "At the limit",
-        ("resource", "effect on the host", "order among hosts", "alarm"),
-        lambda row: (row.at_limit, row.between, row.alarm),
+        ("resource", "effect on the host", "order among hosts", "alarm", "host, unknown, kept: if not as above"),
+        lambda row: (_short(row.thing), row.at_limit, row.between, row.alarm, row.counting),
     )
     yield _table(
         "Margins: the honest use that comes closest",
         ("resource", "use", "it needs", "allowed", "times", "beyond it"),
-        lambda row: (row.margin.use or "none", *_margin(row), row.margin.beyond),
+        lambda row: _margin(row) if allowed(row) < 2 * row.margin.needs else None,
     )
-    yield _table(
-        "Definition of host, unknown or kept, where it differs from the rule above",
-        ("resource", "rule"),
-        lambda row: (row.counting,) if row.counting else None,
-    )
-    yield "The field `shown_by` of each row in `appliance/quotas/table.py` names the tests that exhaust the resource.\n"
+
+
+def _short(thing: str) -> str:
+    return re.split(r": | \(|; |, (?:beyond|in percent|including|also|divided) ", thing)[0]
 
 
 def allowed(row: QuotaRow) -> int:
@@ -170,20 +167,20 @@ def allowed(row: QuotaRow) -> int:
     return bounds.host
 
 
-def _margin(row: QuotaRow) -> tuple[str, str, str]:
-    needs, most = row.margin.needs, allowed(row)
-    return (f"{needs:,}", f"{most:,}", f"{most / needs:.1f}") if needs else ("", "", "")
+def _margin(row: QuotaRow) -> tuple[str, ...]:
+    use, needs, _, beyond = row.margin
+    return _short(row.thing), use, f"{needs:,}", f"{allowed(row):,}", f"{allowed(row) / needs:.1f}", beyond
 
 
 def _table(title: str, columns: tuple[str, ...], cells: Callable[[QuotaRow], tuple[str, ...] | None]) -> str:
-    rows = ((row.thing, *found) for row in all_rows() if (found := cells(row)) is not None)
+    rows = (found for row in all_rows() if (found := cells(row)) is not None)
     lines = (columns, ("---",) * len(columns), *rows)
     return f"## {title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _setting(row: QuotaRow) -> str:
     key, space, note = row.setting.partition(" ")
-    return f"`{key}`{space}{note}" if key else "none"
+    return f"`{key}`{space}{note}" if key else ""
 
 
 # Generate the end of docs/reference/metrics.md: the table of all metrics.
