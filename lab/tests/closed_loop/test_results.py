@@ -34,7 +34,7 @@ def test_worlds_of_several_commits_are_added_and_counted_by_commit() -> None:
     line = "900 worlds from seed 1000, 27 s, {}, 21 of 24 honest commands passed, closest 100.0 cm"
     when = " (2026-11-28, 600 of commit `c1`, 300 of commit `c2`)"
     assert run_line(added) == line.format("3 broke a law") + when
-    bound = "none broke a law (at most 0.33 % with 95 % confidence)"
+    bound = "none broke a law (at most 0.33 %)"
     assert run_line(replace(added, violations={})) == line.format(bound) + when
 
 
