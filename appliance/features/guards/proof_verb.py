@@ -18,7 +18,7 @@ def test(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[GUARD]...",
+            metavar="GUARD",
             help="Names as in `rosrv guard list` (default: all guards in force)",
             autocompletion=completion.monitors,
             show_default=False,

@@ -190,7 +190,7 @@ def new(
     """Make a guard from a preset and load it. Its file is also written into the folder of specifications.
 
     The robot must have the topics, with types that the preset knows; --type is for a topic that no node has yet. With
-    --confirm-within, and over REST, no file is written. `rosrv guard list` prints the presets with their parameters.
+    --confirm-within, and over REST, no file is written.
 
     Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5
     """

@@ -128,7 +128,7 @@ def enforce(
 
     With --confirm-within they return to shadow mode after this time, even if the appliance restarts.
 
-    A monitor that missed messages in shadow mode starts in its initial state; the output names it.
+    The output names those that start in their initial state.
 
     Example: rosrv monitor enforce safeTrigger
     """

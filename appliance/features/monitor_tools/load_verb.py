@@ -101,9 +101,8 @@ def load(
     """Load specifications while the robot runs; files of the same name are replaced.
 
     They are compiled and compared with the robot's topics first. After an error nothing changes: exit status 1. A
-    monitor whose source changes loses its state; if it then holds topics with traffic, the load needs --hold. With
-    --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the files
-    and from --msg.
+    monitor whose source changes loses its state; if it then holds topics with traffic, the load needs --hold.
+    Message definitions come from `msg/` beside the files and from --msg.
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """

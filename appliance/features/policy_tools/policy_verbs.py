@@ -278,8 +278,7 @@ def explain_request(
     """Explain whether a request is allowed, by which rule, and which rules it overrides. Exit status 1 unless
     allowed.
 
-    Without an action, list the rules that grant the host something; exit status 1 if none does. Without a file, the
-    policy in force is used.
+    Without an action, list the rules that grant the host something; exit status 1 if none does.
 
     Example: rosrv policy explain --host 10.0.0.9 --node /joy --publish /cmd_vel
     """

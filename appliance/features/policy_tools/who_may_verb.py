@@ -30,8 +30,6 @@ def list_who_may(
 ) -> None:
     """List the hosts that may do something, and the rule for each. Exit status 1 if no host may.
 
-    Without a file, the policy in force is used.
-
     Example: rosrv policy who-may publish /cmd_vel
     """
     try:
