@@ -27,7 +27,7 @@ _File = Annotated[
         "--config", readable=False, help="Configuration file (default: ROSRV_CONFIG, else ./appliance.yaml)"
     ),
 ]
-_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
+_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:

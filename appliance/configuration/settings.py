@@ -211,7 +211,7 @@ class LivenessSection:
 
 @section
 class Relay:
-    """The limits of the relay; each key is a field of `appliance.relay.relay_limits.RelayLimits`."""
+    """The limits of the relay."""
 
     connections: Count = key(default=16_384, description="of all hosts")
     connections_per_host: Count = key(default=8_192, description="connections of one host")

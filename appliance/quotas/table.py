@@ -112,7 +112,7 @@ RVMASTER_REQUESTS = QuotaRow(
     at_limit="the request waits for its host's turn",
     between="each host that a rule names has one more of its own, so it never waits for another host's requests; hosts"
     " that the policy names as one network, or only by `*`, share turns and get at most half of the whole",
-    alarm="none: nothing is rejected",
+    alarm="none",
     margin=HonestUse(
         "200 nodes of one machine that call at once",
         200,
@@ -131,7 +131,7 @@ RVMASTER_TIME = QuotaRow(
     " is divided",
     between="next is the host that has used least",
     counting="all unknown hosts count as one host",
-    alarm="none: nothing is rejected",
+    alarm="none",
     margin=HonestUse(
         "200 nodes that start beside a browser",
         0,
@@ -165,7 +165,7 @@ LARGE_WRITES = QuotaRow(
     thing="large values under way to the ROS master and to a standby",
     bounds=Bounds(whole=3, host=1, unknown=1, kept=1),
     at_limit="the value waits for its host's turn; small calls need not wait for it",
-    alarm="none: nothing is rejected",
+    alarm="none",
     margin=HonestUse(
         "one large value at a time, such as a robot description",
         1,
@@ -180,7 +180,7 @@ PROBES = QuotaRow(
     thing="liveness checks of nodes under way",
     bounds=Bounds(whole=64, host=16, unknown=8, kept=24),
     at_limit="the check waits for its host's turn",
-    alarm="none: nothing is rejected",
+    alarm="none",
     margin=HonestUse(
         "200 nodes of one machine that are killed at once",
         200,
@@ -192,7 +192,7 @@ NODE_CALLS_UNDER_WAY = QuotaRow(
     thing="calls to nodes under way",
     bounds=Bounds(whole=512, host=128, unknown=64, kept=192),
     at_limit="the call waits for its host's turn",
-    alarm="none: nothing is rejected",
+    alarm="none",
     margin=HonestUse(
         "200 nodes of one machine that learn of a new publisher",
         200,
@@ -295,7 +295,7 @@ RELAY_TURN = QuotaRow(
     between="next is the host that has used least; the relay's links to control and supervisor come first",
     counting="unknown: no grant; hosts with grants that no rule or only `*` names count as one; a policy change"
     " applies to new connections",
-    alarm="none: nothing is rejected",
+    alarm="none",
     margin=HonestUse(
         "a host with ten cameras beside one that sends a stop",
         0,

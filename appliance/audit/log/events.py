@@ -91,12 +91,9 @@ EVENTS: dict[str, str] = {
     " topics.",
     "topics held": "A monitor's state was lost, so it holds its topics until an operator resumes it.",
     "monitor verdict": "A property of a monitor reached a category that has a handler; `detail` has the logic and the"
-    " category, the `binding` for parametric specifications, the location `at`, the events `why` that alone give the"
-    " verdict, and the `conditions` with the values that they compared.",
+    " category, the `binding` for parametric specifications, and in `why` the events that alone give the verdict.",
     "message dropped": "A monitor dropped a message; the first in each second is recorded in full, the others as"
-    " `detail.count` with `first_time` and `last_time` (nanoseconds since the epoch). `at` is the location of the"
-    " statement that dropped it, `conditions` the conditions that led there, each with the values that it compared;"
-    " `handler` is the verdict whose handler ran, with its `why`.",
+    " `detail.count` with `first_time` and `last_time` (nanoseconds since the epoch).",
     "message changed": "Monitors changed a message; `detail` has the bytes before and after, `changed_by` the events"
     " that changed it, in order, and `monitor` the monitor of the last event. A record with `count` has `changed_by`"
     " if several monitors changed the message.",
@@ -104,10 +101,8 @@ EVENTS: dict[str, str] = {
     "monitor log": "A monitor logged a line; the first in each second is recorded in full, and further ones that differ"
     " only in numbers as `detail.count`, with `first_time`, `last_time` (nanoseconds since the epoch), `first_text` and"
     " `last_text` of those. The reason has the last line.",
-    "monitor called": "A monitor called a service, with the fields of `monitor published`; if the call fails, the event"
-    " `monitor fault` follows.",
-    "monitor published": "A monitor published a message; `at` is the location of the statement, `conditions` the"
-    " conditions that led there; `handler` is the verdict whose handler ran, with its `why`.",
+    "monitor called": "A monitor called a service; if the call fails, `monitor fault` follows.",
+    "monitor published": "A monitor published a message.",
     "stop begun": "A monitor stops a topic: it sends its safe message, or puts it in the place of messages. `detail`"
     " has `monitor`, `cause` (its own line, a fault, or why it cannot judge), and what"
     " `message changed` or `monitor published` has of this message; `host` and `caller_id` are those of the message"

@@ -207,7 +207,7 @@ _CHECKPOINT_SECONDS = (
     5.0  # pause between two queries: a checkpoint is made once a minute, and REST queries are recorded
 )
 _PROGRESS_EVERY = 1000  # records
-_JSON_HELP = "One JSON object on each line (NDJSON)"
+_JSON_HELP = "Machine-readable output, one object per line"
 _ALWAYS_JSON_HELP = "Accepted; the output is always NDJSON"
 
 
