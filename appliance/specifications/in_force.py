@@ -122,7 +122,7 @@ def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed
     """Return the next revision. With `signed`, the site signs the texts."""
     constants, before = constants_of(order, checked, signed=signed), now
     if order.undoes:
-        now = _undone(now, order)
+        now = _undone(now, order, checked)
     present = {name: to for name, to in now.states.items() if name in checked.switches}
     said = {**_absent(now, order.switches), **present, **now.switches.said}
     new = InForce(
@@ -149,22 +149,34 @@ def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed
     return cleared(new)._replace(put=put, given=constants)
 
 
-def _undone(now: InForce, order: Order) -> InForce:
-    """Return the value with the words of an order, except for what ends by itself or was ordered since."""
+def _undone(now: InForce, order: Order, checked: CheckedSpecifications) -> InForce:
+    """Return the value with the texts and words of an order, but for what ends automatically or was ordered since."""
+    former = now.switches.saying(order.switches).of(checked).states
+    returns = dict(now.returns)
+    for name in now.returns.keys() & former.keys() - now.since:
+        of = returns[name].of
+        back = former[name] if of is True else former[name] or True
+        returns |= {name: Return(back, of)}
+    returns = {name: one for name, one in returns.items() if one.back != one.of}
     kept = now.since | now.returns.keys()
     said = {name: to for name, to in now.switches.said.items() if name in kept}
     values = {
         monitor: {name: value for name, value in given.items() if f"{monitor}.{name}" in now.since}
         for monitor, given in now.givens.said.items()
     }
+    given = Givens(order.given).giving(Givens(values).in_force(checked))
     switches = now.switches.saying({**order.switches, **said})
-    return replace(now, switches=switches, givens=Givens(order.given).giving(values))
+    return replace(now, checked=checked, switches=switches, givens=given, returns=returns)
 
 
 def _with_differences(coming: Coming, before: InForce) -> Coming:
     """Return it with the switches and values of `before` that it replaces."""
     new = coming.now
-    put = {name: to for name, to in new.states.items() if before.states.get(name, to) != to}
+    put = {
+        name: to
+        for name, to in new.states.items()
+        if before.states.get(name, to) != to and name not in coming.drawn_in
+    }
     given = {
         name: {
             one.name: one.value
@@ -177,8 +189,10 @@ def _with_differences(coming: Coming, before: InForce) -> Coming:
     return coming._replace(put=put, given={name: values for name, values in given.items() if values})
 
 
-def switched(now: InForce, names: Collection[str], to: Switch, *, timed: bool = False) -> InForce:
-    """Return the value after a switch. A `timed` switch returns to the one before all timed ones."""
+def switched(
+    now: InForce, names: Collection[str], to: Switch, *, timed: bool = False, due: bool = False
+) -> InForce:
+    """Return the value after a switch. A `timed` switch returns to the one before all timed ones, when it is `due`."""
     others = dict.fromkeys(names, to)
     require_whole({**now.states, **others}, now.checked)
     returns = {name: one for name, one in now.returns.items() if name not in others}
@@ -186,7 +200,7 @@ def switched(now: InForce, names: Collection[str], to: Switch, *, timed: bool = 
         back = now.returns[name].back if name in now.returns else now.states[name] or True
         returns[name] = Return(back, to)
     switches = now.switches.saying({**now.switches.said, **others})
-    since = now.since | others.keys()
+    since = now.since if timed or due else now.since | others.keys()
     return replace(now, switches=switches, acts=now.acts + 1, returns=returns, since=since)
 
 

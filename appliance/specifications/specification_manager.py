@@ -565,7 +565,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         ]
         if not changed:
             return changed
-        new = in_force.switched(now, changed, to, timed=seconds is not None)
+        new = in_force.switched(now, changed, to, timed=seconds is not None, due=due)
         told = [(name, messages.MonitorSwitched(name, to is True)) for name in changed]
         shadow = to == SHADOW or any(map(switches.in_shadow, changed))
         limits = [] if seconds is None else [(TIMED, name, seconds) for name in changed]

@@ -2,6 +2,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.channel.answers.monitor_answers import GivenState
@@ -134,3 +135,40 @@ def test_changes_without_a_confirmation_go_back_to_the_last_revision_before_them
     waiting = following(following(NOW, 5.0), 5.0)
     assert (waiting.number, waiting.back_to, switched(waiting, ["a"], True).back_to) == (5, 3, 3)
     assert (following(waiting).back_to, confirmed(waiting).back_to) == (None, None)
+
+
+def undone(now: InForce, text: CheckedSpecifications, former: InForce) -> InForce:
+    order = Order(former.sources, switches=former.switches.said, given=former.givens.said, undoes=True)
+    return loaded(now, order, text, signed=False).now
+
+
+def worded(word: str, *names: str) -> CheckedSpecifications:
+    return msgspec.structs.replace(checked(*names), switches=dict.fromkeys(names, word))
+
+
+@pytest.mark.parametrize(("enable", "word"), [("all", "off"), ("all", "shadow"), ("none", "on")])
+def test_the_word_of_a_text_that_is_undone_goes_with_it(enable: str, word: str) -> None:
+    former = in_force("b", enable=enable)
+    now = loaded(former, Order(sources("b"), within=60.0), worded(word, "b"), signed=False).now
+    assert now.states == former.states
+    assert undone(now, checked("b"), former).states == former.states
+
+
+@pytest.mark.parametrize("to", [False, True])
+def test_a_timed_switch_returns_to_the_one_before_a_change_that_is_undone(to: bool) -> None:
+    former = in_force("b")
+    now = loaded(former, Order(sources("b"), within=60.0, shadow={"b.rv"}), checked("b"), signed=False).now
+    timed = switched(now, ["b"], to, timed=True)
+    back = undone(timed, checked("b"), former)
+    assert (back.states, back.returns) == ({"b": to}, {} if to else {"b": Return(True)})
+    ended = switched(timed, ["b"], SHADOW, due=True)
+    assert undone(ended, checked("b"), former).states == {"b": True}
+
+
+def test_a_constant_that_the_former_text_does_not_allow_gives_way_to_the_former_one() -> None:
+    wide = msgspec.structs.replace(
+        checked("b"), givens={"b": (GivenState("speed", "double", 1.0, "m/s", 1.0, 0.0, 5.0),)}
+    )
+    former = given(in_force("b"), "b", {"speed": 0.3})
+    now = given(loaded(former, Order(sources("b"), within=60.0), wide, signed=False).now, "b", {"speed": 4.0})
+    assert undone(now, checked("b"), former).givens.said == {"b": {"speed": 0.3}}
