@@ -461,12 +461,16 @@ class BundleGate:
 
     async def _undo(self, trial: Trial) -> None:
         """Roll back to the state before the trial, except for parts that an operator has changed."""
+        policies, monitors = self._policies, self._monitors
         while True:
             try:
-                if self._policies.in_force.who == trial.who and self._policies.revision > trial.policy_back:
-                    await self._policies.roll_back(admin.PolicyRollback(trial.policy_back), UNCONFIRMED)
-                if self._monitors.in_force.who == trial.who and self._monitors.revision > trial.monitors_back:
-                    await self._monitors.roll_back(admin.MonitorRollback(trial.monitors_back), UNCONFIRMED)
+                if policies.in_force.who == trial.who and policies.revision > trial.policy_back:
+                    policy = admin.PolicyRollback(trial.policy_back, policies.revision)
+                    await policies.roll_back(policy, UNCONFIRMED)
+                if monitors.in_force.who == trial.who and monitors.revision > trial.monitors_back:
+                    await monitors.roll_back(
+                        admin.MonitorRollback(trial.monitors_back, monitors.tag), UNCONFIRMED
+                    )
                 if fingerprint(self._hosts().bundled) == trial.hosts_sha256 and (
                     self._hosts().bundled != trial.hosts_back
                 ):

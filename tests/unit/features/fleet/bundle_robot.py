@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from appliance.control.assembly.policies import RevisionChangedError
 from appliance.features.fleet.bundle_gate import BundleGate
 from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.features.fleet.bundle_link import BundleLink, BundleOffered, BundlePollReported, BundleStated
@@ -44,10 +45,14 @@ class Revisions:
         self.confirm_by: float | None = None
         self.error: Exception | None = None
         self.would_hold: list[str] = []
+        self.queued = ""
+        """The operator whose change a rollback waits for."""
 
     @property
     def revision(self) -> int:
         return self.in_force.revision
+
+    tag = revision
 
     @property
     def in_force(self) -> RevisionRow:
@@ -75,6 +80,11 @@ class Revisions:
         self.change(who, "of the bundle")
 
     async def roll_back(self, order: Any, who: str) -> None:
+        if self.queued:
+            self.change(self.queued)
+            self.queued = ""
+        if order.expected != self.tag:
+            raise RevisionChangedError(order.expected, self.revision)
         self.change(who, self.rows[order.revision - 1].text)
 
 

@@ -44,6 +44,16 @@ async def test_a_change_by_an_operator_during_commit_confirm_only_delays_the_bun
         assert robot.trail.events == ["bundle in force"]
 
 
+async def test_a_change_that_a_rollback_waits_for_stays(robot: BundleRobot) -> None:
+    async with robot.running():
+        robot.poll(offered=True)
+        await asyncio.sleep(5)
+        robot.monitors.change("olga")
+        robot.policies.queued = "olga"
+        await asyncio.sleep(_CONFIRM_SECONDS)
+        assert robot.policies.in_force.text == robot.monitors.in_force.text == OF_OPERATOR
+
+
 async def test_a_change_while_the_policy_is_prepared_only_delays_the_bundle(robot: BundleRobot) -> None:
     async with robot.running():
         robot.policies.error = RevisionChangedError(1, 2)
