@@ -106,7 +106,9 @@ class AdminSocket:
 
     def _say_that_it_starts(self, sock: socket.socket) -> None:
         """Wait a second for the answer; then print that it waits, if no process has read the request during a start."""
-        if select.select([sock], [], [], _PATIENCE_SECONDS)[0]:
+        answers = select.poll()  # unlike `select`, for any number of open files
+        answers.register(sock, select.POLLIN)
+        if answers.poll(_PATIENCE_SECONDS * 1000):
             return
         unread = struct.unpack("i", fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)))[0]
         age = starting_for(self.state) if unread else None
