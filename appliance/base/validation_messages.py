@@ -45,8 +45,10 @@ _BODY: dict[str, Callable[..., str]] = {
     r"Expected `(.*)` of length ([<>]=) (\d+)": (
         lambda what, bound, many: f"must have {_BOUNDS[bound]} {many} {_PARTS.get(what, 'parts')}"
     ),
-    r"Expected `.*` ([<>]=?) (\S+)": lambda bound, limit: f"must be {_BOUNDS[bound]} {_plain(float(limit))}",
-    r"(?s)Expected `.*` matching regex '(.*?)(?:\(\?!.*)?'": lambda pattern: f"must be {_shape(pattern)}",
+    r"Expected `.*` ([<>]=?) (\S+)": lambda bound, limit: (
+        f"must be {_BOUNDS[bound]} {limit.removesuffix('.0')}"
+    ),
+    r"(?s)Expected `.*` matching regex '(.*?)(?:\(\?!.*)?'": lambda pattern: f"must be {shape_of(pattern)}",
     r"(?s)Object missing required field `(.*)`": lambda name: f"the field `{name}` must be given",
     r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
     r"Number out of range": lambda: "must be a smaller number",
@@ -55,7 +57,7 @@ _BODY: dict[str, Callable[..., str]] = {
 
 
 _NAME = re.compile(
-    r"\^\(?\[([\w.-]+)\](?:\(\?:)?\[([\w.-]+)\]\{0,(\d+)\}(\[[\w.-]+\])?(?:\)\?)?(?:\\+(\.\w+))?(?:\$|\\Z)"
+    r"\^\(?\[([\w.-]+)\](?:\(\?:)?\[([\w.+ -]+)\]\{0,(\d+)\}(\[[\w.-]+\])?(?:\)\?)?(?:\\+(\.\w+))?(?:\$|\\Z)"
 )
 _HEX = re.compile(r"\^\[0-9a-f\]\{(\d+)\}\$")
 _YAML = {
@@ -94,7 +96,7 @@ def must_be(error: "ErrorDetails") -> str:
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     shown = {name: _plain(value) for name, value in context.items()}
     if "pattern" in shown:
-        shown["pattern"] = _shape(str(shown["pattern"]))
+        shown["pattern"] = shape_of(str(shown["pattern"]))
     return wanted.format(**shown)
 
 
@@ -131,7 +133,8 @@ def _cut(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…"
 
 
-def _shape(pattern: str) -> str:
+def shape_of(pattern: str) -> str:
+    """Return what a string must be that matches a pattern, in words where they are known."""
     if (digits := _HEX.fullmatch(pattern)) is not None:
         return f"{digits[1]} hexadecimal digits (0-9, a-f)"
     found = _NAME.fullmatch(pattern)

@@ -20,19 +20,17 @@ Signature = Annotated[
     ),
 ]
 MonitorName = Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
-FileName = Annotated[
-    str, msgspec.Meta(max_length=200, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,190}\.rv$" + WHOLE)
-]
-Definition = Annotated[
-    str,
-    msgspec.Meta(max_length=200, pattern=r"^[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\.(msg|srv)$" + WHOLE),
-]
-FileText = Annotated[str, msgspec.Meta(max_length=1 << 20)]
+FILE_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+ -]{0,190}\.rv$"
+FileName = Annotated[str, msgspec.Meta(max_length=200, pattern=FILE_NAME + WHOLE)]
+DEFINITION = r"^[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\.(msg|srv)$"
+Definition = Annotated[str, msgspec.Meta(max_length=200, pattern=DEFINITION + WHOLE)]
+LONGEST_TEXT = 1 << 20
+FileText = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 Definitions = Annotated[
     dict[Definition, FileText],
     doc(
         "definitions of message and service types that ROS does not ship, by `package/Type.msg`",
-        max_length=1000,
+        max_length=10_000,
     ),
 ]
 NOTE_LENGTH = 200

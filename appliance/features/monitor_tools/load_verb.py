@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.validation_messages import shape_of
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
+from appliance.channel.rest_bodies import DEFINITION, FILE_NAME, LONGEST_TEXT
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced
@@ -54,6 +56,13 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
             column = found.start() - text.rfind("\n", 0, found.start())
             raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
     sent = {Path(path).name: text for path, text in texts.items()}
+    forms = ((sent, FILE_NAME), (definitions, DEFINITION))
+    for name, text, form in ((name, text, form) for found, form in forms for name, text in found.items()):
+        place = Position(str(named[name]), 1, 1)
+        if not re.fullmatch(form, name):
+            raise SpecificationError.at(place, f"{name} must be {shape_of(form)}: rename it")
+        if len(text) > LONGEST_TEXT:
+            raise SpecificationError.at(place, f"longer than {LONGEST_TEXT} characters: divide it")
     return Sources(sent, definitions, signatures_of(named))
 
 

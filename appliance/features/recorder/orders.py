@@ -32,7 +32,6 @@ from appliance.features.recorder.view import RecorderState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0
-_LONGEST_NOTE = 300
 _MAX_TOPICS = 20
 _LONGEST_NAME = 500
 _M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemoved, recorder_link.MemoryLent)
@@ -122,7 +121,7 @@ class RecordingOrders:
             "recording ordered", reason, who=who, before=before, after=after, **caller
         )
         charged_to = self._plan.charged_to(str(caller["host"])) if "host" in caller else OPERATORS
-        trigger = Trigger(clock.wall_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
+        trigger = Trigger(clock.wall_ns(), what, record, text[: recording_requests.LONGEST_NOTE], charged_to)
         begun = await self._ask(
             lambda number: recorder_link.RecordingRequested(number, trigger, before, after),
             recorder_link.RecordingStarted,

@@ -10,6 +10,7 @@ from appliance.channel.rest_bodies import DATED, WHOLE
 from appliance.channel.rest_operation import Body, parameter, rest
 from appliance.features.recorder.recording_answers import Recording, RecordingBegun, Recordings
 
+LONGEST_NOTE = 300
 _NO_RECORDING = {404: "There is no such recording, or the flight recorder is off."}
 RecordingId = Annotated[
     str,
@@ -52,7 +53,7 @@ class RecordNow(WaitingRequest[RecordingBegun], frozen=True, tag="record now"):
 
     before: Annotated[Annotated[float, msgspec.Meta(ge=0, le=3600)] | None, doc("seconds")] = None
     after: Annotated[Annotated[float, msgspec.Meta(gt=0, le=3600)] | None, doc("seconds")] = None
-    note: Annotated[str, doc("reason given by the person who loaded it", max_length=300)] = ""
+    note: Annotated[str, doc("reason given by the person who loaded it", max_length=LONGEST_NOTE)] = ""
 
 
 @rest("investigator", "GET", "/v1/recordings/{recording_id}/bag")

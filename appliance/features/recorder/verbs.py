@@ -82,6 +82,9 @@ def now(
 
     Example: rosrv record now --after 30s --note "the arm hit the door"
     """
+    if len(note) > recording_requests.LONGEST_NOTE:  # nothing may delay the recording
+        typer.echo(f"rosrv: the note is cut after {recording_requests.LONGEST_NOTE} characters", err=True)
+        note = note[: recording_requests.LONGEST_NOTE]
     request = recording_requests.RecordNow(_seconds("--before", before), _seconds("--after", after), note)
     body = appliance.answer_or_exit(request)
     say(body.id)

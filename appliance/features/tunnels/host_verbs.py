@@ -31,6 +31,7 @@ from appliance.features.tunnels.requests import (
     HostsReload,
     HostToken,
 )
+from appliance.network.close_ports import parse_services
 from rosmop.tool.terminal import printable, say
 
 _DAY = 86_400.0
@@ -235,7 +236,8 @@ def _write_kit(
 
 
 def _write_script(running: Appliance, order: HostToken, wishes: KitOptions, out: Path | None) -> None:
-    asked = replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=[*wishes.opened])
+    services = [str(service) for service in parse_services(wishes.opened)]
+    asked = replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=services)
     with new_output(out, f"rosrv-{order.name}-join.sh", as_json=running.as_json) as output:
         write_script(output, running.ask_or_exit(asked), as_json=running.as_json)
 
