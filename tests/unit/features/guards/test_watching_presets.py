@@ -63,6 +63,17 @@ def test_a_ninth_hand_resets_nothing_until_all_are_forgotten() -> None:
         at += 1000
 
 
+@pytest.mark.parametrize("silent", [0, 1])
+def test_a_command_may_be_the_first_after_the_buttons_are_forgotten(silent: int) -> None:
+    guard = Guarded("estop", silent=silent)
+    guard.tell("stop", button(True), 0)
+    guard.drive(twist(), 2500)
+    guard.monitors.give({"guard": {"forget": 1, "silent": silent}})
+    guard.drive(twist(), 2510)
+    assert not guard.monitors.monitor("guard").held
+    assert not runs(guard, 2520)
+
+
 def scan(ranges: list[float]) -> bytes:
     return message("sensor_msgs/LaserScan", ranges=ranges, range_min=0.1, range_max=5.0)
 
