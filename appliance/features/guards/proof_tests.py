@@ -40,6 +40,7 @@ _WITHOUT_ROLE = {"stop": "std_msgs/Bool", "reset": "std_msgs/Bool", "check": "st
                  "fix": "sensor_msgs/NavSatFix"}  # fmt: skip
 _NO_MOTION = (
     "header",
+    "child_frame_id",
     "pose",
     "covariance",
     "acceleration",

@@ -194,7 +194,8 @@ NAN = {**ZERO, "linear": {"x": math.nan, "y": 0.0, "z": 0.0}}
 
 def odometry(twist: dict[str, Any]) -> dict[str, Any]:
     return {
-        "header": {"seq": 7},
+        "header": {"seq": 7, "frame_id": "odom"},
+        "child_frame_id": "base_link",
         "pose": {"pose": {"position": {"x": 3.0}}},
         "twist": {"twist": twist, "covariance": [1.0]},
     }
