@@ -72,6 +72,8 @@ class Rollout:
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
     unfit: dict[int, str] = field(default_factory=dict)
     """Why the part of a relay in the heartbeat is off, or an empty text; without a relay that has not reported."""
+    acting: dict[int, int] = field(default_factory=dict)
+    """The monitors in force of each relay that may stop, change or withhold messages."""
     _now: InForce = field(default_factory=InForce)
     # The relays' parts of the specifications in force, and of specifications being tried.
     compiled_parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
@@ -364,8 +366,8 @@ class Rollout:
                 self._left.pop(number).set_result(message)
             case messages.SpecificationsRefused(number, findings, statement):
                 self._refused(relay, number, findings, statement)
-            case messages.MonitorsCounted(rows, unfit):
-                self._rows[relay], self.unfit[relay] = rows, unfit
+            case messages.MonitorsCounted(rows, unfit, acting):
+                self._rows[relay], self.unfit[relay], self.acting[relay] = rows, unfit, acting
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:

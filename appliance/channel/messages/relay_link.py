@@ -572,11 +572,13 @@ class MonitorRow(msgspec.Struct, array_like=True):
 class MonitorsCounted(Message):
     """The counters of monitors, sent after a change, at most once a second.
 
-    `unfit` is why this relay's part of the heartbeat is off, or empty.
+    `unfit` is why this relay's part of the heartbeat is off, or empty; `acting` counts its monitors in force that may
+    stop, change or withhold messages.
     """
 
     rows: list[MonitorRow]
     unfit: str = ""
+    acting: int = 0
 
 
 class LookWanted(Message):

@@ -73,10 +73,9 @@ class GuardFitness:
         """Why the heartbeat is off, or an empty text; null if none is set."""
         if not self._wanted:
             return None
-        unfit = self._monitors.rollout.unfit
-        reasons = [unfit.get(relay, "a relay process is starting") for relay in range(self._relays)]
-        monitors = self._monitors
-        if not any(map(monitors.switches.enabled, monitors.checked.monitors)):
+        rollout = self._monitors.rollout
+        reasons = [rollout.unfit.get(relay, "a relay process is starting") for relay in range(self._relays)]
+        if not any(rollout.acting.values()):
             reasons.append("no guard is in force")
         return next(filter(None, reasons), "")
 

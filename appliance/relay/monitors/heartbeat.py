@@ -90,7 +90,7 @@ class Heartbeat:
         self._due = now + period
         self._loop.after(period, self._beat)
         own = _WORDS * self._index
-        self._interceptor.observations.unfit = why
+        self._interceptor.observations.unfit, self._interceptor.observations.acting = why, len(acting)
         self._shared[own + 1] = len(acting)
         self._shared[own] = 0 if why else int(now * 1e9)
         if why or not self._all_fit(now):

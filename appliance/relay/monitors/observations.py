@@ -79,7 +79,7 @@ class Observations:
     """The events of monitors, sent in batches; `rows()` returns the counters of all monitors."""
 
     def __init__(self, loop: EventLoop, reporter: Reporter, rows: Callable[[], Iterable[MonitorRow]]) -> None:
-        self.unfit = ""
+        self.unfit, self.acting = "", 0
         """Why this relay's part of the heartbeat is off."""
         self._loop = loop
         self._reporter = reporter
@@ -225,7 +225,7 @@ class Observations:
     def tell_counters(self) -> None:
         if not self._reporter.attached:
             return
-        counted = MonitorsCounted(list(self._rows()), self.unfit)
+        counted = MonitorsCounted(list(self._rows()), self.unfit, self.acting)
         if counted != self._counted:
             self._counted = counted
             self._reporter.send(counted)

@@ -271,14 +271,16 @@ async def test_the_heartbeat_is_off_for_the_reason_of_a_relay(monitors: Specific
     trail = FakeTrail()
     orders = orders_of(monitors, trail, relay=Relay(heartbeat="/rosrv/heartbeat"))
     reasons = []
-    for unfit in (None, "", "fence is disabled", "fence is disabled", ""):
-        if unfit is not None:
-            monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv")], unfit))
+    for counted in (None, ("", 1), ("fence is disabled", 1), ("fence is disabled", 1), ("", 0), ("", 1)):
+        if counted is not None:
+            monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv")], *counted))
         orders.look()
         state = orders.state()
         assert state is not None
         reasons.append(state.heartbeat)
-    assert reasons == ["a relay process is starting", "", "fence is disabled", "fence is disabled", ""]
+    assert reasons == [
+        "a relay process is starting", "", "fence is disabled", "fence is disabled", "no guard is in force", "",
+    ]  # fmt: skip
     events = [record.event for record in trail.records if record.event.startswith("heartbeat")]
     assert events == ["heartbeat begun", "heartbeat ended", "heartbeat begun"]
     monitors.rollout.lost(0)
