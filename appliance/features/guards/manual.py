@@ -1,8 +1,8 @@
 """Make the safety manual of a robot from its guards, and the difference from an earlier one. No I/O.
 
-The content is a function of the guards with their values, of what is not protected, and of the version; its digest is
-printed below it. Delays and the last proof tests change automatically: they follow the signatures, and are not part of
-the content.
+The content is a function of the guards with their values and longest delays, of what is not protected, and of the
+version; its digest is printed below it. The last proof tests and the counts of delays follow the signatures, and are
+not part of the content.
 """
 
 import difflib
