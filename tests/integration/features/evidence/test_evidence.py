@@ -129,7 +129,12 @@ def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -
     refused = appliance.rosrv("evidence", "export", "../x", "-o", str(tmp_path / "x.zip"), check=False)
     assert (refused.returncode, refused.stderr) == (
         1,
-        "rosrv: there is no recording ../x: rosrv record list\n",
+        "rosrv: id: must be 20 hexadecimal digits (0-9, a-f)\n",
+    )
+    absent = appliance.rosrv("evidence", "export", "0" * 20, "-o", str(tmp_path / "x.zip"), check=False)
+    assert (absent.returncode, absent.stderr) == (
+        1,
+        f"rosrv: there is no recording {'0' * 20}: rosrv record list\n",
     )
     both = ("evidence", "export", recording, "--since", "1h", "-o", str(tmp_path / "x.zip"))
     assert appliance.rosrv(*both, check=False).returncode == 2
