@@ -84,9 +84,17 @@ def crash(appliance: Appliance) -> None:
     appliance.process.stop()
 
 
+def adoption(robot: Robot, appliance: Appliance) -> dict[str, Any]:
+    """Return the status of the adoption, without the notes before it."""
+    found: dict[str, Any] = json.loads(
+        rosrv(robot, appliance, "adopt", "--status", "--json").splitlines()[-1]
+    )
+    return found
+
+
 def until_taken(robot: Robot, appliance: Appliance) -> None:
     def taken() -> bool:
-        found = json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))
+        found = adoption(robot, appliance)
         assert not found["not_cut"], "a node keeps its connections"
         return bool(found["phase"] == "taken")
 

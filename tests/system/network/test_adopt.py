@@ -60,6 +60,7 @@ def appliance(robot: Robot) -> Iterator[Appliance]:
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(1200)
 def test_cycles_of_adopt_and_release_restart_nothing_and_lose_little(
     robot: Robot, appliance: Appliance
 ) -> None:

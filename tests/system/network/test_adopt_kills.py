@@ -3,7 +3,6 @@
 ROSRV_ADOPT_KILLS is the number of rounds over all steps; in each, the kill comes a little later after its step.
 """
 
-import json
 import os
 import random
 import signal
@@ -15,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, Robot, rosrv, until_taken
+from tests.support.adopted_robot import POLICY, Robot, adoption, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, has_ros
@@ -101,7 +100,7 @@ def said(step: str) -> str:
 
 def settled(robot: Robot, appliance: Appliance, phase: str) -> bool:
     try:
-        status = json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))
+        status = adoption(robot, appliance)
     except AssertionError:  # control, which was killed, does not answer yet
         return False
     return bool(status["phase"] == phase and status["wanted"] == (phase == "taken"))

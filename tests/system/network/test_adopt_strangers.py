@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, Robot, rosrv, until_taken
+from tests.support.adopted_robot import POLICY, Robot, adoption, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, has_ros
@@ -117,7 +117,7 @@ def _filled(stranger: Host, robot: Robot) -> Iterator[None]:
 
 def _require_served(robot: Robot, appliance: Appliance) -> None:
     """All honest nodes are taken in time, their topics and services work, and the other names are named."""
-    found = json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))
+    found = adoption(robot, appliance)
     took = float(
         re.findall(r'"seconds": ([0-9.]+), "event": "the robot\'s graph is adopted"', appliance.story())[-1]
     )

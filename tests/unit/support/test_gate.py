@@ -185,9 +185,9 @@ def test_a_release_names_each_lane_that_is_not_green(
 
 def test_a_green_lane_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nightly, "GREEN", tmp_path / "green.json")
-    nightly.GREEN.write_text('{"nodes": {"commit": "old"}, "pairs": {"commit": "old"}, "gone": {}}')
+    nightly.GREEN.write_text('{"nodes": {"commit": "old"}, "fleet": {"commit": "old"}, "gone": {}}')
     record({"green": {"nodes": {"commit": "new"}}})
-    assert json.loads(nightly.GREEN.read_text()) == {"nodes": {"commit": "new"}, "pairs": {"commit": "old"}}
+    assert json.loads(nightly.GREEN.read_text()) == {"nodes": {"commit": "new"}, "fleet": {"commit": "old"}}
 
 
 @pytest.mark.nightly

@@ -36,6 +36,7 @@ def test_a_cut_between_the_appliances_is_not_reported_as_a_refusal(site: Standby
     site.until_both_in_sync()
     active, passive = site.pair()
     with site.without_link((ADDRESSES["a"], ADDRESSES["b"])):
+        site.appliances[active].rosrv("host", "block", "10.79.0.99")  # the standby lacks this change
         eventually(lambda: site.in_sync() == {active}, site.story)
         for name in (passive, active):
             eventually(lambda name=name: fails(site.appliances[name]), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default

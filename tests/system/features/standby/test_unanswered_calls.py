@@ -11,7 +11,7 @@ _CHANGES = {
     "control/process.py": (
         "        watched = listener_limits.answering.watched(calls)\n",
         "        async def hanging(request):\n"
-        "            while (base.settings.state / 'control' / 'hang').exists():\n"
+        "            while (control.settings.state / 'control' / 'hang').exists():\n"
         "                await asyncio.sleep(0.1)\n"
         "            return await calls(request)\n"
         "        watched = listener_limits.answering.watched(hanging)\n",
