@@ -206,7 +206,7 @@ def switched(
 
 def confirmed(now: InForce) -> InForce:
     returns = {name: one for name, one in now.returns.items() if one.of is not True}
-    return replace(now, returns=returns, back_to=None, since=frozenset())
+    return replace(now, returns=returns, back_to=None)
 
 
 def given(now: InForce, name: str, values: Mapping[str, GivenValue]) -> InForce:

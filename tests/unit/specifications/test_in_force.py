@@ -165,6 +165,15 @@ def test_a_timed_switch_returns_to_the_one_before_a_change_that_is_undone(to: bo
     assert undone(ended, checked("b"), former).states == {"b": True}
 
 
+def test_an_order_between_two_changes_that_are_undone_goes_with_the_second() -> None:
+    former = given(in_force("b"), "b", {"speed": 0.3})
+    now = loaded(former, Order(sources("b"), within=60.0), checked("b"), signed=False).now
+    now = given(switched(now, ["b"], False), "b", {"speed": 0.5})
+    again = Order(sources("b"), within=60.0, shadow={"b.rv"}, constants={"b": {"speed": 0.7}})
+    back = undone(loaded(now, again, checked("b"), signed=False).now, checked("b"), former)
+    assert (back.states, back.givens.said) == ({"b": True}, {"b": {"speed": 0.3}})
+
+
 def test_a_constant_that_the_former_text_does_not_allow_gives_way_to_the_former_one() -> None:
     wide = msgspec.structs.replace(
         checked("b"), givens={"b": (GivenState("speed", "double", 1.0, "m/s", 1.0, 0.0, 5.0),)}

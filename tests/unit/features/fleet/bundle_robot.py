@@ -83,7 +83,7 @@ class Revisions:
         if self.queued:
             self.change(self.queued)
             self.queued = ""
-        if order.expected != self.tag:
+        if order.expected not in (None, self.tag):
             raise RevisionChangedError(order.expected, self.revision)
         self.change(who, self.rows[order.revision - 1].text)
 
