@@ -2,7 +2,8 @@
 
 Beside the assumptions of `world.py`:
 
-- The clocks of senders, guard and controller agree; where time is simulated, it runs at 0.3 to 1 of the real one.
+- The clocks of senders, controller and the nodes that report agree. That of the guard differs by up to a quarter of an
+  hour, unless reports have no stamps.
 - A trajectory reaches the controller within 10 ms, and a report the guard within 20 ms; the controller runs every 10 ms
   or oftener, and the arm follows it exactly.
 - Trajectories come only through the guard. A goal may also be cancelled beside it, which stops the arm. Bytes that are
@@ -17,9 +18,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
-from appliance.features.guards.presets import preset_named
 from lab.closed_loop.controller import Controller, Point, extremes
-from lab.closed_loop.messages import EPOCH, header
+from lab.closed_loop.messages import EPOCH
 from lab.closed_loop.senders import (
     HONEST,
     JOINTS,
@@ -33,7 +33,7 @@ from lab.closed_loop.senders import (
     bare,
     line,
 )
-from lab.closed_loop.world import COMMAND, NEVER, SLACK, World, void
+from lab.closed_loop.world import COMMAND, NEVER, SLACK, World
 
 TRAJECTORY, GOAL = "trajectory_msgs/JointTrajectory", "control_msgs/FollowJointTrajectoryActionGoal"
 _NEAR = 1e-5
@@ -66,9 +66,15 @@ def trajectory(sent: Sent, began: float, kind: str) -> bytes:
 
 
 def states(
-    at: float, names: Sequence[str], positions: Sequence[float], velocities: Sequence[float] = ()
+    stamp: float, names: Sequence[str], positions: Sequence[float], velocities: Sequence[float] = ()
 ) -> bytes:
-    return header(at) + _texts(names) + _numbers(positions) + _numbers(velocities) + _numbers(())
+    return (
+        struct.pack("<4I", 0, *_time(stamp), 0)
+        + _texts(names)
+        + _numbers(positions)
+        + _numbers(velocities)
+        + _numbers(())
+    )
 
 
 class JointsWorld(World):
@@ -127,12 +133,10 @@ class JointsWorld(World):
         simulated = self.sender in UNSTAMPED and self.seed // len(KINDS) % 3 == 1
         declared = {"simulated": simulated, "stopDuration": self.stopping, "partial": self.controller.partial}
         self.kind = GOAL if r.random() < 0.25 and self.sender != "unstopped" else TRAJECTORY
-        self.began, self.rate = float(EPOCH), 1.0
-        """The second in which the controller's time begins, and the seconds of it in a second."""
-        if "clock" in preset_named("joints").given_topics and r.random() < 0.2:
-            self.began, self.rate = float(r.randrange(1000)), r.uniform(0.3, 1)
-            every, lag = r.choice((1, 10, 20)), 0 if self.tight else r.choice((0, 5, 20))
-            self.every(lambda: every, lambda: self._tell_time(lag))
+        self.stamps = self.seed // len(KINDS) % 5 != 1
+        """Whether reports have stamps."""
+        self.began = EPOCH + (r.uniform(-900, 900) if self.stamps else 0)
+        """The second in which the controller's time begins; that of the guard begins at `EPOCH`."""
         self.guarded({**values, **bounds, **declared})
         halves = r.random() < (0.7 if self.alone else 0.4)
         self.reports = {3: JOINTS[:1], 4: JOINTS[1:]} if halves else {3: JOINTS}
@@ -179,7 +183,7 @@ class JointsWorld(World):
         return self.silent * 1000
 
     def good(self, topic: str) -> bytes:
-        return states(self.now, JOINTS, self.place)
+        return states(self.stamp, JOINTS, self.place)
 
     def damages(self, topic: str) -> bool:
         return not self.third
@@ -192,17 +196,18 @@ class JointsWorld(World):
         if self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
 
-    def _tell_time(self, late: float) -> None:
-        data = struct.pack("<2I", *_time(self.began + self.time))
-        self.after(self.now + late, lambda: void(self.say("clock", data, 5)))
-
     def _read(self, node: int, names: Sequence[str], late: float, *, velocities: bool) -> None:
         found = [self.controller.state(JOINTS.index(name), self.time) for name in names]
         numbers = [one[0] for one in found], [one[1] for one in found] if velocities else []
-        self.after(self.now + late, lambda: self._report(node, names, *numbers))
+        stamp = self.stamp
+        self.after(self.now + late, lambda: self._report(stamp, node, names, *numbers))
+
+    @property
+    def stamp(self) -> float:
+        return self.began + self.time if self.stamps else 0.0
 
     def _report(
-        self, node: int, names: Sequence[str], places: list[float], velocities: Sequence[float]
+        self, stamp: float, node: int, names: Sequence[str], places: list[float], velocities: Sequence[float]
     ) -> None:
         match self.fault:
             case "dead":
@@ -212,33 +217,31 @@ class JointsWorld(World):
             case "NaN":
                 places = [math.nan] * len(places)
             case "no names" if node not in self.heard:
-                self.say(
-                    "state", states(self.now, (), places), node
-                )  # a node that has named no joint owes none
+                self.say("state", states(stamp, (), places), node)  # a node that has named no joint owes none
                 return
             case "no names":
                 names = ()
             case "cut":
                 self.heard[node] = NEVER
                 self.unknown = True  # the guard begins again, and with it a stop, as its page says
-                self.say("state", states(self.now, names, places)[:20], node, whole=False)
+                self.say("state", states(stamp, names, places)[:20], node, whole=False)
                 return
             case "":
                 for name, place in zip(names, places, strict=True):
                     self.told[JOINTS.index(name)] = place
         self.heard[node] = self.now if self.fault in {"", "half dead"} else NEVER
-        self.say("state", states(self.now, names, places, velocities if names else ()), node)
+        self.say("state", states(stamp, names, places, velocities if names else ()), node)
 
     # Commands
 
     def _next(self) -> None:
         pause = next(self.sends, None)
         if pause is not None:
-            self.after(self.now + max(1, 1000 * pause / self.rate), self._next)
+            self.after(self.now + max(1, 1000 * pause), self._next)
 
     @property
     def time(self) -> float:
-        return self.now / 1000 * self.rate
+        return self.now / 1000
 
     @property
     def still(self) -> bool:
@@ -271,7 +274,9 @@ class JointsWorld(World):
         self.trace(f"a trajectory of {len(sent.points)} points{shown}: {sent.bad or self.sender}")
         if self.tight:
             for reporter, names in self.reports.items():
-                self._report(reporter, names, [self.place[JOINTS.index(name)] for name in names], ())
+                self._report(
+                    self.stamp, reporter, names, [self.place[JOINTS.index(name)] for name in names], ()
+                )
         data = trajectory(sent, self.began, self.kind)
         topic = self.guard.topics[COMMAND]
         passed, messages = self.guard.tell(topic, data, self.now, node or self.commander)
@@ -382,12 +387,11 @@ class JointsWorld(World):
     @property
     def unjudged(self) -> bool:
         return (
-            self.switched_off
-            or self.now < self.fresh_from + 100 + SLACK + self.delay + 1000 * self.stopping / self.rate
+            self.switched_off or self.now < self.fresh_from + 100 + SLACK + self.delay + 1000 * self.stopping
         )
 
     def move(self, until: int) -> None:
-        begin, end = self.time, until / 1000 * self.rate
+        begin, end = self.time, until / 1000
         if end <= begin:
             return
         number = math.ceil((end - begin) / _STEP)

@@ -241,6 +241,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L1", "joints", "judges the first part of a curve", r"left -= t;", "left = 0;"),
     ("L1", "joints", "limits no velocity of a curve", r"<= top \* t\)", "<= 1e9)"),
     ("L1", "joints", "takes times in any order", r"t > before\)", "true)"),
+    ("L1", "joints", "takes its own clock for the controller's", r"isfinite\(clock\) \|\| isfinite\(clockToo\)", "false"),
     ("L1", "joints", "takes a moving joint for one at rest", r"later \? 0 : -top, up = later \? 0 : top", "0, up = 0"),
     ("L2", "enable", "hears no silence", r"now - heard\[(\w+)\] <= silent", "true"),
     ("L2", "mode", "hears no silence", r"silent > 0 && !\(now - heard\[i\] <= silent\)", "false"),

@@ -120,8 +120,8 @@ role Joints(std::string[] names, double[] found) {
     sensor_msgs/JointState '{name:names, position:found}';
 }
 
-role JointMotions(std::string[] names, double[] found, double[] moving) {
-    sensor_msgs/JointState '{name:names, position:found, velocity:moving}';
+role JointMotions(std::string[] names, double[] found, double[] moving, ros::Time stamp) {
+    sensor_msgs/JointState '{header.stamp:stamp, name:names, position:found, velocity:moving}';
 }
 
 role Battery(double percentage) {

@@ -131,15 +131,19 @@ def trajectory(names: list[str], *points: tuple[Any, ...], stamp: float = 0) -> 
         )
         for at, positions, *more in points
     ]
-    begin = {"sec": int(stamp), "nanosec": round(stamp % 1 * 1e9)}
+    begin = time_of(stamp)
     return message("trajectory_msgs/JointTrajectory", header__stamp=begin, joint_names=names, points=made)
+
+
+def time_of(stamp: float) -> dict[str, int]:
+    return {"sec": int(stamp), "nanosec": round(stamp % 1 * 1e9)}
 
 
 JOINTS = ["elbow", "wrist"]
 
 
-def state(*positions: float, names: list[str] = JOINTS) -> bytes:
-    return message("sensor_msgs/JointState", name=names, position=[*positions])
+def state(*positions: float, names: list[str] = JOINTS, stamp: float = 0) -> bytes:
+    return message("sensor_msgs/JointState", name=names, position=[*positions], header__stamp=time_of(stamp))
 
 
 @pytest.mark.parametrize(
@@ -455,6 +459,54 @@ def test_a_stamp_of_a_simulated_clock_counts_as_now() -> None:
         guard.tell("state", state(0, 0), 1)
         given = trajectory(JOINTS, (1, [0, 0]), stamp=12.5)
         assert (guard.tell("command", given, 2).result == "passed") == simulated
+
+
+@pytest.mark.parametrize("clocks", [[0.2], [-3600], [11, 0], [0, 11], [5, None]])
+def test_a_stamp_is_of_the_clock_of_the_nodes_that_report(clocks: list[float | None]) -> None:
+    """The clock of the robot is ahead of the guard's: another machine's, or set, or the guard's after a takeover."""
+    guard, at = Guarded("joints"), 0
+
+    def passes(begins: float, clock: float | None) -> bool:
+        stamp = BEGIN / 1e9 + at / 1000 + (clock or 0) + begins
+        return (
+            guard.tell("command", trajectory(JOINTS, (0.5, [0.01, 0]), (1, [0, 0]), stamp=stamp), at).result
+            == "passed"
+        )
+
+    def report(delay: int, clock: float | None) -> None:
+        stamp = 0 if clock is None else BEGIN / 1e9 + (at - delay) / 1000 + clock
+        guard.tell("state", state(0, 0, stamp=stamp), at)
+
+    for clock in clocks:
+        for number in range(320):
+            at += 10
+            report(200 if number % 7 else 4, clock)  # most of them are late
+            assert number < 210 or not passes(-1.1, clock)
+        assert passes(-0.9, clock) and passes(0.05, clock) and passes(-0.9, clock)
+    at += 3000
+    report(0, -20)  # the first after a silence
+    assert passes(-0.9, -20)
+
+
+@pytest.mark.parametrize(("first", "second", "silent", "passes"), [
+    (3, 3.02, 0, True), (3, 3.1, 0, False), (3.1, 3, 0, False), (3, None, 0, True), (None, 3, 0, True),
+    (3.1, 3, 600, True), (3, 2.96, 0, True), (2.96, 3, 0, True),
+])  # fmt: skip
+def test_both_nodes_that_report_have_one_clock(
+    first: float | None, second: float | None, silent: int, passes: bool
+) -> None:
+    """One of them alone could say that points are over which the controller will execute."""
+    guard = Guarded("joints")
+    for node, clock, at in (("/a", first, 1), ("/b", second, 2 + silent)):
+        stamp = 0 if clock is None else BEGIN / 1e9 + at / 1000 + clock
+        names = ["finger", "thumb"] if silent and node == "/a" else JOINTS
+        guard.tell("state", state(0, 0, names=names, stamp=stamp), at, node)
+    # It is over in 67 ms by the clock that is ahead by 2.96 s, and has to last 50 ms.
+    begins = -0.97 if 2.96 in {first, second} else 0
+    command = trajectory(JOINTS, (1, [0, 0]), stamp=BEGIN / 1e9 + 3 + silent / 1000 + begins)
+    assert (guard.tell("command", command, 3 + silent).result == "passed") == passes
+    without = trajectory(JOINTS, (1, [0, 0]))
+    assert guard.tell("command", without, 4 + silent).result == "passed"
 
 
 def with_id(name: str, before: int, behind: int) -> bytes:
