@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from appliance.audit.log.events import EVENTS, SEVERITIES
 from appliance.audit.log.record import Severity
 from appliance.audit.log.repetition import ABOUT, PARAMETERS
-from appliance.audit.log.schema import FIELDS, json_schema
+from appliance.audit.log.schema import FIELDS
 from appliance.channel.alarms import ALARM_KINDS
 from appliance.configuration.settings import Settings
 from appliance.features.guards import guard_order
@@ -192,48 +192,35 @@ def metrics_markdown() -> str:
     return "\n".join([*lines, ""])
 
 
-# Generate the end of docs/reference/audit-log.md: the fields and the JSON schema of audit records.
+# Generate the end of docs/reference/audit-log.md: the fields of audit records.
 
-_HASH = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
-CHAIN: dict[str, Any] = {
-    "type": "object",
-    "description": "in an export: the position in the hash chain, up to a signed checkpoint",
-    "properties": {
-        "previous": _HASH | {"description": "hash of the record before"},
-        "hash": _HASH | {"description": "hash of this record"},
-        "then": {
-            "type": ["array", "null"],
-            "items": _HASH,
-            "description": "content hashes of the omitted records after it, or null in records of version 0.1.0",
-        },
-        "checkpoint": {
-            "type": ["object", "null"],
-            "description": "signed checkpoint that seals the records up to this one (see `rosrv audit checkpoints`)",
-        },
-    },
-    "required": ["previous", "hash", "then"],
-    "additionalProperties": False,
-}
+_FORMS = {"string": "text", "integer": "integer", "object": "object", "null": "null"}
 
 
 def audit_record_markdown() -> str:
-    lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
-    lines += [f"| `{name}` | {text} |" for name, (_form, text) in FIELDS.items()]
+    lines = ["## Fields of a record", "", "| field | value | meaning |", "|---|---|---|"]
+    lines += [f"| `{name}` | {_form(form)} | {text} |" for name, (form, text) in FIELDS.items()]
     lines += [
         "",
+        "A record has all of these fields (`decision` only if something was decided), and no others. A line of an",
+        "export also has `chain`, and `robot` if `appliance.yaml` names the robot and the appliance runs.",
+        "`GET /v1/openapi.json` has the JSON schema, `AuditRecord`.",
         "The names of `event`, each with its fields of `detail`: [audit-events.md](generated/audit-events.md).",
-    ]
-    lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
-    lines += [
-        "A line of an export also has `robot`, if `appliance.yaml` names the robot and the appliance runs, "
-        "and `chain`:",
-        "",
-        "```json",
-        json.dumps(CHAIN, indent=2),
-        "```",
         "",
     ]
     return "\n".join(lines)
+
+
+def _form(form: dict[str, Any]) -> str:
+    if "enum" in form:
+        return ", ".join(f"`{one}`" for one in form["enum"])
+    if "const" in form:
+        return f"`{form['const']}`"
+    kinds = form["type"] if isinstance(form["type"], list) else [form["type"]]
+    text = " or ".join(_FORMS[one] for one in kinds)
+    if "properties" in form:
+        text += ": " + ", ".join(f"`{one}`" for one in form["properties"])
+    return f"{text} `{form['pattern']}`" if "pattern" in form else text
 
 
 # Generate docs/reference/generated/audit-events.md, from the registry and from the calls that record events.
