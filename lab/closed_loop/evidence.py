@@ -167,7 +167,7 @@ class SensorWorld(EvidenceWorld):
 class ArmWorld(EvidenceWorld):
     """A battery, a position fix and a check, each of which may be absent, old, invalid or too low."""
 
-    preset: ClassVar[str] = "arm"
+    preset: ClassVar[str] = "ready"
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "by": ("no battery", "cut"),
         "fix": ("no fix",),

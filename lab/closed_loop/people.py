@@ -111,7 +111,7 @@ class SwitchWorld(World):
 class EnableWorld(SwitchWorld):
     """Enabling devices that are held, let go, tied down or silent: the base moves only while all are held."""
 
-    preset: ClassVar[str] = "enable"
+    preset: ClassVar[str] = "hold_to_run"
 
     def plan(self) -> None:
         r = self.random

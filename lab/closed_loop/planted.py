@@ -149,7 +149,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "sensor takes frozen values": Fault("L2", "sensor", replaced(r"repeated < frozen", "true")),
     "arm takes any charge for enough": Fault(
-        "L2", "arm", replaced(r"left >= charge && left <= 1", "!(left < charge)")
+        "L2", "ready", replaced(r"left >= charge && left <= 1", "!(left < charge)")
     ),
     "agree compares the linear velocity alone": Fault("L2", "agree", replaced(r"&& turned <= turning", "")),
     "fence takes any quaternion for a heading": Fault(
@@ -189,7 +189,7 @@ FAULTS: Mapping[str, Fault] = {
         "L4", "sensor", replaced(r"caller\(sense\) == source", "true")
     ),
     "arm takes another battery for its own": Fault(
-        "L4", "arm", replaced(r"caller\(battery\) == batteryNode", "true")
+        "L4", "ready", replaced(r"caller\(battery\) == batteryNode", "true")
     ),
     # L5
     "estop begins anew after its state is lost": Fault(
@@ -241,9 +241,9 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L1", "joints", "judges the first part of a curve", r"left -= t;", "left = 0;"),
     ("L1", "joints", "limits no velocity of a curve", r"<= top \* t\)", "<= 1e9)"),
     ("L1", "joints", "takes times in any order", r"t > before\)", "true)"),
-    ("L1", "joints", "takes its own clock for the controller's", r"isfinite\(clock\) \|\| isfinite\(clockToo\)", "false"),
+    ("L1", "joints", "takes its own clock for the controller's", r"clamp\(fmin\(clock, clockToo\)[^;]*", "0"),
     ("L1", "joints", "takes a moving joint for one at rest", r"later \? 0 : -top, up = later \? 0 : top", "0, up = 0"),
-    ("L2", "enable", "hears no silence", r"now - heard\[(\w+)\] <= silent", "true"),
+    ("L2", "hold_to_run", "hears no silence", r"now - heard\[(\w+)\] <= silent", "true"),
     ("L2", "mode", "hears no silence", r"silent > 0 && !\(now - heard\[i\] <= silent\)", "false"),
     ("L2", "diagnostics", "hears no silence", r"&& now - oldest <= silent", ""),
     ("L2", "diagnostics", "takes STALE for well", r"level != 0 && \(warnings", "level == 2 && (warnings"),
@@ -255,7 +255,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L6", "diagnostics", "takes a zero from before the stop", r'standing = "";\s+standingToo = "";', ""),
     ("L2", "mode", "begins in automatic mode", r"manual = nodes.size\(\) == 0 .*crowded", "manual = crowded"),
     ("L2", "estop", "waits for one button alone", r"&& buttons.size\(\) >= publishers", ""),
-    ("L2", "enable", "waits for one device alone", r"&& devices.size\(\) >= publishers", ""),
+    ("L2", "hold_to_run", "waits for one device alone", r"&& devices.size\(\) >= publishers", ""),
     ("L2", "mode", "waits for one node alone", r"\|\| nodes.size\(\) < publishers", ""),
     ("L2", "overspeed", "takes NaN for slow", r"!\(v <= vMax && w <= wMax\)", "v > vMax || w > wMax"),
     ("L2", "overspeed", "hears no silence", r"return since <= silent &&", "return"),
@@ -266,9 +266,9 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L2", "zone", "does not ask whether rays cover it", r"whole = covers\(\);", "whole = true;"),
     ("L2", "zone", "takes a zone behind a thing for free", r"r > far \|\| r < own", "r > far || r < 0.4"),
     ("L2", "agree", "hears no silence", r"since <= silent && sinceOther <= silent", "true"),
-    ("L2", "arm", "hears no silence", r"battery <= silent &&", ""),
+    ("L2", "ready", "hears no silence", r"battery <= silent &&", ""),
     ("L2", "sensor", "hears no silence", r"since <= silent &&", ""),
-    ("L3", "enable", "does not stop at a release",
+    ("L3", "hold_to_run", "does not stop at a release",
      r"(?s)(heard\[place\] = now;\s*\}\s*)if \(judge\(now\)\) \{ STOP; \}", r"\1judge(now);"),
     ("L3", "mode", "does not stop at a change",
      r"(?s)(heard\[place\] = now; \}\s*)if \(judge\(now\)\) \{ STOP; \}", r"\1judge(now);"),
@@ -284,9 +284,9 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L3", "joints", "takes a dropped goal for a stop", r"othersEnd = fmax\(othersEnd, good \? 0 : before\);", ""),
     ("L3", "fence", "judges no tick", r"lastV > 0 && \(!\(age\(pose\)", "false && (!(age(pose)"),
     ("L3", "rate", "drops a stop", r"if \(moves && !slower &&", "if (!slower &&"),
-    ("L4", "enable", "has one device", r"node = caller\(device\)", 'node = "a device"'),
+    ("L4", "hold_to_run", "has one device", r"node = caller\(device\)", 'node = "a device"'),
     ("L4", "mode", "has one switch", r"node = caller\(change\)", 'node = "a switch"'),
-    ("L4", "enable", "asks the first device alone", r"i < devices.size\(\)", "i < 1"),
+    ("L4", "hold_to_run", "asks the first device alone", r"i < devices.size\(\)", "i < 1"),
     ("L4", "mode", "asks the first switch alone", r"i < nodes.size\(\)", "i < 1"),
     *(
         ("L4", preset, "does not see another node", r"!\(sinceForeign <= 1\)", "true")
@@ -306,16 +306,16 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L4", "sensor", "does not see another node", r"&& !\(sinceForeign <= 1\)", ""),
     ("L4", "agree", "does not see another node", r"&& !\(sinceForeign <= 1\)", ""),
     ("L4", "zone", "does not see another node", r"\|\| sinceForeign <= 1", ""),
-    ("L4", "arm", "does not see another battery", r"&& !\(otherBattery <= silent\)", ""),
+    ("L4", "ready", "does not see another battery", r"&& !\(otherBattery <= silent\)", ""),
     ("L4", "joints", "does not see a third node", r"&& !\(age\(foreign\) <= silent\)", ""),
     ("L4", "joints", "asks one of two nodes", r"&& \(place < 0 \|\| known\) && \(placeToo < 0 \|\| knownToo\)", ""),
     ("L4", "agree", "takes any node for its second source",
      r'otherSource == "" \|\| caller\(two\) == otherSource', "true"),
-    ("L6", "enable", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
-    ("L6", "enable", "takes the zero of any node", r"standing == node \|\| standingToo == node", 'standing != ""'),
-    ("L6", "enable", "takes a zero from before the stop",
+    ("L6", "hold_to_run", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
+    ("L6", "hold_to_run", "takes the zero of any node", r"standing == node \|\| standingToo == node", 'standing != ""'),
+    ("L6", "hold_to_run", "takes a zero from before the stop",
      r'if \(!enabled\) \{ standing = ""; standingToo = ""; \}', ""),
-    ("L6", "enable", "takes a device that is tied down", r"else if \(state\[place\] == 1\)", "else"),
+    ("L6", "hold_to_run", "takes a device that is tied down", r"else if \(state\[place\] == 1\)", "else"),
     ("L6", "overspeed", "needs no zero", r"fast && good && slow && !moves", "fast && good && slow"),
     ("L6", "overspeed", "asks not whether the base stands",
      r"fast && good && slow && !moves", "fast && good && !moves"),
@@ -375,13 +375,13 @@ FAULTS = {
     **{
         f"a hold of {preset} holds nothing": Fault("L5", preset, patch=(RunningGuard, "hold", lambda _guard: None))
         for preset in (
-            "speed", "separation", "fence", "sensor", "estop", "arm", "agree", "sane", "enable", "mode", "overspeed",
-            "standstill", "zone", "diagnostics",
+            "speed", "separation", "fence", "sensor", "estop", "ready", "agree", "sane", "hold_to_run", "mode",
+            "overspeed", "standstill", "zone", "diagnostics",
         )
     },
     **{
         f"{preset} hears any node when it begins again": Fault("L4", preset, patch=(Origin, "hears", _hears_any))
-        for preset in ("sensor", "arm", "agree", "overspeed", "standstill", "zone")
+        for preset in ("sensor", "ready", "agree", "overspeed", "standstill", "zone")
     },
     **{
         f"a hold of {preset} drops observed messages": Fault("L5", preset, patch=(RunningGuard, "tell", _deaf))

@@ -43,7 +43,7 @@ NOT_MODELLED = {
 EACH_NODE = {
     ("estop", "stop"): "each node is a button: worlds of `estop`",
     ("estop", "reset"): "each node is a hand: worlds of `estop`",
-    ("enable", "by"): "each node is a device: worlds of `enable`",
+    ("hold_to_run", "by"): "each node is a device: worlds of `hold_to_run`",
     ("diagnostics", "by"): "the entries of each node count: worlds of `diagnostics`",
     ("mode", "by"): "each node says the mode: worlds of `mode`",
     (

@@ -40,7 +40,7 @@ level."""
 MEANING_OF_SUMS = """\
 The sum is for a silent source (`standstill`: for `settle`). A thing that a message shows is noticed in that message:
 then the interval of the messages takes the place of the silence, `frozen` (`sensor`) or `samples` (`agree`) times. The
-check of `arm` has `checked` instead of `silent`, and the goal of `answer` its deadline before the sum."""
+check of `ready` has `checked` instead of `silent`, and the goal of `answer` its deadline before the sum."""
 
 RELAY_MS = 68
 """The longest of 1,000 measured times from the end of `silent` to a stop at the base, on a busy machine."""
@@ -141,7 +141,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         ("the button's computer or cable, before `silent`", "a base that ignores a zero velocity"),
         unit=("test_a_guard_does_what_its_page_says",),
     ),
-    "arm": Evidence(
+    "ready": Evidence(
         ("no standard: an interlock of preconditions",),
         "a condition that is missing or older than `silent` (the check: `checked`)",
         "silent",
@@ -194,7 +194,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         fails=("a finite velocity that is too high",),
         unit=("test_a_guard_does_what_its_page_says",),
     ),
-    "enable": Evidence(
+    "hold_to_run": Evidence(
         (
             "ISO 3691-4:2020, 4.9, presence of the operator",
             "ISO 10218-1:2011, 5.8.3, enabling device, which has three positions",

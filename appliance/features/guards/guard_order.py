@@ -18,14 +18,14 @@ PRECEDENCES = (
     Precedence(
         (
             "agree",
-            "arm",
             "deadman",
             "diagnostics",
-            "enable",
             "estop",
             "fence",
+            "hold_to_run",
             "mode",
             "overspeed",
+            "ready",
             "sensor",
             "separation",
             "standstill",
@@ -37,14 +37,14 @@ PRECEDENCES = (
     Precedence(
         (
             "agree",
-            "arm",
             "deadman",
             "diagnostics",
-            "enable",
             "estop",
             "fence",
+            "hold_to_run",
             "mode",
             "overspeed",
+            "ready",
             "sane",
             "sensor",
             "separation",
@@ -65,10 +65,12 @@ PRECEDENCES = (
     ),
     Precedence(("deadman",), ("rate",), "dropped commands count as silence and stop the base"),
     Precedence(
-        ("arm", "sane"), ("rate",), "a command that has to be stopped may be dropped, and the base drives on"
+        ("ready", "sane"),
+        ("rate",),
+        "a command that has to be stopped may be dropped, and the base drives on",
     ),
     Precedence(
-        ("arm", "diagnostics", "enable", "estop", "joints", "sensor"),
+        ("diagnostics", "estop", "hold_to_run", "joints", "ready", "sensor"),
         ("answer",),
         "a goal that was dropped is reported as late, and cancelled, after the deadline",
     ),

@@ -176,10 +176,13 @@ def _read_given(line: str) -> tuple[str, Parameter] | None:
 PRESETS = {
     name: Preset(name)
     for name in (
-        "deadman", "speed", "separation", "fence", "sensor", "estop", "arm", "answer", "joints", "rate", "agree",
-        "sane", "enable", "mode", "overspeed", "standstill", "zone", "diagnostics", "withhold",
+        "deadman", "speed", "separation", "fence", "sensor", "estop", "ready", "answer", "joints", "rate", "agree",
+        "sane", "hold_to_run", "mode", "overspeed", "standstill", "zone", "diagnostics", "withhold",
     )
 }  # fmt: skip
+
+RENAMED = {"arm": "ready", "enable": "hold_to_run"}
+"""The presets that were called otherwise up to 0.4: texts with the old names are guards still."""
 
 DRIVER_CHECK = Preset("driver_check")
 """The monitor that `rosrv guard check-driver` loads for a short time; not a guard."""
@@ -215,6 +218,7 @@ def unknown_guard(name: str, guards: Collection[str]) -> str:
 
 
 def preset_named(name: str) -> Preset:
+    name = RENAMED.get(name, name)
     if name not in PRESETS:
         raise GuardError(
             f"there is no preset {name!r}{meant(name, PRESETS)}; use one of: {', '.join(PRESETS)}"
@@ -245,7 +249,9 @@ def text_of(guard: Guard) -> str:
             types[name] = kind
     settings = {name: f"{topic} {types[name]}" if name in types else topic for name, topic in topics.items()}
     settings |= {name: preset.parameter(name).checked(value) for name, value in guard.values.items()}
-    return _written(Head(preset.name, preset.version, guard.name, settings, guard.switch or ""), preset.body)
+    head = head_of(preset.text)
+    assert head is not None  # noqa: S101  a test reads every preset
+    return _written(replace(head, name=guard.name, settings=settings, switch=guard.switch or ""), preset.body)
 
 
 def _require_topic(preset: Preset, name: str, topic: str) -> None:
@@ -309,7 +315,7 @@ def _divide(text: str) -> tuple[str, str]:
 def preset_of(text: str) -> Preset | None:
     """Return the preset of a guard, with the parameters of the guard's own text."""
     head = head_of(text)
-    preset = PRESETS.get(head.preset) if head else None
+    preset = PRESETS.get(RENAMED.get(head.preset, head.preset)) if head else None
     return None if preset is None else replace(preset, source=text)
 
 

@@ -292,10 +292,10 @@ _HONEST: Mapping[str, Callable[[_Robot], Readings]] = {
     "overspeed": _moved,
     "standstill": _moved,
     "estop": _buttons,
-    "enable": _devices,
+    "hold_to_run": _devices,
     "mode": lambda robot: _said_by("by", robot.several, {"data": False}),
     "withhold": lambda _robot: _said_by("by", [f"{_ROBOT}_0"], {"data": False}),
-    "arm": _armed,
+    "ready": _armed,
     "joints": _reported,
     "diagnostics": lambda robot: _said_by("by", [_ROBOT], robot.entries(0)),
 }
@@ -360,14 +360,14 @@ _FAULTS: Mapping[str, Callable[[_Robot], _Fault]] = {
         seconds=robot.number("settle") + 1,
     ),
     "estop": lambda robot: _from(f"a press on {robot.topics['stop']}", "stop", _FIRST, {"data": True}),
-    "enable": lambda robot: _from(
+    "hold_to_run": lambda robot: _from(
         f"the device on {robot.topics['by']} is let go", "by", _FIRST, robot.held(held=False)
     ),
     "mode": lambda robot: _from(
         f"manual mode on {robot.topics['by']}, and a command of {robot.speed():g} m/s", "by", _FIRST, {"data": True}
     ),
     "withhold": lambda robot: _from(f"the switch on {robot.topics['by']} is on", "by", _FIRST, {"data": True}),
-    "arm": lambda _robot: _from("an empty battery", "by", _ROBOT, {"percentage": 0.0}),
+    "ready": lambda _robot: _from("an empty battery", "by", _ROBOT, {"percentage": 0.0}),
     "joints": lambda robot: _commanded("a trajectory beyond the limits", robot.beyond()),
     "diagnostics": lambda robot: _from("the entries at ERROR", "by", _ROBOT, robot.entries(2)),
     "answer": lambda robot: _commanded(

@@ -54,7 +54,7 @@ _READ = {
 NOT_SUGGESTED = {
     "agree": "no name says which two velocities should be equal",
     "diagnostics": "no name says which entries a motion needs",
-    "enable": "no name says that a person has to hold a switch",
+    "hold_to_run": "no name says that a person has to hold a switch",
     "overspeed": "its limits follow from the base, which the graph does not show",
     "rate": "a rate follows from the driver, which the graph does not show",
     "sane": "the other guards of a base stop it at values that are not finite",
@@ -163,9 +163,9 @@ class _Writer:
         self._add_mode(base)
         batteries = self.graph.sources(base, types.BATTERIES)
         if len(batteries) == 1:
-            self._add("arm", base, _silence(batteries[0], 5, 5, 600), topics={"by": batteries[0].name})
+            self._add("ready", base, _silence(batteries[0], 5, 5, 600), topics={"by": batteries[0].name})
         elif batteries:
-            self._leave("arm", base, "several batteries fit", batteries)
+            self._leave("ready", base, "several batteries fit", batteries)
         self._add_diagnostics(base)
 
     def _add_diagnostics(self, base: TopicFacts) -> None:
@@ -351,7 +351,7 @@ class _Writer:
             (bases, ("separation", "zone"), "no guard stops {} before a person or a thing", self._no_scanner),
             (bases, ("fence",), "no area bounds {}", None),
             (bases, ("mode",), "no manual mode slows {}", self._no_mode),
-            (bases, ("enable",), "no enabling device has to be held for {}", self._no_device),
+            (bases, ("hold_to_run",), "no enabling device has to be held for {}", self._no_device),
             (bases, ("overspeed",), "no guard stops {} when the base is measured too fast", self._no_measurement),
             (arms, (), "no guard stops {} before the arm meets a person or a thing", None),
         ):  # fmt: skip
@@ -407,7 +407,7 @@ class _Writer:
             (topic.name for topic in self.graph.topics if topic.type == _JOY and topic.publishers), ""
         )
         by = f"--by {stick} --shadow button=N" if stick else "--by TOPIC --shadow"
-        return f"where a person drives by hand: rosrv guard new enable {command.name} {by}"
+        return f"where a person drives by hand: rosrv guard new hold_to_run {command.name} {by}"
 
     def _no_measurement(self, command: TopicFacts) -> str:
         odometries = {topic.name for topic in self.graph.topics if topic.type == "nav_msgs/Odometry"}

@@ -134,8 +134,8 @@ def test_a_guard_that_takes_any_node_for_its_source_is_found(preset: str, topic:
 
 LAWS_OF = {
     "deadman": {"L3", "L4", "L6"}, "speed": {"L1", "L2"}, "separation": {"L1", "L2", "L3"}, "fence": {"L2", "L3"},
-    "sensor": {"L2"}, "estop": {"L2", "L3", "L4"}, "arm": {"L2"}, "rate": {"L3"}, "agree": {"L2"},
-    "sane": {"L1", "L2"}, "enable": {"L2", "L6"}, "diagnostics": {"L2", "L6"}, "mode": {"L2", "L6"},
+    "sensor": {"L2"}, "estop": {"L2", "L3", "L4"}, "ready": {"L2"}, "rate": {"L3"}, "agree": {"L2"},
+    "sane": {"L1", "L2"}, "hold_to_run": {"L2", "L6"}, "diagnostics": {"L2", "L6"}, "mode": {"L2", "L6"},
     "overspeed": {"L3", "L6"}, "standstill": {"L2", "L6"}, "zone": {"L2", "L3", "L6"},
     "joints": {"L1", "L2", "L3"},
 }  # fmt: skip

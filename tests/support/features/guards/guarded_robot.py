@@ -153,12 +153,12 @@ def rows(rays: int = RAYS[-1]) -> list[Row]:
     return [
         Row("agree", {"command": VELOCITY, "by": ODOMETRY, "other": ODOMETRY}),
         Row("answer", {"command": GOAL, "by": RESULT}),
-        Row("arm", {"command": VELOCITY, "by": BATTERY, "fix": FIX, "check": ON},
+        Row("ready", {"command": VELOCITY, "by": BATTERY, "fix": FIX, "check": ON},
             {"needFix": "true", "needCheck": "true"}),
         Row("deadman", {"command": VELOCITY}),
         Row("diagnostics", {"command": VELOCITY, "by": DIAGNOSTICS}),
         Row("driver_check", {"command": VELOCITY, "by": ODOMETRY}),
-        Row("enable", {"command": VELOCITY, "by": HELD}),
+        Row("hold_to_run", {"command": VELOCITY, "by": HELD}),
         Row("estop", {"command": VELOCITY, "stop": OFF, "reset": PRESSED}),
         Row("estop", {"command": TRAJECTORY, "stop": OFF, "reset": PRESSED}),
         Row("fence", {"command": VELOCITY, "by": ODOMETRY}),
@@ -179,7 +179,7 @@ def rows(rays: int = RAYS[-1]) -> list[Row]:
     ]  # fmt: skip
 
 
-WAIT = {"arm", "joints", "withhold"}
+WAIT = {"ready", "joints", "withhold"}
 """Presets that wait for a node that has ended until they begin again, `arm` for as long as a check counts."""
 
 

@@ -134,7 +134,7 @@ def arming(seed: int, events: int = 50) -> None:
     silent, checked = chance.choice((500, 2000)), chance.choice((1000, 3000))
     fix, check, hundred = chance.random() < 0.4, chance.random() < 0.4, chance.random() < 0.3
     trace = Trace(
-        "arm", seed, charge=0.2, hundred=hundred, needFix=fix, needCheck=check,
+        "ready", seed, charge=0.2, hundred=hundred, needFix=fix, needCheck=check,
         silent=silent / 1000, checked=max(1.0, checked / 1000),
     )  # fmt: skip
     sources = {"by": Source(silent), "fix": Source(silent), "check": Source(checked)}

@@ -126,7 +126,7 @@ def enabling_device(seed: int, events: int = 40) -> None:
     chance = seeded(seed)
     silent = chance.choice((100, 300, 500))
     zero_first = chance.random() < 0.8
-    trace = Trace("enable", seed, silent=silent / 1000, zeroFirst=zero_first)
+    trace = Trace("hold_to_run", seed, silent=silent / 1000, zeroFirst=zero_first)
     devices = Switches(silent)
     zeros = Zeros(20)
     hands = (3, 4) if chance.random() < 0.4 else (3,)

@@ -417,7 +417,7 @@ async def test_a_type_of_an_unknown_topic_is_refused(
 ) -> None:
     for preset, name, why in (
         ("speed", "by", "speed: by is not one of its topics; give the type of command"),
-        ("arm", "fix", "arm: fix always has the same type; give the type of command, by"),
+        ("ready", "fix", "ready: fix always has the same type; give the type of command, by"),
     ):
         types = {"command": TYPES["command"], name: "nav_msgs/Odometry"}
         request = guard_requests.GuardNew(preset, {"command": "/c", "by": "/b"}, types=types, name="x")

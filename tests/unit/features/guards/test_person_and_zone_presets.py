@@ -45,7 +45,7 @@ def stops(guard: Guarded) -> list[int]:
 
 @pytest.mark.parametrize(("pressed", "other"), [((0, 1), (1, 0)), ((0, 1), ()), ((0, 1), (0, 2))])
 def test_a_button_of_a_joystick_is_a_device(pressed: tuple[int, ...], other: tuple[int, ...]) -> None:
-    guard = Guarded("enable", {"by": "sensor_msgs/Joy"}, button=1)
+    guard = Guarded("hold_to_run", {"by": "sensor_msgs/Joy"}, button=1)
     guard.tell("by", joy(0, 0), 0, "/b")
     guard.tell("by", joy(*pressed), 10, "/b")
     moves(guard, STILL, 20)

@@ -89,7 +89,7 @@ RECIPES = {
     ),
     "sensor": Recipe(by_type={"sensor_msgs/LaserScan": {"least": 1}, "sensor_msgs/JointState": {"least": 1}}),
     "estop": Recipe(fixed={"stop": "std_msgs/Bool"}),
-    "arm": Recipe(
+    "ready": Recipe(
         {"needFix": True, "needCheck": True, "silent": 0.5, "checked": 1},
         {"fix": "sensor_msgs/NavSatFix", "check": "std_msgs/Bool"},
         evidence={"check": {"data": True}},
@@ -98,7 +98,7 @@ RECIPES = {
     "agree": Recipe(),
     "sane": Recipe(velocities="stopped"),
     "joints": Recipe(),
-    "enable": Recipe(
+    "hold_to_run": Recipe(
         typed={"std_msgs/Bool": {"data": True}, "sensor_msgs/Joy": {"buttons": [1]}},
         first={"std_msgs/Bool": {"data": False}, "sensor_msgs/Joy": {"buttons": [0]}},
     ),
@@ -161,8 +161,8 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ("*", "*", "done", "NaN"): "a truth value has no NaN",
     ("*", "*", "held", "NaN"): "a truth value has no NaN",
     ("*", "*", "byHand", "NaN"): "a truth value has no NaN",
-    ("enable", "by", "buttons", "NaN"): "a whole number has no NaN",
-    ("enable", "by", "buttons", "out of range"): "`test_a_button_of_a_joystick_is_a_device`",
+    ("hold_to_run", "by", "buttons", "NaN"): "a whole number has no NaN",
+    ("hold_to_run", "by", "buttons", "out of range"): "`test_a_button_of_a_joystick_is_a_device`",
     ("zone", "by", "most", "out of range"): "as `separation`",
     (
         "zone",
@@ -391,7 +391,7 @@ def _wrong(value: float, whole: int) -> Callable[[Lab, Place], str]:
         assert not (math.isnan(value) and (is_bool or is_whole)), "give a reason"
         change = changed(place, True if is_bool else whole if is_whole else value, good)
         assert change is not None, "give a reason"
-        if place.preset in {"arm", "enable"} and is_bool:
+        if place.preset in {"ready", "hold_to_run"} and is_bool:
             change = {"data": False}
         passed = lab.run(1000, without=place.topic, bad=lambda: lab.send(place.topic, change))
         return "a motion passes with it" if passed else ""

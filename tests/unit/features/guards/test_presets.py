@@ -72,7 +72,7 @@ def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) ->
         )
 
 
-OF_THE_SITE = {("separation", "margin"), *((name, "publishers") for name in ("estop", "enable", "mode"))}
+OF_THE_SITE = {("separation", "margin"), *((name, "publishers") for name in ("estop", "hold_to_run", "mode"))}
 """Values of which only the site has the safe one; `guard list` names the default."""
 
 

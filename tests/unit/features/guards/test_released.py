@@ -15,10 +15,13 @@ from appliance.features.guards.presets import (
     GuardError,
     Parameter,
     Preset,
+    preset_named,
+    preset_of,
     text_of,
     topics_in,
     types_in,
     values_in,
+    with_values,
 )
 from appliance.features.guards.released import FOLDER, origin_of
 from appliance.features.guards.robot_graph import TopicFacts
@@ -86,7 +89,9 @@ def test_a_value_beyond_its_range_or_without_a_place_is_a_change(preset: Preset)
         assert origin_of(text.replace("\n}\n", f"\n    {other}\n}}\n", 1)) == "changed"
 
 
-@pytest.mark.parametrize(("name", "version"), [("separation", 2), ("zone", 1), ("joints", 2), ("joints", 3)])
+@pytest.mark.parametrize(("name", "version"), [
+    ("separation", 2), ("zone", 1), ("joints", 2), ("joints", 3), ("hold_to_run", 1), ("ready", 2),
+])  # fmt: skip
 def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, version: int) -> None:
     base = released.released(name, version)
     for guard in (made(base), replace(made(base), values={})):
@@ -95,6 +100,17 @@ def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, ve
         new = upgraded(text, {}, [TopicFacts(topic, kind, (), ()) for topic, kind in old_types(text)])
         assert origin_of(new.text) == "current" and topics_in(new.text) == topics_in(text)
         assert values_in(new.text).items() >= values_in(text).items()
+
+
+@pytest.mark.parametrize(("old", "new", "version"), [("enable", "hold_to_run", 1), ("arm", "ready", 2)])
+def test_a_preset_with_its_old_name_is_the_same_preset(old: str, new: str, version: int) -> None:
+    text = text_of(made(released.released(new, version)))
+    preset = preset_of(text)
+    assert text.startswith(f"preset {old} {version} as mine")
+    assert preset is not None and preset.name == new and preset_named(old) is PRESETS[new]
+    changed = with_values(text, {"silent": "0.45"})
+    assert changed.startswith(f"preset {old} {version} as mine") and origin_of(changed) == "older"
+    assert upgraded(changed, {}, ()).text.startswith(f"preset {new} {PRESETS[new].version} as mine")
 
 
 def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from lab.closed_loop.worlds import WORLDS, replay, run_one
 
 SEEDS = {
     "deadman": (1, 3), "speed": (0, 6), "separation": (0, 14), "fence": (14,), "sensor": (7,), "estop": (4,),
-    "arm": (0, 34), "agree": (0, 6), "mode": (0, 6), "overspeed": (0, 6), "standstill": (1, 2), "diagnostics": (0, 3),
+    "ready": (0, 34), "agree": (0, 6), "mode": (0, 6), "overspeed": (0, 6), "standstill": (1, 2), "diagnostics": (0, 3),
     "zone": (0, 17), "joints": (3, 7, 12),
 }  # fmt: skip
 """Worlds that find a guard that does nothing, and one that stops everything; 0 and 1 do so for the other presets.

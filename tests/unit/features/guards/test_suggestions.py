@@ -168,7 +168,7 @@ def test_the_list_of_what_is_not_protected_is_never_empty_and_knows_the_guards_i
         assert len(advice(graph).not_protected) == 2
     loaded = [
         LoadedSuggestion(preset, preset, {"command": "/cmd_vel", "by": "/x"})
-        for preset in ("deadman", "estop", "zone", "fence", "mode", "enable", "overspeed")
+        for preset in ("deadman", "estop", "zone", "fence", "mode", "hold_to_run", "overspeed")
     ]
     assert len(advice(BASE, loaded).not_protected) == 1
     for place, guard in enumerate(loaded[1:], 1):

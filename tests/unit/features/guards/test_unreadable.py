@@ -29,9 +29,9 @@ GOOD = {
     "fence": {"by": ODOMETRY},
     "sensor": {"by": SCAN},
     "agree": {"other": ODOMETRY, "by": ODOMETRY},
-    "arm": {"by": BATTERY, "fix": message("sensor_msgs/NavSatFix"), "check": message("std_msgs/Bool", data=True)},
+    "ready": {"by": BATTERY, "fix": message("sensor_msgs/NavSatFix"), "check": message("std_msgs/Bool", data=True)},
     "estop": {"stop": message("std_msgs/Bool"), "reset": message("std_msgs/Bool")},
-    "enable": {"by": message("std_msgs/Bool", data=True)},
+    "hold_to_run": {"by": message("std_msgs/Bool", data=True)},
     "mode": {"by": message("std_msgs/Bool")},
     "diagnostics": {"by": message("diagnostic_msgs/DiagnosticArray", status=[{"name": "motor"}])},
     "overspeed": {"by": ODOMETRY},
@@ -39,10 +39,10 @@ GOOD = {
     "zone": {"by": SCAN, "mute": message("std_msgs/Bool")},
 }  # fmt: skip
 """For each preset with a safe velocity that observes topics: messages after which the base may move."""
-VALUES = {"zone": {"clear": "0"}, "arm": {"needFix": "true", "needCheck": "true"}}
-SPEAKERS = {"diagnostics": ("by",), "enable": ("by",), "mode": ("by",)}
+VALUES = {"zone": {"clear": "0"}, "ready": {"needFix": "true", "needCheck": "true"}}
+SPEAKERS = {"diagnostics": ("by",), "hold_to_run": ("by",), "mode": ("by",)}
 """Topics on which each node has a say, so that the guard holds its topics until each has spoken again."""
-BEFORE = {"enable": {"by": message("std_msgs/Bool")}}
+BEFORE = {"hold_to_run": {"by": message("std_msgs/Bool")}}
 """Messages that come once before these."""
 SEND_NOTHING = {
     "answer": "its goals are cancelled at their deadlines",
@@ -207,7 +207,9 @@ def test_speakers_are_all_heard_and_all_awaited() -> None:
 
 @MADE
 @pytest.mark.parametrize("how", ["unreadable", "enabled again", "restarted"])
-@pytest.mark.parametrize(("name", "permits", "forbids"), [("enable", b"\1", b"\0"), ("mode", b"\0", b"\1")])
+@pytest.mark.parametrize(
+    ("name", "permits", "forbids"), [("hold_to_run", b"\1", b"\0"), ("mode", b"\0", b"\1")]
+)
 def test_the_word_of_a_node_is_not_forgotten_when_the_guard_begins_again(
     name: str, permits: bytes, forbids: bytes, how: str, made: Callable[[SetPart], MonitorSet]
 ) -> None:

@@ -9,7 +9,7 @@ from appliance.features.guards.presets import PRESETS, Guard, text_of
 from tests.unit.features.guards.guarding import BEGIN, MS, TWIST
 from tests.unit.features.guards.test_preset_laws import Lab
 
-WAITING = ("diagnostics", "enable", "estop", "mode", "overspeed", "standstill", "zone")
+WAITING = ("diagnostics", "hold_to_run", "estop", "mode", "overspeed", "standstill", "zone")
 SAFE = f"safe {TWIST} {{ }} on command every 100ms;"
 X = f"event drive(double x) command {TWIST} '{{linear.x:x}}'"
 STOPPERS = {
