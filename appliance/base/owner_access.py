@@ -93,6 +93,13 @@ def acting_as(uid: int) -> Iterator[None]:
         setfsuid(0)
 
 
+@contextlib.contextmanager
+def acting_as_owner(folder: Path) -> Iterator[None]:
+    """Act as the owner of a folder, if it exists: in a container, root may not use the folders of other users."""
+    with acting_as(folder.stat().st_uid) if folder.exists() else contextlib.nullcontext():
+        yield
+
+
 def _folder(path: Path) -> int:
     try:
         return os.open(path, _PASSING)

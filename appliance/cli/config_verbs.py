@@ -1,6 +1,5 @@
 """`rosrv config check|show`: validate and print the configuration."""
 
-import contextlib
 import json
 import os
 import sqlite3
@@ -13,7 +12,7 @@ import yaml
 
 from appliance.configuration.config_sources import ConfigError, Mistake, json_schema, plain, resolve
 from appliance.configuration.settings import Settings
-from appliance.supervisor.state_directory import STORED, made_before_0_4, read_only
+from appliance.supervisor.state_directory import made_before_0_4, read_only
 from rosmop.tool.terminal import printable
 
 _SOURCES = "SELECT sources FROM monitor_revision ORDER BY revision DESC LIMIT 1"
@@ -76,10 +75,8 @@ def _check_state(settings: Settings) -> None:
 
 def _stored_files(state: Path) -> dict[str, str]:
     """Return the specifications in force by their files."""
-    if not (state / STORED).exists():
-        return {}
-    with contextlib.closing(read_only(state)) as database:
-        row = database.execute(_SOURCES).fetchone()
+    with read_only(state) as database:
+        row = database.execute(_SOURCES).fetchone() if database is not None else None
     return {} if row is None else dict(json.loads(row[0])["files"])
 
 

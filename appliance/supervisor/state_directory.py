@@ -12,15 +12,17 @@ state/control/    2710  rosrv:rosrv-api  (as root) new files get this group, whi
 """
 
 import contextlib
+import errno
 import fcntl
 import os
 import socket
 import sqlite3
 import stat
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
+from appliance.base.owner_access import acting_as_owner
 from appliance.features.table import members
 from appliance.store.writer_thread import StoreError, require_0_4
 from appliance.supervisor.errors import StartError
@@ -59,11 +61,10 @@ def _has_lock(path: Path) -> bool:
 
 def made_before_0_4(path: Path) -> str | None:
     """Return why this version cannot continue a state; None if it can, or none is stored. Raises `OSError`."""
-    if not (path / STORED).exists():
-        return None
     try:
-        with contextlib.closing(read_only(path)) as database:
-            require_0_4(database.execute)
+        with read_only(path) as database:
+            if database is not None:
+                require_0_4(database.execute)
     except sqlite3.Error as error:
         raise OSError(f"{path / STORED}: {error}") from error
     except StoreError as error:
@@ -71,12 +72,18 @@ def made_before_0_4(path: Path) -> str | None:
     return None
 
 
-def read_only(path: Path) -> sqlite3.Connection:
+@contextlib.contextmanager
+def read_only(path: Path) -> Iterator[sqlite3.Connection | None]:
     """Open what is stored in a state directory. If an appliance closed it, SQLite writes nothing there either."""
     file = path.absolute() / STORED
     log = file.with_name(f"{file.name}-wal")
-    still = "" if log.exists() and log.stat().st_size else "&immutable=1"
-    return sqlite3.connect(f"{file.as_uri()}?mode=ro{still}", uri=True)
+    with acting_as_owner(file.parent):
+        if not file.exists():
+            yield None
+            return
+        still = "" if log.exists() and log.stat().st_size else "&immutable=1"
+        with contextlib.closing(sqlite3.connect(f"{file.as_uri()}?mode=ro{still}", uri=True)) as database:
+            yield database
 
 
 class StateDirectory:
@@ -154,9 +161,9 @@ class StateDirectory:
             listener.bind(str(path))
         except OSError as error:
             listener.close()
-            raise StartError(
-                f"{path} cannot be created: {error.strerror or error}; name a shorter path with --state DIR"
-            ) from error
+            full = error.errno in {errno.ENOSPC, errno.EDQUOT}
+            advice = "free some space" if full else "name a shorter path with --state DIR"
+            raise StartError(f"{path} cannot be created: {error.strerror or error}; {advice}") from error
         finally:
             os.umask(mask)
         listener.listen(64)
@@ -181,8 +188,9 @@ class StateDirectory:
                 f"another appliance (process {owner}) already uses the state directory {self.path}: "
                 f"stop it, or name another directory with --state DIR"
             ) from error
-        os.ftruncate(self._lock, 0)
-        os.pwrite(self._lock, f"{os.getpid()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # of a full disk: the number only informs
+            os.ftruncate(self._lock, 0)
+            os.pwrite(self._lock, f"{os.getpid()}\n".encode(), 0)
 
     def _folder(self, name: str, uid: int, gid: int, mode: int) -> None:
         path = self.path / name

@@ -1,6 +1,7 @@
 """The commands `rosrv backup`, `restore` and `purge`."""
 
 import contextlib
+import os
 import shlex
 import sqlite3
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from appliance.base.input_files import read_given_text
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
 from appliance.cli.typed_confirmation import Yes, confirm_state
+from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import load_resolved
 from appliance.features.backup.purge import purge as remove
 from appliance.features.backup.purge import require_state_directory
@@ -51,11 +53,12 @@ def specifications_in(name: str, copy: Path) -> Mapping[str, str]:
 
 
 def lacking_in_folder(state: Path, texts: Mapping[str, str]) -> list[str]:
-    """Return the files whose texts are not in the folder that the appliance of this state last used."""
+    """Return the files whose texts are not in the folder that the appliance of this state uses, or will use."""
     try:
-        folder = load_resolved(state / "run" / "config.json").monitors
-    except (OSError, ValueError):
-        folder = None  # the appliance has not started with this state
+        running = state / "run" / "config.json"
+        folder = (load_resolved(running) if running.exists() else resolve(None, os.environ, {})).monitors
+    except (OSError, ValueError, ConfigError):
+        folder = None
     return [file for file, text in texts.items() if not _has(folder, file, text)]
 
 

@@ -130,7 +130,12 @@ def _state(state: Path) -> Iterator[SelftestFinding]:
     if not stat.S_ISDIR(mode):
         yield fail("state", f"{state} is not a directory", "use another: --state DIR")
         return
-    if os.access(state, os.R_OK) and (reason := foreign(state) or made_before_0_4(state)):
+    try:
+        reason = foreign(state) or made_before_0_4(state) if os.access(state, os.R_OK) else None
+    except OSError as error:
+        yield skip("state", f"what is stored is not read: {error}", "run as the appliance's owner, or root")
+        reason = None
+    if reason:
         yield fail("state", reason, "use another, empty or new: --state DIR")
         return
     if mode & 0o022:

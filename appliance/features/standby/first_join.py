@@ -18,6 +18,7 @@ import typer
 from msgspec.structs import replace
 
 from appliance.base.atomic_files import write_whole
+from appliance.base.owner_access import acting_as_owner
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.up_inputs import read_node_ports
 from appliance.configuration.config_sources import resolve
@@ -246,7 +247,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
 def _with_authority(other: Membership, state: Path) -> Membership:
     signer = state / "signer"
     try:
-        with as_owner(signer):
+        with acting_as_owner(signer):
             sealed = sealed_authority(signer)
     except FileNotFoundError:
         return other  # this appliance was never started
@@ -255,20 +256,6 @@ def _with_authority(other: Membership, state: Path) -> Membership:
     if sealed is None:
         return other
     return replace(other, sealed_certificate=sealed.certificate, sealed_key=sealed.key)
-
-
-@contextlib.contextmanager
-def as_owner(folder: Path) -> Iterator[None]:
-    """Act as the owner of a folder: in a container, root may not use the folders of other users."""
-    owner, own = folder.stat().st_uid, os.geteuid()
-    if owner == own or own != 0:
-        yield
-        return
-    os.seteuid(owner)
-    try:
-        yield
-    finally:
-        os.seteuid(own)
 
 
 def existing_membership(path: Path) -> Membership | None:
@@ -323,7 +310,8 @@ def _plan(options: JoinOptions, settings: Settings, earlier: Membership | None) 
                 f"{option} {text!r} is not an IPv4 address, such as 192.168.1.2", _VERB
             ) from None
     try:
-        epoch = stored_epoch(options.state / "lease" / EPOCH)
+        with acting_as_owner(options.state / "lease"):
+            epoch = stored_epoch(options.state / "lease" / EPOCH)
     except (OSError, ValueError) as error:
         raise refused([f"{_VERB}: {error}"]) from None
     # Its audit log and the state of its monitors have the appliance's name.

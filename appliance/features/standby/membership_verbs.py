@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
 from appliance.base import clock
+from appliance.base.owner_access import acting_as_owner
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.features.standby.first_join import (
@@ -29,7 +30,7 @@ from appliance.features.standby.membership import (
     save_membership,
 )
 from appliance.features.standby.process import EPOCH
-from appliance.supervisor.state_directory import StateDirectory
+from appliance.supervisor.state_directory import STORED, StateDirectory
 from appliance.supervisor.users import account_of
 from rosmop.tool.terminal import printable, refused, say
 
@@ -91,7 +92,9 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
             ]
         )
     backup = None
-    if (state / "control" / "state.db").exists():
+    with acting_as_owner(state / "control"):
+        stored = (state / STORED).exists()
+    if stored:
         path.parent.mkdir(mode=0o700, exist_ok=True)
         backup = path.with_name(f"before-{clock.utc_now():%Y%m%dT%H%M%SZ}.tar.gz")
         try:
@@ -101,7 +104,8 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
     # An epoch belongs to a pair. This one is kept if the appliance was in this pair: it may have promised something.
     last = earlier or existing_membership(path.with_name(LEFT_FILE))
     if last is None or last.certificate != membership.certificate:
-        (state / "lease" / EPOCH).unlink(missing_ok=True)
+        with acting_as_owner(state / "lease"):
+            (state / "lease" / EPOCH).unlink(missing_ok=True)
     if membership.sealed_key:
         account = account_of("rosrv-signer")
         sealed = SealedAuthority(membership.sealed_certificate, membership.sealed_key)
@@ -273,8 +277,9 @@ def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     directory = StateDirectory(state)
     file = state / "lease" / EPOCH
     try:
-        epoch = file.read_text("ascii", "replace").strip()[:32] if file.exists() else ""
-        file.unlink(missing_ok=True)
+        with acting_as_owner(file.parent):
+            epoch = file.read_text("ascii", "replace").strip()[:32] if file.exists() else ""
+            file.unlink(missing_ok=True)
     except OSError as error:
         raise usage_error(f"{file} cannot be removed: {error.strerror}; run this as root", _VERB) from None
     finally:

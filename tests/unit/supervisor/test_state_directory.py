@@ -1,11 +1,16 @@
 import os
 import socket
 import stat
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from appliance.base.atomic_files import name_to_make
+from appliance.features.standby.membership import path_of as path_of_membership
+from appliance.features.standby.process import EPOCH
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
@@ -178,3 +183,40 @@ def test_a_state_has_the_mark_of_0_4_once_it_has_a_policy(tmp_path: Path) -> Non
     (tmp_path / "control" / "state.db").write_bytes(b"no database" * 100)
     with pytest.raises(OSError, match="not a database"):
         made_before_0_4(tmp_path)
+
+
+@pytest.mark.real
+@pytest.mark.skipif(os.geteuid() != 0, reason="a folder of another user than root")
+@pytest.mark.parametrize(("verb", "before", "shown"), [
+    ("selftest", False, "ok state {state}, mode 711"),
+    ("selftest", True, "fail state {state}: the state was made by a version before 0.4"),
+    ("config check", True, "state: {state}: the state was made by a version before 0.4"),
+    ("standby repair", False, "Epoch 7 is forgotten"),
+])  # fmt: skip
+def test_root_of_a_container_reads_the_folders_of_processes(verb: str, before: bool, shown: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # whose parents other users may pass
+        said = said_in_a_container(Path(folder), verb, before=before)
+        assert shown.format(state=folder) in " ".join(said.split())
+
+
+def said_in_a_container(tmp_path: Path, verb: str, *, before: bool) -> str:
+    tmp_path.chmod(0o711)
+    for name in ("control", "lease"):
+        (tmp_path / name).mkdir(0o700)
+    store = StateStore(tmp_path / "control", failed=pytest.fail, kind=InlineDatabase)
+    store.save_revision(RevisionRow(1, "", "", 0.0, "disk", ""))
+    if not before:
+        store.save_setting("ends", "1")
+    store.close()
+    (tmp_path / "lease" / EPOCH).write_text("7")
+    (tmp_path / "lock").touch()
+    path_of_membership(tmp_path).parent.mkdir()
+    path_of_membership(tmp_path).touch()
+    for name in ("control", "lease"):
+        for path in (tmp_path / name, *(tmp_path / name).iterdir()):
+            os.chown(path, 61_999, 61_999)
+    rights = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
+    command = (*rights, sys.executable, "-c", "from appliance.cli.main import main; main()", *verb.split())
+    environment = {**os.environ, "ROSRV_STATE": str(tmp_path)}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return run.stdout + run.stderr
