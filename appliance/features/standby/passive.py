@@ -71,13 +71,14 @@ from appliance.store.writer_thread import StoreError
 # this
 # appliance does not claim the lease, but still follows the active one and stays in the in-sync set. With little room
 # it claims a lease that the active one has lost, but is given none: as a standby it writes less, so both could pass
-# the lease to and fro.
+# the lease to and fro. The same holds from a change of the policy or the specifications until the check ends: a
+# takeover compiles what has changed, which can take longer than a new active appliance may need until it serves.
 
 _CHECK_AGAIN_SECONDS = 15.0
 
 
 class TakeoverCheck:
-    """The check; set `news` when the policy or the specifications of the active appliance have changed."""
+    """The check. `obstacle` prevents each takeover, `scarce` those from an active appliance that is not away."""
 
     def __init__(
         self,
@@ -93,14 +94,19 @@ class TakeoverCheck:
         self._again = again
         self.obstacle = UNCHECKED
         self.scarce = ""
-        self.news = asyncio.Event()
+        self._news = asyncio.Event()
+
+    def note_news(self) -> None:
+        """Check again, because the policy or the specifications of the active appliance have changed."""
+        self.scarce = self.scarce or UNCHECKED
+        self._news.set()
 
     async def run(self, changed: Callable[[], None]) -> None:
         while True:
-            self.news.clear()
+            self._news.clear()
             obstacle = await self._find_obstacle()
-            scarce = "" if obstacle else self._find_scarce()
-            if (obstacle, bool(scarce)) != (self.obstacle, bool(self.scarce)):
+            scarce = "" if obstacle else self._find_scarce() or (UNCHECKED if self._news.is_set() else "")
+            if self.scarce == UNCHECKED or (obstacle, bool(scarce)) != (self.obstacle, bool(self.scarce)):
                 self.scarce = scarce
                 if self.obstacle not in ("", UNCHECKED):
                     _log.info("the reason why this appliance cannot take over is gone", reason=self.obstacle)
@@ -108,7 +114,7 @@ class TakeoverCheck:
                 changed()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._again):
-                    await self.news.wait()
+                    await self._news.wait()
 
     def _find_scarce(self) -> str:
         short, other = lacking_room(self._rehearsal.folder, SERVING_ROOM), self._membership.other
@@ -297,7 +303,7 @@ class PassiveControl:
             self._accepts,
             lambda: self.tunnels.introduction(endpoint, self._rest.pin),
             lambda: self.obstacle,
-            self._check.news.set,
+            self._revised,
         )
         self.copies = CopyAge(self._replica.setting)
         self._epoch = 0
@@ -362,6 +368,10 @@ class PassiveControl:
                     _log.error("the copy of the state is not on the disk", reason=reason)
                 await asyncio.sleep(_AGAIN_SECONDS)
 
+    def _revised(self) -> None:
+        self._check.note_news()
+        self._state_presence()
+
     @property
     def obstacle(self) -> str:
         """Why this appliance could not take over, although it may follow."""
@@ -414,7 +424,7 @@ class PassiveControl:
 
     async def hand_over(self) -> None:
         troubles = self.state().troubles
-        if troubles and (self._connected or self.obstacle):
+        if troubles and self.obstacle != UNCHECKED and (self._connected or self.obstacle):
             raise HandOverError(troubles[0])
         try:
             refusal = await self._receiver.want_switchover()

@@ -140,6 +140,7 @@ _REPORT_SECONDS = 0.1
 _SYNC_SECONDS = 0.1
 _BACKLOG = 8
 _REHEARSAL_SECONDS = EXPIRY
+_CHECK_SECONDS = 2.0  # a policy takes less, monitors can take more
 _SETTLE_SECONDS = 1.0  # topics are paused
 _LOOK_SECONDS = 0.01
 _ANSWER_SECONDS = 5.0
@@ -348,18 +349,26 @@ class Replication:
     async def require_ready(self, rehearse: Callable[[], Awaitable[None]]) -> None:
         """Raise `HandOverError` unless the standby can take over; `rehearse` writes as much as the switchover.
 
-        The witness must answer the standby after the order, because its cable may just have been unplugged.
+        A check of the last change may end soon. The witness must answer the standby after that and after the order:
+        its cable may just have been unplugged, and the same answer says whether it may be given the lease.
         """
+        if not self._is_checking():
+            self._require_no_trouble()
+        await self._settle(_REHEARSAL_SECONDS, rehearse)
+        with contextlib.suppress(TimeoutError):  # then it is the trouble
+            async with asyncio.timeout(_CHECK_SECONDS):
+                while self._is_checking():
+                    await asyncio.sleep(_LOOK_SECONDS)
+        heard = await self._lease.standby_hears_witness()
         self._require_no_trouble()
-        heard, _ = await asyncio.gather(
-            self._lease.standby_hears_witness(), self._settle(_REHEARSAL_SECONDS, rehearse)
-        )
         if not heard:
             other = self._membership.other
             raise HandOverError(
                 f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
             )
-        self._require_no_trouble()
+
+    def _is_checking(self) -> bool:
+        return self.sender.lag().obstacle == UNCHECKED
 
     def _require_no_trouble(self) -> None:
         if troubles := self.state().troubles:
@@ -367,6 +376,7 @@ class Replication:
 
     async def hand_over(self) -> None:
         await self._settle(_SETTLE_SECONDS)
+        self._require_no_trouble()
         await self._lease.hand_over()
 
     async def _settle(self, seconds: float, write: Callable[[], Awaitable[None]] | None = None) -> None:
@@ -401,7 +411,7 @@ class Replication:
 
     async def _report_always(self) -> None:
         while True:
-            if self._in_sync() and self._connected() and self.sender.lag().obstacle != UNCHECKED:
+            if self._in_sync() and self._connected() and not self._is_checking():
                 self._trouble_since = None
             elif self._trouble_since is None:
                 self._trouble_since = asyncio.get_running_loop().time()

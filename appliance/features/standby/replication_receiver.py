@@ -19,14 +19,15 @@ from appliance.features.standby.replication_frames import (
     obstacle_of,
     reason_of,
 )
-from appliance.store.changes import Put
+from appliance.specifications.switches import SWITCHES
+from appliance.store.changes import Change, Put
 from appliance.store.state_file import REVISION_TABLES
 from appliance.store.writer_thread import StoreError
 
 _INTRODUCED_SECONDS = 3600.0
 _FEW = 16  # changes
 _SMALL = 16 << 10  # bytes of one value
-_REFUSAL_SECONDS = 4.0  # the active appliance refuses after 1.2 s, and gives up after 2.5 s of a pause
+_REFUSAL_SECONDS = 7.0  # the active appliance refuses after 4.4 s, and gives up after 2.5 s of a pause
 _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 
 
@@ -79,9 +80,9 @@ class ReplicationReceiver:
         try:
             await link.send(self._replica.position)
             self._link = link
+            await self._report_obstacle(link)
             while True:
                 await self._introduce(link)
-                await self._report_obstacle(link)
                 message = await link.receive(_SILENCE_SECONDS)
                 self._messages += 1
                 if isinstance(message, Refused):
@@ -101,6 +102,7 @@ class ReplicationReceiver:
                     self.refusal.note(str(error))
                     await link.send(reason_of(error))
                     raise
+                await self._report_obstacle(link)  # before the active appliance counts this as stored
                 await link.send(self._replica.position)
         finally:
             self._link = None
@@ -135,8 +137,14 @@ class ReplicationReceiver:
 
 def _has_revisions(message: FromActive) -> bool:
     return isinstance(message, SnapshotEnd) or (
-        isinstance(message, Changes) and any(change.table in REVISION_TABLES for change in message.changes)
+        isinstance(message, Changes) and any(map(_is_revision, message.changes))
     )
+
+
+def _is_revision(change: Change) -> bool:
+    if isinstance(change, Put) and change.table == "setting":
+        return any(row[0] == SWITCHES for row in change.rows)
+    return change.table in REVISION_TABLES
 
 
 def _is_small(message: Changes) -> bool:

@@ -16,8 +16,11 @@ SILENT_SECONDS = 5.0
 """The age of its last answer from which the witness is silent. It is asked every 0.3 s."""
 
 
-UNCHECKED = "it has just started, and still checks whether it could serve"
-"""The obstacle of a standby before its first check ends, which takes as long as its specifications need."""
+UNCHECKED = (
+    "since its start or the last change of the policy or the monitors, it still checks whether it could serve, which"
+    " takes some seconds: try again then"
+)
+"""The obstacle of a standby before its check ends, which takes as long as its specifications need."""
 
 MISFIT = "a change does not fit"
 """The beginning of a refusal of a standby whose tables are others, as those of an earlier version are."""

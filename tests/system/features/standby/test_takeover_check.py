@@ -3,6 +3,8 @@
 The standby `b` has keys of the site, which `a` does not know. Each test brings the policy into force that it needs.
 """
 
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from tests.support.nodes import has_ros
 from tests.support.printed import row_of
 from tests.support.requirements import need_program, need_root, needs
 from tests.support.site_key import LINE, signed
-from tests.support.waiting import eventually
+from tests.support.waiting import NoAnswerError, eventually
 from tests.system.features.standby.conftest import RULE
 
 NO_SIGNATURE = "it has no signature of the site"
@@ -138,3 +140,33 @@ def test_a_specification_that_it_cannot_load(site: StandbySite) -> None:
     eventually(
         lambda: [row["name"] for row in site.appliances["b"].rows("monitor", "list")] == ["seen"], site.story
     )
+    site.restore("a")
+
+
+def test_a_change_that_it_still_checks(site: StandbySite) -> None:
+    """The order to switch over is refused until the check has ended; after a power cut, nothing waits for it."""
+    site.until_both_in_sync()
+    active, standby = site.pair()
+
+    def change(name: str) -> None:
+        text = RULE.replace("seen", name)
+        order = admin.MonitorLoad({"seen.rv": text}, signatures={"seen.rv": signed(text)})
+        site.appliances[active].ask(order)
+
+    change("one")
+    until_obstacle(site, "", "a", "b")
+    (compiler,) = site.pids(standby, "compiler")
+    for name in (active, standby):
+        os.kill(compiler, signal.SIGSTOP)  # for less than 5 s, or the supervisor kills it
+        change(f"for_{name}")
+        with pytest.raises(NoAnswerError, match="it still checks"):
+            site.appliances[name].ask(standby_requests.StandbyPromote())
+        os.kill(compiler, signal.SIGCONT)
+        assert site.holder() == active
+        until_obstacle(site, "", "a", "b")
+    os.kill(compiler, signal.SIGSTOP)
+    change("cut")
+    site.cut(active)
+    site.until_taken_over(standby)
+    os.kill(compiler, signal.SIGCONT)
+    site.until_active(standby)

@@ -35,12 +35,14 @@ from appliance.features.standby.replication_frames import (
 )
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_sender import ReplicationSender
+from appliance.specifications.switches import SWITCHES
 from appliance.store.access_tokens import make_token
 from appliance.store.changes import Put
 from appliance.store.host_tables import HostBlockRow, HostRow, RevokedCertificateRow
 from appliance.store.state_file import SCHEMA as STATE_SCHEMA
 from appliance.store.state_file import (
     IncarnationRow,
+    MonitorRevisionRow,
     PermissionRow,
     RegistrationRow,
     RevisionRow,
@@ -559,21 +561,32 @@ async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_
     replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
     revisions: list[int] = []
     obstacles: list[str] = [""]
+
+    def revised() -> None:
+        revisions.append(replica.position.number)
+        obstacles.append(f"check {len(revisions)}")
+
     ends, others = await pair_of_streams()
     receiver = ReplicationReceiver(
         replica,
         lambda _epoch: True,
         obstacle=lambda: obstacles[-1],
-        revised=lambda: revisions.append(replica.position.number),
+        revised=revised,
     )
     tasks = [asyncio.create_task(sender.serve(*ends)), asyncio.create_task(receiver.follow(*others))]
+    changes: list[Callable[[], None]] = [
+        lambda: None,  # the snapshot
+        lambda: store.save_revision(RevisionRow(1, "text", "p.ini", 1.0, "disk", "note")),
+        lambda: store.save_monitor_revision(MonitorRevisionRow(1, "{}", 1.0, "disk", "note")),
+        lambda: store.save_setting(SWITCHES, "{}"),
+    ]
     async with asyncio.timeout(SECONDS):
-        await sender.acknowledged(store.database.number)
-        await until(lambda: len(revisions) == 1)  # the snapshot
-        store.save_setting("name", "value")
-        store.save_revision(RevisionRow(1, "text", "p.ini", 1.0, "disk", "note"))
-        await sender.acknowledged(store.database.number)
-        await until(lambda: len(revisions) > 1 and revisions[-1] == store.database.number)
+        for number, change in enumerate(changes, 1):
+            store.save_setting("name", "value")
+            change()
+            await sender.acknowledged(store.database.number)
+            assert sender.lag().obstacle == f"check {number}"  # with what it acknowledges
+            assert (len(revisions), revisions[-1]) == (number, store.database.number)
         for obstacle in ("other keys", "x" * 600, ""):
             obstacles.append(obstacle)
             store.save_setting("name", obstacle)

@@ -14,11 +14,13 @@ from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.orders import ActiveAppliance
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_sender import ReplicationLag
+from appliance.features.standby.summary import UNCHECKED
 from tests.unit.features.standby.parts import MEMBERSHIP, CountedDatabase
 
 pytestmark = pytest.mark.anyio
 
 REFUSED_SECONDS = 2.0
+CHECKED_SECONDS = 2.0
 PAUSE_SECONDS = 2.0
 
 
@@ -72,11 +74,11 @@ class Active:
             self._do("give up")
             asyncio.get_running_loop().call_soon(self.lease.heard, lease_link.HandOverAnswered(""))
 
-    async def refused(self) -> str:
+    async def refused(self, seconds: float = REFUSED_SECONDS) -> str:
         began = clock.now()
         with pytest.raises(HandOverError) as caught:
             await self.order.hand_over()
-        assert clock.now() - began <= REFUSED_SECONDS
+        assert clock.now() - began <= seconds
         return str(caught.value)
 
     def steps(self) -> list[str]:
@@ -138,6 +140,30 @@ async def test_a_check_that_fails_refuses_the_order_at_once(active: Active) -> N
     assert active.steps() == []
 
 
+async def test_the_order_waits_until_the_standby_has_checked_a_change(active: Active) -> None:
+    """The process `lease` says a moment later that the standby may have the lease."""
+    active.obstacle = UNCHECKED
+    active.report(takeover_obstacle="b could not serve after a takeover")
+
+    def checked() -> None:
+        active.obstacle = ""
+        asyncio.get_running_loop().call_later(0.3, active.report)
+
+    asyncio.get_running_loop().call_later(1.0, checked)
+    await active.order.hand_over()
+    assert active.steps() == ["rehearse", "pause", "give up"]
+
+
+@pytest.mark.parametrize("after", [0.0, 0.05])
+async def test_a_change_that_the_standby_still_checks_refuses_the_order(active: Active, after: float) -> None:
+    asyncio.get_running_loop().call_later(after, setattr, active, "obstacle", UNCHECKED)
+    asyncio.get_running_loop().call_later(CHECKED_SECONDS, active.report)  # the witness goes on answering
+    assert f"the standby b (10.0.0.3) cannot take over: {UNCHECKED}" in await active.refused(
+        CHECKED_SECONDS + 0.5
+    )
+    assert active.steps() == ["rehearse"]
+
+
 async def test_a_standby_that_is_removed_after_the_order_refuses_it(active: Active) -> None:
     active.delay = 0.5
     asyncio.get_running_loop().call_later(0.3, lambda: active.report(in_sync=False))
@@ -145,15 +171,22 @@ async def test_a_standby_that_is_removed_after_the_order_refuses_it(active: Acti
     assert active.steps() == ["rehearse"]
 
 
-async def test_topics_pass_again_if_the_standby_becomes_slow_during_the_pause(active: Active) -> None:
+@pytest.mark.parametrize(
+    ("what", "value", "reason"),
+    [("delay", math.inf, "b has not stored the last changes after 1 s"), ("obstacle", UNCHECKED, UNCHECKED)],
+)
+async def test_topics_pass_again_if_the_standby_becomes_slow_during_the_pause(
+    active: Active, what: str, value: object, reason: str
+) -> None:
     async def leave() -> None:
         active.did.append(("pause", clock.now()))
-        active.written, active.delay = clock.now(), math.inf
+        active.written = clock.now()
+        setattr(active, what, value)
 
     active.order = ActiveAppliance(
         active.replication, active.rehearse, leave, lambda: active.did.append(("pass again", clock.now()))
     )
-    with pytest.raises(HandOverError, match="b has not stored the last changes after 1 s"):
+    with pytest.raises(HandOverError, match=reason):
         await active.order.hand_over()
     assert active.steps() == ["rehearse", "pause", "pass again"]
     (_, paused), (_, again) = active.did[1:]

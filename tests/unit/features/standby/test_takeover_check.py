@@ -106,7 +106,7 @@ class Checked:
 
     async def replicate(self) -> None:
         await self._store.settled()
-        self.check.news.set()
+        self.check.note_news()
 
 
 @pytest.fixture
@@ -140,6 +140,30 @@ async def test_a_standby_with_little_room_takes_over_only_what_the_other_one_has
         await checked.replicate()
         assert "4194303 bytes are free" in await checked.next_obstacle()
         assert checked.check.scarce == ""
+
+
+async def test_a_change_keeps_the_lease_from_it_until_a_check_that_began_later_has_ended(
+    standby: Standby,
+) -> None:
+    """It still takes over what the other one has lost."""
+    begun: asyncio.Queue[Sources] = asyncio.Queue()
+    goes_on = asyncio.Semaphore(1)
+
+    class Slow(SpecificationCompiler):
+        async def check_at_start(self, sources: Sources, *_: object) -> CheckedSpecifications:
+            begun.put_nowait(sources)
+            await goes_on.acquire()
+            return await here(sources, [])
+
+    async with standby.checked(compiler=Slow(lambda: None)) as checked:
+        assert (await checked.next_obstacle(), checked.check.scarce) == ("", "")
+        for _ in range(2):
+            await checked.replicate()
+            assert (checked.check.obstacle, checked.check.scarce) == ("", UNCHECKED)
+            await begun.get()
+        for left in (UNCHECKED, ""):
+            goes_on.release()
+            assert (await checked.next_obstacle(), checked.check.scarce) == ("", left)
 
 
 async def test_the_state_of_an_active_appliance_before_0_4(standby: Standby) -> None:
