@@ -399,9 +399,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )  # fmt: skip
             return await self._change(order, self._strictly)
 
-    async def take_bundle(self, sources: Sources, who: str, note: str) -> Replaced:
+    async def take_bundle(self, sources: Sources, who: str, note: str, expected: str) -> Replaced:
         """Bring exactly these sources into force."""
-        async with self.changing(None):
+        async with self.changing(expected):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
                 return self.replaced(self.revision)  # same texts: no new revision

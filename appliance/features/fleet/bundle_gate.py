@@ -353,29 +353,31 @@ class BundleGate:
             self._hosts().bundled,
             fingerprint(contents.hosts or "\n"),
         )
+        tag = self._monitors.tag
         try:
             await self._keep(msgspec.structs.replace(record, trial=trial))
-            await self._try(trial, contents)
+            await self._try(trial, contents, tag)
         except (*_OUTDATED, _OperatorChangeError, StoreError) as error:
-            self._waits = str(error)  # says nothing about the bundle: it is offered again
+            # It says nothing about the bundle, which is offered again.
+            self._waits = str(error) if isinstance(error, StoreError) else _CHANGED_DURING_TRIAL
             # Before the rollback: after a crash in between, the next start rolls back.
             self._save(msgspec.structs.replace(record, trial=trial))
             await self._end(trial)
             self._save(record)
 
-    async def _try(self, trial: Trial, contents: BundleContents) -> None:
+    async def _try(self, trial: Trial, contents: BundleContents, tag: str) -> None:
         before, self._earlier = self._health(), self._policies.current
         try:
-            await self._put_in_force(trial, contents)
+            there = await self._put_in_force(trial, contents, tag)
             self._held = frozenset(self._monitors.rollout.held - before.failing)
-            reason = await self._watch(before)
+            reason = await self._watch(before, there)
         except _REFUSALS as error:
             reason = str(error)
         if reason:
             await self._end(trial)
             self._refuse(trial.path, trial.sha256, reason)
             return
-        policy, monitors = self._policies.revision, self._monitors.revision
+        policy, monitors = there
         earlier, earlier_sha256 = self._record.in_force, self._record.sha256
         await self._keep(
             BundleRecord(
@@ -399,19 +401,25 @@ class BundleGate:
             revision_of_specifications=monitors,
         )
 
-    async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
-        """Load all parts of a bundle, in order. If one of `_REFUSALS` is raised, the earlier parts are in force."""
-        await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
-        load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
-        await self._policies.load_with(load, trial.who, _cases(contents))
-        await self._hosts().take_bundle(contents.hosts or "\n", trial.who)
+    async def _put_in_force(self, trial: Trial, contents: BundleContents, tag: str) -> tuple[int, int]:
+        """Load all parts of a bundle, in order; return its revisions of the policy and the specifications.
 
-    async def _watch(self, before: RobotHealth) -> str:
+        If one of `_REFUSALS` or `_OUTDATED` is raised, the earlier parts are in force. `tag` is that of the monitors to
+        which the trial would go back: what an operator loads later is not lost.
+        """
+        monitors = await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle", tag)
+        load = admin.PolicyLoad(
+            contents.policy, "of the bundle", expected=trial.policy_back, signature=contents.policy_signature
+        )
+        policy = await self._policies.load_with(load, trial.who, _cases(contents))
+        await self._hosts().take_bundle(contents.hosts or "\n", trial.who)
+        return policy.revision, monitors.revision
+
+    async def _watch(self, before: RobotHealth, there: tuple[int, int]) -> str:
         deadline = clock.now() + self._fleet.bundles.confirm_seconds
-        there = (self._policies.revision, self._monitors.revision)
         while True:
             if there != (self._policies.revision, self._monitors.revision):
-                raise _OperatorChangeError(_CHANGED_DURING_TRIAL)
+                raise _OperatorChangeError
             reason = self._health().worse_than(before)
             if reason or clock.now() >= deadline:
                 return reason

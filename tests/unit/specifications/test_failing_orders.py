@@ -38,7 +38,7 @@ LOADS: dict[str, Ordered] = {
     "reload": lambda monitors: monitors.reload(admin.MonitorReload(prune=True), "eve"),
     "remove": lambda monitors: monitors.remove(admin.MonitorRemove(["b"]), "eve"),
     "roll back": lambda monitors: monitors.roll_back(admin.MonitorRollback(1), "eve"),
-    "bundle": lambda monitors: monitors.take_bundle(Sources({"c.rv": C}), "eve", "a bundle"),
+    "bundle": lambda monitors: monitors.take_bundle(Sources({"c.rv": C}), "eve", "a bundle", monitors.tag),
 }
 ROLLED_OUT: dict[str, Ordered] = LOADS | {
     "shadow": lambda monitors: monitors.shadow(admin.MonitorShadow(["a"], True), "eve"),

@@ -195,9 +195,10 @@ async def test_one_of_two_concurrent_changes_is_made(desk: Desk) -> None:
         monitors.load(admin.MonitorLoad({"c.rv": A.replace("a()", "c()")}, expected=tag), "adam"),
         monitors.switch(admin.MonitorSwitch(["a"], False, expected=tag), "eve"),
         monitors.resume(admin.MonitorResume(["b"], expected=tag), "eve"),
+        monitors.take_bundle(Sources(), "fleet", "of the bundle", tag),
         return_exceptions=True,
     )
-    assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True]
+    assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True, True]
     assert monitors.switches.enabled("a")
     assert messages.MonitorResumed("b") not in desk.sent
 

@@ -1,7 +1,7 @@
 """A robot whose bundle gate, link, state and trail are real; its revisions are texts with their authors."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -43,10 +43,9 @@ class Revisions:
         self.rows = [RevisionRow(1, BEFORE, "", 0.0, "", "")]
         self.rollout = self
         self.confirm_by: float | None = None
-        self.error: Exception | None = None
         self.would_hold: list[str] = []
-        self.queued = ""
-        """The operator whose change a rollback waits for."""
+        self.meanwhile: Callable[[], object] = lambda: None
+        """Called once, while an order waits."""
 
     @property
     def revision(self) -> int:
@@ -62,8 +61,9 @@ class Revisions:
     def current(self) -> Policy:
         return _compiled(self.in_force.text, file="policy.ini")
 
-    def change(self, who: str, text: str = OF_OPERATOR) -> None:
+    def change(self, who: str, text: str = OF_OPERATOR) -> RevisionRow:
         self.rows.append(RevisionRow(len(self.rows) + 1, text, "", 0.0, who, ""))
+        return self.in_force
 
     async def attempt(self, *_content: object) -> None:
         """All policies pass."""
@@ -71,21 +71,23 @@ class Revisions:
     async def held_by_bundle(self, _sources: object) -> list[str]:
         return self.would_hold
 
-    async def load_with(self, load: Any, who: str, _cases: object) -> None:
-        if self.error is not None:
-            raise self.error
-        self.change(who, load.text)
+    async def load_with(self, load: Any, who: str, _cases: object) -> RevisionRow:
+        self._wait(load.expected)
+        return self.change(who, load.text)
 
-    async def take_bundle(self, _sources: object, who: str, _note: str) -> None:
-        self.change(who, "of the bundle")
+    async def take_bundle(self, _sources: object, who: str, _note: str, expected: int) -> RevisionRow:
+        self._wait(expected)
+        return self.change(who, "of the bundle")
 
     async def roll_back(self, order: Any, who: str) -> None:
-        if self.queued:
-            self.change(self.queued)
-            self.queued = ""
-        if order.expected not in (None, self.tag):
-            raise RevisionChangedError(order.expected, self.revision)
+        self._wait(order.expected)
         self.change(who, self.rows[order.revision - 1].text)
+
+    def _wait(self, expected: int | None) -> None:
+        happens, self.meanwhile = self.meanwhile, lambda: None
+        happens()
+        if expected not in (None, self.tag):
+            raise RevisionChangedError(expected or 0, self.revision)
 
 
 class BundleRobot:

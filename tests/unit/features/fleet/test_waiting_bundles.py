@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from appliance.control.assembly.policies import RevisionChangedError
 from tests.unit.features.fleet.bundle_robot import BEFORE, FLEET, OF_OPERATOR, OFFER, BundleRobot
 
 pytestmark = pytest.mark.anyio
@@ -49,19 +48,25 @@ async def test_a_change_that_a_rollback_waits_for_stays(robot: BundleRobot) -> N
         robot.poll(offered=True)
         await asyncio.sleep(5)
         robot.monitors.change("olga")
-        robot.policies.queued = "olga"
+        robot.policies.meanwhile = lambda: robot.policies.change("olga")
         await asyncio.sleep(_CONFIRM_SECONDS)
         assert robot.policies.in_force.text == robot.monitors.in_force.text == OF_OPERATOR
 
 
-async def test_a_change_while_the_policy_is_prepared_only_delays_the_bundle(robot: BundleRobot) -> None:
+@pytest.mark.parametrize("waiting", ["monitors", "policies"])
+@pytest.mark.parametrize("changed", ["monitors", "policies"])
+async def test_a_change_while_a_part_is_prepared_only_delays_the_bundle(
+    waiting: str, changed: str, robot: BundleRobot
+) -> None:
+    parts = {"monitors": robot.monitors, "policies": robot.policies}
+    parts[waiting].meanwhile = lambda: parts[changed].change("olga")
     async with robot.running():
-        robot.policies.error = RevisionChangedError(1, 2)
         robot.poll(offered=True)
         await asyncio.sleep(5)
+        assert parts.pop(changed).in_force.text == OF_OPERATOR
+        assert [part.in_force.text for part in parts.values()] == [BEFORE]
         assert robot.stated[-1].refused is None
-        assert "revision 2 is in force, not 1" in robot.state.trouble
-        robot.policies.error = None
+        assert "an operator changed" in robot.state.trouble
         robot.poll(offered=True)
         await asyncio.sleep(_CONFIRM_SECONDS + 5)
         assert robot.stated[-1].in_force == OFFER.path
