@@ -63,7 +63,7 @@ class Allocation:
     def __init__(self, relays: int, save: Callable[[str], None] = lambda _text: None) -> None:
         self.relays = relays
         self._save = save
-        self._plan = AllocationPlan()
+        self._plan = self._former = AllocationPlan()
 
     def of(self, kind: str, name: str) -> int:
         return self._of(self._plan.resources, (kind, name))
@@ -99,6 +99,11 @@ class Allocation:
             homes = self._one_way(groups, homes, carried)
             plan = self._planned(groups, homes, carried)
         return plan
+
+    def plan_back(self, former: CheckedSpecifications, carried: Collection[Resource]) -> AllocationPlan:
+        """Return a plan with the files where they were before the present plan, with these specifications."""
+        groups, files = groups_of(former), self._former.files
+        return self._planned(groups, [files[min(group.files)] for group in groups], set(carried))
 
     def _homes(self, groups: Sequence[FileGroup], carried: Collection[Resource]) -> list[int]:
         homes: list[int] = []
@@ -154,7 +159,7 @@ class Allocation:
         return AllocationPlan(files, resources, moves, moved, frozenset(losing))
 
     def adopt(self, plan: AllocationPlan) -> None:
-        self._plan = plan
+        self._former, self._plan = self._plan, plan
         kept = {
             "relays": self.relays,
             "files": sorted(plan.files.items()),

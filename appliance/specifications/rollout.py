@@ -124,10 +124,11 @@ class Rollout:
         self._forget()
 
     async def take_back(self, earlier: InForce) -> None:
-        """Return all relays to the specifications that they had before `take`, and which they do not refuse."""
-        plan = self.allocation.plan(earlier.checked, self.relays.live_resources())
-        await self._make(earlier, _of(plan))
-        self._settle(earlier, plan)
+        """Return all relays to the specifications that they had before `take`, and which they do not refuse.
+
+        Each gets the same part again, because the compiler may fail now.
+        """
+        self._settle(earlier, self.allocation.plan_back(earlier.checked, self.relays.live_resources()))
         await self.all_taken()
 
     async def leave(self, seconds: float) -> list[bytes]:

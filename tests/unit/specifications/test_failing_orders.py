@@ -200,6 +200,27 @@ async def test_an_order_that_fails_changes_nothing(desk: Desk, order: str, fault
     assert told(again.statement(0)) | {"later": []} == relay
 
 
+async def test_an_order_that_cannot_be_stored_is_taken_back_without_the_compiler(desk: Desk) -> None:
+    """Both files and their topics are on one relay with the new specifications, and on two again without them."""
+    desk.relays = 2
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    before, relays = monitors.now, [told(monitors.statement(relay)) for relay in range(2)]
+    joins = "joins() { event one() /chatter std_msgs/String '{}' { } event two() /other std_msgs/String '{}' { } }"
+
+    def breaks(desk: Desk) -> None:
+        assert len({monitors.rollout.allocation.of_file(file) for file in ("a.rv", "b.rv")}) == 1
+        full(desk)
+        no_parts(desk, monitors)
+
+    at_the_next_change(breaks)(desk, monitors)
+    with pytest.raises(StoreError, match="revision 2 of the specifications stays in force: "):
+        await monitors.load(admin.MonitorLoad({"joins.rv": joins}), "eve")
+    assert monitors.now == before
+    stated = [told(message) for message in desk.sent if isinstance(message, messages.SpecificationsStated)]
+    assert stated[-2:] == relays == [told(monitors.statement(relay)) for relay in range(2)]
+
+
 @pytest.mark.parametrize("order", ORDERS)
 async def test_a_kill_after_an_order_is_stored_leaves_the_next_value(
     desk: Desk, order: str, monkeypatch: pytest.MonkeyPatch
