@@ -44,6 +44,7 @@ _QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})  # queries wit
 _LOOKS = frozenset({"GET", "HEAD"})
 _BODY_SECONDS = 30.0
 _LONGEST_ANONYMOUS_BODY = 1024  # bytes of a body without a token
+_LARGER = ": raise api_limits.body_bytes (appliance.yaml) and restart, or load it with rosrv on the appliance's machine"
 _REQUEST_BODY = (
     24 << 10
 )  # bytes of a body with a host's signing request, or of a feature's call without a token
@@ -153,10 +154,12 @@ class RequestGate:
         self._check_tunnel(host, path, renewal=renewal)
         if path not in PUBLIC and not renewal and not is_console(path):
             bearer = await self.doorkeeper.recognise(headers.get("authorization"), host)
-        limit = int(self._limits.body_bytes) if bearer is not None else _LONGEST_ANONYMOUS_BODY
+        limit, advice = _LONGEST_ANONYMOUS_BODY, ""
+        if bearer is not None:
+            limit, advice = int(self._limits.body_bytes), _LARGER
         if renewal or path == "/v1/enrol" or path in _OF_FEATURES:
-            limit = _REQUEST_BODY
-        body = await _read(headers, receive, limit)
+            limit, advice = _REQUEST_BODY, ""
+        body = await _read(headers, receive, limit, advice)
         if bearer is not None and scope["method"] not in _LOOKS:
             bearer = replace(bearer, asked=asked_of(scope, headers, body))
         return bearer, body
@@ -291,9 +294,9 @@ def _check_origin(scope: Scope, headers: Headers) -> None:
         raise ProblemError(403, "foreign-origin", "requests from pages of other sites are not served")
 
 
-async def _read(headers: Headers, receive: Receive, limit: int) -> bytes:
+async def _read(headers: Headers, receive: Receive, limit: int, advice: str) -> bytes:
     too_large = ProblemError(
-        413, "too-large", f"the body is larger than {limit} bytes", headers={"Connection": "close"}
+        413, "too-large", f"the body is larger than {limit} bytes{advice}", headers={"Connection": "close"}
     )
     length = headers.get("content-length", "0")
     if not length.isdigit() or int(length) > limit:

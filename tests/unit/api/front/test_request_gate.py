@@ -70,6 +70,17 @@ def test_other_origins_are_refused(origin: str, status: int) -> None:
     assert get("/v1/status", Origin=origin).status_code == status
 
 
+def test_a_body_that_is_too_large_names_the_setting_and_another_way() -> None:
+    token = {"Authorization": f"Bearer {world().tokens.texts['admin']}"}
+    for path, headers, way in (("/v1/policy", token, True), ("/v1/enrol", {}, False)):
+        answer = sent("POST", path, {"Content-Length": str(1 << 30)} | headers)
+        assert (answer.status_code, answer.json()["type"]) == (413, "urn:rosrv:problem:too-large")
+        assert [part in answer.json()["detail"] for part in ("api_limits.body_bytes", "rosrv on the")] == [
+            way,
+            way,
+        ]
+
+
 def test_answers_are_hardened() -> None:
     for answer in (get("/v1/status"), get("/nowhere"), sent("GET", "/metrics", {})):
         assert answer.headers["cache-control"] == "no-store"
