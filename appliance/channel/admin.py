@@ -220,6 +220,10 @@ class MonitorReplace(AdminRequest[monitor_answers.Replaced], frozen=True, tag="m
     force: Force = False
     shadow: Shadow = False
     hold: Hold = False
+    given: Annotated[
+        dict[bodies.MonitorName, bodies.GivenValue],
+        doc("constants and topics that are given to this monitor", max_length=100),
+    ] = {}
 
 
 @rest("operator", of=MONITORS)

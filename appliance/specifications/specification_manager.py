@@ -371,6 +371,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             request.force,
             request.shadow,
             request.hold,
+            {request.name: request.given} if request.given else {},
         )
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:

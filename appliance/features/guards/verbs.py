@@ -269,10 +269,9 @@ def set_values(
     constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
     if in_text:
         changed = with_values(text, in_text)
-        order = admin.MonitorLoad(
-            {row.file: changed}, note=described(changed), shadow=row.shadow, hold=hold,
-            given={name: constants} if constants else {},
-        )  # fmt: skip
+        order = admin.MonitorReplace(
+            name, changed, note=described(changed), shadow=row.shadow, hold=hold, given=constants
+        )
         _say_changed(appliance, appliance.ask_or_exit(order))
         write_specification(appliance, loaded, row, changed)
     elif constants:

@@ -18,7 +18,8 @@ DEADMAN = (ROOT / "monitors/guards/deadman.rv").read_text(encoding="utf-8")
 WAITS = {
     "policy load": ("policy enforce",),  # `policy grant --load` only adds a right
     "policy reload": ("policy reload",),
-    "monitor load": ("monitor load", "guard set"),
+    "monitor load": ("monitor load",),
+    "monitor replace": ("guard set",),
     "monitor reload": ("monitor reload",),
     "monitor switch": ("monitor enable",),
     "monitor shadow": ("monitor enforce", "guard enforce"),
@@ -43,8 +44,7 @@ AT_ONCE = {
     "policy confirm": _NO_MOTION,
     "monitor confirm": _NO_MOTION,
     "guard test": "it is rejected unless the robot stands still",
-    "monitor replace": "a client of REST gives it: `monitor load` is the verb",
-    "guard set": "a client of REST gives it: the verb `guard set` gives `monitor load` and `monitor set`",
+    "guard set": "a client of REST gives it: the verb `guard set` gives `monitor replace` and `monitor set`",
     "monitor remove": _ENDS,
     "monitor resume": _ENDS,
     "monitor try": _READS,

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.base.withdrawal import WithdrawnError, awaited
@@ -588,3 +589,13 @@ async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> No
     assert (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed
     assert again.switches.enabled("a") and again.until("a", of=True) is None
     assert not (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed
+
+
+async def test_a_file_that_only_the_folder_may_name_is_replaced_by_its_monitor(desk: Desk) -> None:
+    (desk.folder / "größe.rv").write_text(CAP)
+    monitors = await desk.monitors()
+    order = admin.MonitorReplace("cap", CAP.replace("said", "heard"), given={"cap.speed": 0.5})
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.replace(order, "eve")
+    done = await monitors.replace(msgspec.structs.replace(order, given={"speed": 0.5}), "eve")
+    assert (done.changed, monitors.givens.said) == (["größe.rv"], {"cap": {"speed": 0.5}})

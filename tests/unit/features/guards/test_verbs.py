@@ -261,8 +261,8 @@ def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
     robot = Robot(tmp_path, FENCE, shadow=True)
     run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
     [load] = robot.orders  # one change of both, so that none of them is in force without the other
-    assert (load.shadow, "\n    polygon = 0,0 1,0 1,1;\n" in load.files["fence.rv"]) == (True, True)
-    assert load.given == {"fence": {"margin": "0.5"}}
+    assert (load.name, load.shadow, load.given) == ("fence", True, {"margin": "0.5"})
+    assert "\n    polygon = 0,0 1,0 1,1;\n" in load.text
     robot.orders.clear()
     for values in (["polygon=0,0 1,0 1,1", "margin=99"], ["nothing=1"], ["margin"]):
         with pytest.raises(GuardError):
