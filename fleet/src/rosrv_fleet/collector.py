@@ -44,7 +44,7 @@ _DAYS = """
         WHERE inhparent = 'record'::regclass
     ) AS known WHERE day < %s ORDER BY day
 """  # a partition without segments is left if none of a day could be indexed
-_UNREADABLE = (OSError, EOFError, ValueError, zlib.error)
+_UNREADABLE = (OSError, ValueError, zlib.error)
 _log = structlog.get_logger()
 
 

@@ -19,16 +19,18 @@ from starlette.requests import ClientDisconnect
 
 from appliance.base import clock
 from appliance.formats.receipts import SegmentReceipt
-from appliance.formats.segments import SegmentError, SegmentReader, SegmentSummary
+from appliance.formats.segments import SegmentReader, SegmentSummary
 from appliance.signing.log_proof import checkpoint_hash
 from rosrv_fleet.access import certificate_of, robot_of
 from rosrv_fleet.collector import LONG_CHECKS, SHORT_CHECKS, Collector
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.quotas import OverQuotaError
-from rosrv_fleet.segment_store import NotStorableError, SegmentPlace, StoreFullError
+from rosrv_fleet.segment_store import NotStorableError, SegmentPlace, StoreFullError, read_header
 from rosrv_fleet.workers import OutOfTimeError, processor_time
 
 # Verify an upload within a limit of processor time. Runs in a worker.
+
+_MOST_PADDING = 64 << 10  # bytes that gzip may add; each later reader of the segment also pays for padding
 
 
 class SegmentVerdict(NamedTuple):
@@ -51,11 +53,15 @@ def check_segment(upload: Path, keys: Collection[bytes], most_bytes: int, second
     with gzip.open(upload) as file:
         try:
             with processor_time(seconds):
-                summary = SegmentReader(file, keys, most_bytes).summary()
+                reader = SegmentReader(file, keys, most_bytes)
+                read_header(upload)
+                summary = reader.summary()
         except OutOfTimeError as error:
             reason, late = str(error), True
-        except (SegmentError, EOFError, zlib.error, gzip.BadGzipFile) as error:
+        except (ValueError, EOFError, zlib.error, gzip.BadGzipFile) as error:
             reason = str(error)
+        if summary is not None and upload.stat().st_size > file.tell() + _MOST_PADDING:
+            summary, reason = None, "it is larger compressed than uncompressed"
         return SegmentVerdict(summary, reason, late, file.tell(), time.process_time() - begun)
 
 

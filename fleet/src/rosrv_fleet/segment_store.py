@@ -21,7 +21,6 @@ A marker, an empty file KIND/ROBOT/LOG~NUMBER~NAME, states a fact about a segmen
 
 import contextlib
 import errno
-import gzip
 import itertools
 import os
 import re
@@ -40,7 +39,7 @@ import msgspec
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
 from appliance.base.atomic_files import write_whole
-from appliance.formats.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
+from appliance.formats.segments import SegmentHeader, SegmentSummary
 from rosrv_fleet.robots import make_folder
 
 # Read the small files of the data folder. A damaged one is an `OSError` with its path, like an unreadable one.
@@ -69,7 +68,8 @@ _MAX_BUCKETS = 10_000
 _MAX_FORKS = 16
 _LARGE_BYTES = 4 << 20
 _KINDS = ("pending", "large", "damaged", "gaps", "forks")
-_DAMAGED = (gzip.BadGzipFile, EOFError, zlib.error, ValueError)
+_HEADER_BYTES = 64 << 10  # a header has less than 2 KiB
+_DAMAGED = (zlib.error, ValueError)
 _LOG = re.compile("[0-9a-f]{32}")
 _FILE = re.compile(r"(\d{18})-([0-9a-f]{64})\.ndjson\.gz")
 _MARK = re.compile(r"([0-9a-f]{32})~(\d{18})~([0-9a-f]{64})")
@@ -101,6 +101,20 @@ class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     @property
     def number(self) -> int:
         return self.ends[0].end.number
+
+
+def read_header(file: Path) -> SegmentHeader:
+    """Return the header of a compressed segment. Raise `OSError`, `zlib.error` or `ValueError` if it is unreadable.
+
+    Only the file's beginning is read: a robot chooses how its segments are compressed, and millions of empty members
+    before the content would take the server's time.
+    """
+    with file.open("rb") as packed:
+        beginning = zlib.decompressobj(wbits=31).decompress(packed.read(_HEADER_BYTES), _HEADER_BYTES)
+    line, end, _records = beginning.partition(b"\n")
+    if not end:
+        raise ValueError("its header is not at the beginning")
+    return msgspec.json.decode(line, type=SegmentHeader)
 
 
 class SegmentPlace(NamedTuple):
@@ -178,9 +192,8 @@ class SegmentStore:
         return self.path(place).exists() and self._readable(place) is not None
 
     def header(self, place: SegmentPlace) -> SegmentHeader:
-        """Return a segment's header. Raise `OSError`, `EOFError`, `zlib.error` or `ValueError` if it is unreadable."""
-        with gzip.open(self.path(place)) as file:
-            return msgspec.json.decode(file.readline(LONGEST_LINE), type=SegmentHeader)
+        """Return a segment's header. Raise `OSError`, `zlib.error` or `ValueError` if it is unreadable."""
+        return read_header(self.path(place))
 
     def _readable(self, place: SegmentPlace) -> SegmentHeader | None:
         try:
@@ -424,8 +437,7 @@ class SegmentStore:
         """Remove the segments at the beginning of a log that arrived before a time (ns), and return their number.
 
         Segments dated in the future are removed with those after them. A segment that is not in the index yet stays
-        with all later ones, and so does the last segment of a log. Also raise `EOFError`, `zlib.error` and
-        `ValueError`.
+        with all later ones, and so does the last segment of a log. Also raise `zlib.error` and `ValueError`.
         """
         with self._lock(robot):
             note = self.removal(robot, log)

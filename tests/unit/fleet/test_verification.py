@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet.enrolment import Robot
-from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.push_routes import check_segment
+from rosrv_fleet.segment_store import SegmentPlace, SegmentStore, read_header
 from rosrv_fleet.verification import LogProof, prove
 
-from appliance.formats.segments import write_segment
+from appliance.formats.segments import SegmentSummary, write_segment
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
 
@@ -126,3 +127,52 @@ def test_an_earlier_log_that_is_no_longer_stored_is_a_loss(
     shutil.rmtree(store.path(places[0]).parent.parent)
     assert first in proven()
     assert len(proven()[first]) == 1
+
+
+_EMPTY = gzip.compress(b"", 1)
+
+
+@pytest.mark.parametrize(
+    ("packed", "reason"),
+    [
+        (lambda header, rest: gzip.compress(header + rest), ""),
+        (lambda header, rest: gzip.compress(header) + _EMPTY * 1000 + gzip.compress(rest), ""),
+        (lambda header, rest: _EMPTY + gzip.compress(header + rest), "not at the beginning"),
+        (lambda header, rest: gzip.compress(header[:9]) + gzip.compress(header[9:] + rest), "not at the beg"),
+        (
+            lambda header, rest: gzip.compress(header) + _EMPTY * 5000 + gzip.compress(rest),
+            "larger compressed",
+        ),
+        (lambda header, rest: gzip.compress(header + rest) + _EMPTY * 5000, "larger compressed"),
+        (lambda header, rest: gzip.compress(header + rest) + bytes(100_000), "larger compressed"),
+    ],
+    ids=["plain", "padded", "empty first", "divided header", "empty later", "empty last", "zeros last"],
+)
+def test_what_is_stored_costs_its_readers_no_more_than_its_content(
+    packed: Callable[[bytes, bytes], bytes],
+    reason: str,
+    store: SegmentStore,
+    key: Ed25519PrivateKey,
+    tmp_path: Path,
+) -> None:
+    """A compromised robot compresses as it likes, and the collector's main process reads the stored headers."""
+    place, upload = _places(store)[0], tmp_path / "upload"
+    header, end, rest = gzip.decompress(store.path(place).read_bytes()).partition(b"\n")
+    upload.write_bytes(packed(header + end, rest))
+    verdict = check_segment(upload, (key.public_key().public_bytes_raw(),), 1 << 20, 60)
+    assert (reason in verdict.reason, verdict.summary is None) == (True, bool(reason))
+    if not reason:
+        assert read_header(upload) == store.header(place)
+
+
+def test_a_stored_segment_whose_header_comes_late_is_asked_for_again(
+    store: SegmentStore, tmp_path: Path
+) -> None:
+    """An earlier version stored it. Its header is not searched for: 200,000 empty members take a second."""
+    place, upload = _places(store)[0], tmp_path / "upload"
+    upload.write_bytes(store.path(place).read_bytes())
+    summary = SegmentSummary(place.name, store.header(place), 0, 0)
+    store.path(place).write_bytes(_EMPTY + upload.read_bytes())
+    assert (store.has(place), store.headers([place])) == (False, [])
+    store.keep("arm1", upload, summary, 1)
+    assert (store.has(place), store.headers([place])) == (True, [summary.header])
