@@ -201,6 +201,8 @@ class Isolation:
         self._forwarding = _IpForwarding(host)
         self._disturbed = DisturbedConnections(host, self.namespace, settings.link)
         self._protection = ""  # the rules of `rosrv protect` on this machine
+        self.unprotected = ""  # why they are not in force again, after another program removed them
+        self._missing: list[str] = []  # rules that were missing, until `put_rules_back` has returned them
         self._lock: int | None = None
 
     def up(self) -> None:
@@ -226,6 +228,8 @@ class Isolation:
             return
         with self._turn:
             rules, self._rules = self._rules, ()
+            self._protection = self.unprotected = ""
+            self._missing.clear()
         try:
             self._close_master()
             self._clear_leftovers()
@@ -350,22 +354,38 @@ class Isolation:
     def put_rules_back(self) -> list[str]:
         """Install the rules again if the kernel lacks some; return the purposes of these. Raises `NetworkError`.
 
-        If those of `rosrv protect` went with them, no operator meant that: they come back as well.
+        If those of `rosrv protect` went with them, no operator meant that: they come back as well. While they cannot,
+        `unprotected` has the reason, and each call tries again. After an error, the next call does what this one left.
         """
         with self._turn:
-            missing = [rule.purpose for rule in self.rules() if not rule.in_force]
-            if missing:
+            absent = [rule.purpose for rule in self.rules() if not rule.in_force]
+            self._missing += [purpose for purpose in absent if purpose not in self._missing]
+            if absent:
                 self.removed_at = clock.now()
                 self._put(self._wanted())
             protection = self._host.run(close_ports.applied) if self._rules else ""
-            if missing and self._protection and not protection:
-                run_nft(self._host, self._protection)
-                missing.append("rosrv protect")
+            if self._protection and not protection and (self._missing or self.unprotected):
+                self._protect_again()
             else:
-                self._protection = protection
-        if missing:
-            self._forget_tunnels()
+                self._protection, self.unprotected = protection, ""
+            if self._missing:
+                self._forget_tunnels()
+            missing, self._missing = self._missing, []
         return missing
+
+    def _protect_again(self) -> None:
+        try:
+            run_nft(self._host, self._protection)
+        except NetworkError as error:
+            if not self.unprotected:
+                self._missing.append("rosrv protect (NOT in force again)")
+            self.unprotected = (
+                f"another program removed the rules of `rosrv protect`, and they cannot be installed again: {error}."
+                " Other machines can reach the nodes of this one: apply them again (rosrv protect … --apply)"
+            )
+        else:
+            self._missing.append("rosrv protect")
+            self.unprotected = ""
 
     def remember_connections(self) -> None:
         """Note the connections that exist while the rules are in force; call this each second."""

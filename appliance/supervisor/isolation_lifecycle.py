@@ -94,6 +94,11 @@ class NoIsolation:
     trusted_machine: tuple[str, ...] = ()  # addresses of the machine; foreign packets with them are dropped
     lapse = ""  # why the robot's own programs may have started without the appliance
 
+    @property
+    def unprotected(self) -> str:
+        """Return why the rules of `rosrv protect`, which another program removed, are not in force again, or ""."""
+        return ""
+
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
         yield
@@ -568,13 +573,18 @@ class NetnsIsolation(ContainerIsolation):
     def endpoint(self) -> PublicAddress:
         return self._isolation.endpoint()
 
+    @property
+    def unprotected(self) -> str:
+        return self._isolation.unprotected
+
     def watch_rules(self) -> list[RuleWatch]:
         return [self._isolation.watch_rules(), *super().watch_rules()]
 
     def restore(self) -> RestoredRules:
         there = self._isolation.put_rules_back()
-        here, at = super().restore()
-        return RestoredRules([*there, *here], self._isolation.installed_at if there and not here else at)
+        self._found += there  # for the next call, if this one fails
+        found = super().restore()
+        return found._replace(at=self._isolation.installed_at) if there and there == found.rules else found
 
     def remember_connections(self) -> None:
         self._isolation.remember_connections()

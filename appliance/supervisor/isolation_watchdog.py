@@ -77,8 +77,9 @@ class IsolationWatchdog:
 
     def _reported(self, report: FirewallState) -> messages.FirewallReported:
         at, removed = self._removed
-        shown = removed if clock.now() - at < REMOVED_SECONDS else None
-        report = msgspec.structs.replace(report, removed=shown)
+        recent = removed if clock.now() - at < REMOVED_SECONDS else ""
+        shown = "; ".join(filter(None, (self.isolation.unprotected, recent)))
+        report = msgspec.structs.replace(report, removed=shown or None)
         self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
         return self._report
 
@@ -256,6 +257,10 @@ class IsolationWatchdog:
         if missing:
             at, by = changes[0] if changes else (began, "")
             self._begin(self._restored(missing, by, self._intact_at - at, reported=bool(changes)))
+            if (
+                self.isolation.unprotected
+            ):  # the failure may have been a short one: do not wait for the regular check
+                asyncio.get_running_loop().call_later(_REMEMBER_SECONDS, self._changed.set)
 
     def _begin(self, work: Coroutine[None, None, None]) -> None:
         """End connections while the rules are watched, or the next removal would wait for that."""

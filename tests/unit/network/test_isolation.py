@@ -1,9 +1,21 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from appliance.network.firewall.firewall_rules import HOOKS, Chain, Family, PacketVerdict, PortRange
-from appliance.network.isolation import IsolationSettings, LinkAddresses, isolation_rules
+from appliance.network import close_ports, isolation
+from appliance.network.firewall.backend import RuleCounter
+from appliance.network.firewall.firewall_rules import (
+    HOOKS,
+    Chain,
+    Family,
+    PacketRule,
+    PacketVerdict,
+    PortRange,
+)
+from appliance.network.firewall.nft import NftBackend
+from appliance.network.isolation import Isolation, IsolationSettings, LinkAddresses, isolation_rules
+from appliance.network.namespaces import Namespace, NetworkError
 
 ENDS: dict[Family, LinkAddresses] = {
     4: LinkAddresses("10.111.0.0/30", "10.111.0.1", "10.111.0.2"),
@@ -82,3 +94,97 @@ def test_a_port_is_needed() -> None:
 
 def test_the_interface_name_fits() -> None:
     assert len(IsolationSettings(ports=SETTINGS.ports, name="a-rather-long-name").link) <= 15
+
+
+_OPEN = "rosrv protect (NOT in force again)"
+
+
+class Kernel:
+    """The rules of the appliance and of `rosrv protect`, as far as `put_rules_back` sees them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rules: tuple[PacketRule, ...] = ()
+        self.protection = "table inet rosrv_protect {}"
+        self.failing = ""  # the step that fails
+        self.isolation = Isolation(Namespace.own(), SETTINGS)
+        for owner, name, step in (
+            (NftBackend, "install", lambda _backend, rules: self._set(rules)),
+            (NftBackend, "counters", lambda _backend: tuple(map(self._counter, self.rules))),
+            (Namespace, "run", lambda _namespace, work: work()),
+            (close_ports, "applied", lambda: self.protection),
+            (isolation, "run_nft", lambda _namespace, text: setattr(self, "protection", text)),
+            (isolation, "forget_tracked", lambda _namespace, _ports: 0),
+        ):
+            monkeypatch.setattr(owner, name, self._step(name, step))
+        self.isolation._put(isolation_rules(SETTINGS, ENDS, ()))
+        self.isolation.ends = ENDS
+        assert self.isolation.put_rules_back() == []
+
+    def _step(self, name: str, step: Callable[..., object]) -> Callable[..., object]:
+        def taken(*given: object) -> object:
+            if name == self.failing:
+                raise NetworkError(f"{name} fails")
+            return step(*given)
+
+        return taken
+
+    def _set(self, rules: tuple[PacketRule, ...]) -> None:
+        self.rules = rules
+
+    def _counter(self, rule: PacketRule) -> RuleCounter:
+        return RuleCounter(rule.chain.value, None, rule.purpose, 0, 0)
+
+    def flush(self) -> None:
+        self.rules, self.protection = (), ""
+
+    def restored(self) -> list[str]:
+        try:
+            return self.isolation.put_rules_back()
+        except NetworkError:
+            return []
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
+    return Kernel(monkeypatch)
+
+
+@pytest.mark.parametrize("step", ["", "counters", "install", "applied", "run_nft", "forget_tracked"])
+@pytest.mark.parametrize("failures", [1, 3])
+def test_a_step_of_the_restoration_that_fails_for_a_time_loses_nothing(
+    step: str, failures: int, kernel: Kernel
+) -> None:
+    kernel.flush()
+    kernel.failing = step
+    told = [kernel.restored() for _call in range(failures)]
+    kernel.failing = ""
+    told.append(kernel.restored())
+    assert (bool(kernel.rules), bool(kernel.protection)) == (True, True)
+    rules = [rule.purpose for rule in kernel.isolation._wanted()]
+    told_once = [purpose for one in told for purpose in one if purpose != _OPEN]
+    assert sorted(told_once) == sorted([*rules, "rosrv protect"])
+    assert (kernel.restored(), kernel.isolation.unprotected) == ([], "")
+
+
+def test_closed_ports_that_cannot_be_closed_again_are_reported_until_they_are(kernel: Kernel) -> None:
+    """The control group of a rule is gone: the operator applies other rules. No call says that all is well before."""
+    kernel.flush()
+    kernel.failing = "run_nft"
+    assert _OPEN in kernel.restored()
+    for _minute in range(3):
+        assert kernel.restored() == []
+        assert "run_nft fails" in kernel.isolation.unprotected
+    kernel.protection = "other rules"
+    assert (kernel.restored(), kernel.isolation.unprotected) == ([], "")
+    kernel.failing = ""
+    kernel.flush()
+    assert "rosrv protect" in kernel.restored()
+    assert kernel.protection == "other rules"
+
+
+def test_closed_ports_that_an_operator_opened_stay_open(kernel: Kernel) -> None:
+    kernel.protection = ""
+    assert kernel.restored() == []
+    kernel.flush()
+    assert "rosrv protect" not in kernel.restored()
+    assert (kernel.protection, kernel.isolation.unprotected) == ("", "")

@@ -218,15 +218,25 @@ class Flushed(NoIsolation):
         self.heard = heard
         self.missing: list[list[str]] = []
         self.broken: list[Exception] = []
+        self.open_since: list[
+            float
+        ] = []  # the restorations at which the closed ports of the machine were open
+        self.open_ports = ""
         self.ended_at: list[float] = []
         self.remembered = 0
 
     def watch_rules(self) -> list[RuleWatch]:
         return [RuleWatch(self.heard, frozenset({"rosrv"}))]
 
+    @property
+    def unprotected(self) -> str:
+        return self.open_ports
+
     def restore(self) -> RestoredRules:
         if self.broken:
             raise self.broken.pop()
+        if self.open_ports:
+            self.open_since.append(round(clock.now(), 1))
         return RestoredRules(self.missing.pop() if self.missing else [], clock.now())
 
     def remember_connections(self) -> None:
@@ -332,3 +342,34 @@ async def test_a_regular_check_restores_what_the_kernel_does_not_report(
     (restored,) = [one for one in told if isinstance(one, RulesRestored)]
     assert not restored.reported
     assert restored.seconds == pytest.approx(60, abs=0.2)
+
+
+@pytest.mark.usefixtures("guard_in_loop")
+async def test_open_ports_of_the_machine_are_an_alarm_until_they_are_closed_again(
+    kernel: tuple[Flushed, Callable[[str], None]],
+) -> None:
+    """The appliance goes on serving; it tries again soon, and then with each regular check."""
+    isolation, change = kernel
+    told: list[Message] = []
+    watchdog = IsolationWatchdog(isolation, told.append)
+    watching = asyncio.create_task(watchdog.watch())
+    await asyncio.sleep(0.5)
+    isolation.open_ports, began = "apply them again", clock.now()
+    change("rosrv")
+    await asyncio.sleep(3)
+    watching.cancel()
+    assert isolation.open_since == pytest.approx([began, began + 1], abs=0.2)
+
+    def alarm() -> str:
+        (report,) = [one.report for one in watchdog.news() if isinstance(one, FirewallReported)]
+        return str(report.removed)
+
+    assert alarm().startswith("apply them again; nft removed 1 rule")
+    for _minute in range(3):
+        await watchdog.look()
+        assert alarm().startswith("apply them again; nft removed 1 rule")
+    assert len(isolation.open_since) == 5
+    isolation.open_ports = ""
+    await watchdog.look()
+    assert alarm().startswith("nft removed 1 rule")
+    assert not any(isinstance(one, ProbeFailed) for one in told)
