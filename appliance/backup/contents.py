@@ -14,6 +14,8 @@ _LONGEST_NAME = 100  # bytes that fit into a tar header without an extension
 _DATABASES = "control/"  # the only part with databases
 # Files that exist only while the appliance runs, or that the next start makes again.
 _PASSING = ("-wal", "-shm", ".lock", ".new", ".sock", ".pid", "strongswan.conf")
+# The same, but earlier versions backed them up, so `restore` takes them.
+_PASSING_NOW = ("fleet/segment.gz", "control/compiled/")
 # Logs of ROS, recorded messages, and what the robot knows of the fleet's signatures: older knowledge would weaken it.
 _LEFT_OUT = {"rosmaster", "rosout", "recordings", "bundles"}
 KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT
@@ -26,6 +28,11 @@ class BackupError(Exception):
 
 def is_passing(name: str) -> bool:
     return name.endswith(_PASSING)
+
+
+def comes_and_goes(name: str) -> bool:
+    """Return whether the running appliance may remove the file at any time, so that a backup leaves it out."""
+    return is_passing(name) or name.startswith(_PASSING_NOW)
 
 
 def is_database(name: str) -> bool:

@@ -30,8 +30,8 @@ from appliance.backup.contents import (
     LARGEST,
     MAX_FILES,
     BackupError,
+    comes_and_goes,
     is_database,
-    is_passing,
     trouble_with,
 )
 from appliance.base import clock
@@ -182,8 +182,9 @@ def _names(state: Path, part: str) -> Iterator[str]:
     for folder, folders, names in os.walk(state / part, onerror=_raise):
         folders.sort()
         for name in sorted(names):  # `state.ahead` comes before `state.db`
-            if not is_passing(name):
-                yield (Path(folder) / name).relative_to(state).as_posix()
+            kept = (Path(folder) / name).relative_to(state).as_posix()
+            if not comes_and_goes(kept):
+                yield kept
 
 
 def opened(state: Path, name: str) -> int | None:

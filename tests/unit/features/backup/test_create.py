@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from appliance.audit.log.log import AuditLog
 from appliance.audit.proof.verification import verify
 from appliance.backup import create as backup
-from appliance.backup.contents import BackupError
+from appliance.backup.contents import BackupError, is_passing
 from appliance.backup.create import back_up, copy_database
 from appliance.base.clock import wall_ns
 from appliance.features.backup.restore import restore
@@ -97,6 +97,42 @@ def test_a_key_pinned_during_the_backup_is_included(
     assert back_up(state, file)[0] == "control/audit.db"
     restore(file, tmp_path / "other")
     assert verify(tmp_path / "other" / "control" / "audit.db", signer=tmp_path / "other" / "signer").ok
+
+
+_COMES_AND_GOES = ("fleet/segment.gz", f"control/compiled/{'a' * 64}", f"fleet/position.json.{'b' * 8}.new")
+
+
+@pytest.mark.parametrize("lost", [*_COMES_AND_GOES, "signer/audit.key", "control/state.ahead"])
+def test_only_what_comes_and_goes_may_be_missing_when_its_turn_comes(
+    lost: str, state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (state / lost).parent.mkdir(exist_ok=True)
+    (state / lost).touch()
+    names = backup._names
+
+    def lose(root: Path, part: str) -> Iterator[str]:
+        yield from list(names(root, part))
+        if lost.startswith(f"{part}/"):
+            (root / lost).unlink()
+
+    monkeypatch.setattr(backup, "_names", lose)
+    if lost in _COMES_AND_GOES:
+        assert lost not in back_up(state, tmp_path / "backup.tar.gz")
+        return
+    with pytest.raises(BackupError, match=f"No such file.*{Path(lost).name}"):
+        back_up(state, tmp_path / "backup.tar.gz")
+
+
+def test_a_backup_of_an_earlier_version_may_contain_what_comes_and_goes(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in _COMES_AND_GOES[:2]:
+        (state / name).parent.mkdir()
+        (state / name).write_text("x")
+    monkeypatch.setattr(backup, "comes_and_goes", is_passing)
+    assert set(_COMES_AND_GOES[:2]) <= set(back_up(state, tmp_path / "backup.tar.gz"))
+    restore(tmp_path / "backup.tar.gz", tmp_path / "other")
+    assert (tmp_path / "other" / _COMES_AND_GOES[0]).read_text() == "x"
 
 
 def test_a_backup_needs_no_ros(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
