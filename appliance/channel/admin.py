@@ -68,7 +68,11 @@ class AdminRequest(msgspec.Struct, Generic[A_co], frozen=True, tag_field="verb",
 
 
 class WaitingRequest(AdminRequest[A_co], Generic[A_co], frozen=True):
-    """A request that waits for another process, such as charon, or for a topic's messages: others go past it."""
+    """A request that waits for another process, such as charon, or for a topic's messages: others go past it.
+
+    The worker of REST lets other requests go past every order, so only questions need this class, and orders that are
+    refused rather than served in turn when many wait.
+    """
 
 
 def verb_of(request: AdminRequest[object]) -> str:

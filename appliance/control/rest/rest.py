@@ -4,7 +4,8 @@ A flooded or compromised api cannot block RVMaster:
 
 1. At most `_MAX_WAITING` requests wait; the rest are answered `busy` at once. Between two requests, the event loop
    serves nodes.
-2. Requests that wait for another process (`WaitingRequest`, at most `_MAX_SLOW`) do not delay other requests.
+2. Questions that wait for another process (`WaitingRequest`) and orders, which wait for the audit log and may wait for
+   relays or the compiler, do not delay other requests, at most `_MAX_SLOW`. An order beyond these is served in turn.
 3. The link ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
 5. A request needs a token whose role allows it, and a change also the client's own HTTP request, with a proof if the
@@ -192,7 +193,8 @@ class RestLink:
     async def _work(self, channel: Channel | None) -> None:
         while self._waiting and channel is self._link.channel:
             made = self._waiting.popleft()
-            if isinstance(made.request, WaitingRequest):
+            in_turn = type(made.request) not in ORDERS or len(self._slow) >= _MAX_SLOW
+            if isinstance(made.request, WaitingRequest) or not in_turn:
                 self._begin(channel, made)
             else:
                 await self._serve(channel, made)

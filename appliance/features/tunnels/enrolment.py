@@ -418,6 +418,7 @@ class HostEnrolment(TunnelHosts):
         self._store.save_setting(BUNDLED_HOSTS, self._table.declared.bundled)
         self._keep_text()
         after = {row.name for row in self._table.admitted()}
+        now, diff = self._table.declared.in_force, self._table.declared.changed_lines(earlier)
         self._table.changed()
         taken = 0
         if before != after:
@@ -431,7 +432,6 @@ class HostEnrolment(TunnelHosts):
         if self._tunnels.addresses != meant:  # `start` opened the first tunnel and blocked clear text
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
-        now = self._table.declared.in_force
         if (now, before, taken) != (earlier, after, 0):
             self._trail.happened(
                 "hosts reloaded",
@@ -441,7 +441,7 @@ class HostEnrolment(TunnelHosts):
                 closed=sorted(before - after),
                 sha256=fingerprint(now),
                 earlier_sha256=fingerprint(earlier),
-                diff=self._table.declared.changed_lines(earlier),
+                diff=diff,
                 taken_back=taken,
                 divergence=divergence,
                 who=who,

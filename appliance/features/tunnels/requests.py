@@ -190,12 +190,12 @@ class HostList(AdminRequest[tunnel_answers.Hosts], frozen=True, tag="host list")
 
 
 @rest("viewer", machine_only=_KIT)
-class HostEndpoint(AdminRequest[tunnel_answers.Endpoint], frozen=True, tag="host endpoint"):
+class HostEndpoint(WaitingRequest[tunnel_answers.Endpoint], frozen=True, tag="host endpoint"):
     """The address at which hosts reach the appliance unless one is given: `endpoint`, with the `reason`."""
 
 
 @rest("operator")
-class HostKit(AdminRequest[tunnel_answers.KitParts], frozen=True, tag="host kit"):
+class HostKit(WaitingRequest[tunnel_answers.KitParts], frozen=True, tag="host kit"):
     """The parts of an enrolled host's kit, without its private key."""
 
     name: str
@@ -241,12 +241,12 @@ class HostsReload(AdminRequest[tunnel_answers.Reloaded], frozen=True, tag="hosts
 
 
 @rest(None)
-class RevocationsWanted(AdminRequest[tunnel_answers.RevocationList], frozen=True, tag="host revocations"):
+class RevocationsWanted(WaitingRequest[tunnel_answers.RevocationList], frozen=True, tag="host revocations"):
     """The authority's signed list of revoked certificates, in PEM."""
 
 
 @rest(None)
-class AuthorityWanted(AdminRequest[tunnel_answers.AuthorityCertificate], frozen=True, tag="host authority"):
+class AuthorityWanted(WaitingRequest[tunnel_answers.AuthorityCertificate], frozen=True, tag="host authority"):
     """The authority's certificate, in PEM."""
 
 

@@ -24,8 +24,9 @@ from appliance.channel.messages.api import (
     TokensStated,
     TokenUsed,
 )
-from appliance.channel.operations import AnyRequest
+from appliance.channel.operations import ORDERS, AnyRequest
 from appliance.control.rest.rest import RestLink, RestUses
+from appliance.control.rest.rest_proof import RequestAuthenticator
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.core import FakeTrail
@@ -145,6 +146,43 @@ async def test_requests_that_wait_block_no_other_requests(world: Everything, api
     assert [answer_of(one).ok for one in heard if one.number == 99] == [True]
     world.go.set()
     assert sum(answer_of(one).ok for one in (await api.until(22))[1:]) == 17
+
+
+@pytest.mark.parametrize("kind", sorted(ORDERS, key=lambda kind: kind.__name__))
+async def test_no_order_blocks_other_requests(
+    kind: type[Any], world: Everything, link: RestLink, api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Orders wait for relays, of which one may hang, for the compiler or for charon, and all for the audit log."""
+    monkeypatch.setattr(RequestAuthenticator, "asker", _is_admin)
+    world.only_slow = True
+    world.go.clear()
+    order = kind(**{field.name: None for field in msgspec.structs.fields(kind) if field.required})
+    link._on_message(RequestMade(1, order, TOKEN))
+    link._on_message(RequestMade(2, StatusWanted(), TOKEN))
+    assert [one.number for one in (await api.until(2))[1:]] == [2]
+    world.go.set()
+    assert [one.number for one in (await api.until(3))[2:]] == [1]
+
+
+async def _is_admin(_authenticator: RequestAuthenticator, _made: RequestMade) -> str:
+    return "w"
+
+
+async def test_an_order_is_not_refused_because_many_requests_wait(world: Everything, api: Api) -> None:
+    """Viewers look at topics for as long as they like, and an operator blocks a host."""
+    world.only_slow = True
+    world.go.clear()
+    for number in range(16):
+        api.channel.send(RequestMade(number, MonitorTry(MonitorLoad({f"{number}.rv": ""})), TOKEN))
+    for number in range(16, 20):
+        api.channel.send(loading(number, str(number)))
+    api.channel.send(RequestMade(99, StatusWanted(), TOKEN))
+    await api.until(1)
+    world.go.set()
+    heard = (await api.until(22))[1:]
+    assert all(answer_of(one).ok for one in heard)
+    orders = [request.text for request, _who in world.asked if isinstance(request, PolicyLoad)]
+    assert orders == ["16", "17", "18", "19"]
 
 
 async def test_the_pin_of_the_api_is_passed_on(link: RestLink, api: Api, pins: list[str]) -> None:
