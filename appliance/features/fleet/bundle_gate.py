@@ -327,17 +327,24 @@ class BundleGate:
             refused and (refused.path, refused.sha256),
         ):
             return
-        self._waits, self._for_order = "", None
+        if (
+            ordered or self._for_order != offered
+        ):  # else an operator may order it also while it is checked again
+            self._waits, self._for_order = "", None
         if self._unconfirmed:
-            self._waits = _UNCONFIRMED_CHANGE
+            self._waits, self._for_order = _UNCONFIRMED_CHANGE, None
             return
         try:
             parse_declared(contents.hosts, IN_BUNDLE)
             await self._policies.attempt(contents.policy, contents.policy_signature, _cases(contents))
             held = await self._monitors.held_by_bundle(_sources(contents))
         except _REFUSALS as error:
+            self._waits, self._for_order = "", None
             self._refuse(offered.path, offered.sha256, str(error))
             return
+        if self._ordered == offered:
+            return  # meanwhile: `run` tries it now
+        self._waits, self._for_order = "", None
         if held:
             self._waits = f"{offered.path} waits until no message passes for a minute: {held[0]}"
             return

@@ -5,7 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
+from appliance.control.errors import PolicyRefusedError
 from tests.unit.features.fleet.bundle_robot import BEFORE, FLEET, OF_OPERATOR, OFFER, BundleRobot
 
 pytestmark = pytest.mark.anyio
@@ -139,3 +141,56 @@ async def test_a_bundle_that_would_hold_moving_topics_does_not_wait_for_an_order
         await asyncio.sleep(2)
         assert not robot.state.for_order
         assert "no message passes for a minute" in robot.state.trouble
+
+
+@pytest.mark.parametrize("again", [True, False], ids=["the same bundle", "another bundle"])
+async def test_the_bundle_that_waits_can_be_ordered_while_a_poll_offers(
+    again: bool, ordered: BundleRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The check of a large bundle takes long, and each poll offers it again."""
+    checked = asyncio.Event()
+
+    async def check(*_content: object) -> None:
+        await checked.wait()
+
+    async with ordered.running():
+        ordered.poll(offered=True)
+        await asyncio.sleep(2)
+        assert ordered.state.for_order == OFFER.path
+        monkeypatch.setattr(ordered.policies, "attempt", check)
+        offer = OFFER if again else structs.replace(OFFER, path="site-a/arms/3.tar", sha256="3" * 64)
+        ordered.poller.send(offer)
+        await asyncio.sleep(2)
+        assert ordered.state.for_order == (OFFER.path if again else "")
+        assert ordered.gate.order(OFFER.path, "olga") is again
+        assert not ordered.gate.order(OFFER.path, "olga")
+        checked.set()
+        await asyncio.sleep(_CONFIRM_SECONDS + 5)
+        assert (ordered.state.in_force, ordered.state.for_order) == (
+            (OFFER.path, "") if again else ("", offer.path)
+        )
+        assert ordered.trail.events == (["bundle ordered", "bundle in force"] if again else [])
+
+
+@pytest.mark.parametrize("reason", ["unconfirmed", "refused", "held"])
+async def test_a_bundle_that_may_no_longer_be_taken_waits_for_no_order(
+    reason: str, ordered: BundleRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def refuse(*_content: object) -> None:
+        raise PolicyRefusedError([])
+
+    async with ordered.running():
+        ordered.poll(offered=True)
+        await asyncio.sleep(2)
+        assert ordered.state.for_order == OFFER.path
+        match reason:
+            case "unconfirmed":
+                ordered.policies.confirm_by = 100.0
+            case "refused":
+                monkeypatch.setattr(ordered.policies, "attempt", refuse)
+            case _:
+                ordered.monitors.would_hold = ["/cmd_vel"]
+        ordered.poll(offered=True)
+        await asyncio.sleep(2)
+        assert not ordered.state.for_order
+        assert not ordered.gate.order(OFFER.path, "olga")
