@@ -135,6 +135,11 @@ class DoorOrders:
             row = self._table.planned(request.name, request.port, request.source)
             if row.port is not None and row.port in self._core.policy.current().ports:
                 raise SenselessError(f"port {row.port} is in [Ports] range of the policy: choose another one")
+            settings = self._core.settings
+            taken = {settings.listen_address[1]: "RVMaster", settings.rosmaster_port: "the ROS master"}
+            taken |= {} if settings.api_address is None else {settings.api_address[1]: "REST"}
+            if row.port in taken:
+                raise SenselessError(f"port {row.port} is that of {taken[row.port]}: choose another one")
             problem = await self._open([*self._table.ports(), *([row.port] if row.port is not None else [])])
             if problem:
                 raise UnavailableError(problem)

@@ -1,10 +1,13 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from appliance.control.errors import SenselessError
 from appliance.features.doors.door_visits import DoorTickets, DoorVisits
 from appliance.features.doors.orders import DoorOrders
+from appliance.features.doors.requests import DoorAdd
 from appliance.policy.model import address_of
 from tests.unit.features.doors.door_site import DoorSite
 
@@ -38,3 +41,22 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
     assert [(row["host"], row["decision"]) for row in site.trail.rows] == (
         [] if decision is None else [(peer, decision)]
     )
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("port", "owner"),
+    [(11311, "RVMaster"), (11399, "the ROS master"), (8443, "REST"), (19500, "[Ports] range of the policy")],
+)
+async def test_no_door_has_a_port_of_the_appliance(port: int, owner: str, site: DoorSite) -> None:
+    """It would never listen."""
+    core = site.core
+    given = replace(core.settings, listen="0.0.0.0:11311", rosmaster_port=11399, api="0.0.0.0:8443")
+    tickets, visits = DoorTickets(core.store, core.ends), DoorVisits(core.ends, dict)
+    orders = DoorOrders(
+        replace(core, settings=given), site.table, tickets=tickets, visits=visits, processes=site.processes
+    )
+    with pytest.raises(SenselessError, match=f"port {port} is .*{re.escape(owner)}: choose another"):
+        await orders.add(DoorAdd("agent", port), "ann")
+    assert (site.asked, site.trail.rows) == ([], [])
+    assert [row.name for row in site.table.live()] == ["alice"]
