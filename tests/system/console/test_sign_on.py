@@ -116,7 +116,48 @@ def test_a_group_of_the_provider_opens_console_and_door_until_it_is_taken_away(
         expect(again.locator("[data-role]")).to_have_text("viewer")
         expect(page.get_by_text("The session has ended. Sign in again.")).to_be_visible()
         eventually(lambda: not appliance.row("door", "list")["clients"], appliance.story)
-        again.get_by_role("button", name="Sign out").click()
-        again.get_by_role("button", name="Sign in with").click()
-        sign_in(again, "alice")  # the provider asks again
-        expect(again.locator(".who-name")).to_have_text("sso:alice")
+
+
+def _sign_out(page: Page) -> None:
+    page.get_by_role("button", name="Sign out").click()
+
+
+def _leave_until_it_is_locked(page: Page) -> None:
+    page.clock.install()
+    page.reload()
+    expect(page.locator(".who-name")).to_be_visible()
+    page.clock.fast_forward("15:10")
+    expect(page.get_by_role("status").filter(has_text="Locked")).to_be_visible()
+
+
+def _leave_and_reload(page: Page) -> None:
+    page.evaluate("sessionStorage.setItem('rosrv.used', String(Date.now() - 16 * 60000))")
+    page.reload()
+    expect(page.get_by_label("Access token")).to_be_visible()
+
+
+@pytest.mark.parametrize("new_tab", [False, True], ids=["same tab", "new tab"])
+@pytest.mark.parametrize(
+    "leave", [_sign_out, _leave_until_it_is_locked, _leave_and_reload], ids=["out", "locked", "reloaded"]
+)
+@pytest.mark.usefixtures("appliance")
+def test_the_provider_asks_who_signs_in_once_a_person_has_left(
+    leave: Callable[[Page], None],
+    new_tab: bool,
+    provider: Canaille,
+    signed_in: Callable[[str], Page],
+) -> None:
+    with provider.running():
+        page = signed_in("alice")
+        expect(page.locator(".who-name")).to_have_text("sso:alice")
+        leave(page)
+        if new_tab:
+            page = page.context.new_page()
+            page.goto(f"{URL}/console")
+        page.get_by_role("button", name="Sign in with").click()
+        sign_in(page, "alice")  # fails without a question
+        expect(page.locator(".who-name")).to_have_text("sso:alice")
+        other = page.context.new_page()
+        other.goto(f"{URL}/console")
+        other.get_by_role("button", name="Sign in with").click()
+        expect(other.locator(".who-name")).to_have_text("sso:alice")  # without a question: nobody has left

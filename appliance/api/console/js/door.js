@@ -78,7 +78,7 @@ export function Door() {
     <${Brand} />
     <form class="panel" onSubmit=${submit}>
       ${notice && html`<div class="site-notice" role="note" aria-label="Site notice">${notice}</div>`}
-      ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">This page was not used for ${lasting(UNUSED / 1000)}. The work of <${Given} value=${locked.name} most=${40} /> is kept for that token; another token starts a new session.${PROVIDER && ` Sign-in with ${PROVIDER} opens the page again, without unsaved work.`}</${Notice}>`}
+      ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">This page was not used for ${lasting(UNUSED / 1000)}. The work of <${Given} value=${locked.name} most=${40} /> is kept for that token; another token starts a new session.${PROVIDER && ` Sign-in with ${PROVIDER}, which asks who you are, opens the page again, without unsaved work.`}</${Notice}>`}
       ${ended && !error && html`<${Notice} tone="warn" title=${heading} role="status">${ended}</${Notice}>`}
       <${Failure} error=${error} />
       <${Field} label="Access token" type="password" mono value=${token} set=${setToken} placeholder="rosrv_…" autofocus required

@@ -15,6 +15,8 @@ import { createStore } from "./store.js";
 const KEY = "rosrv.token";
 /** Names of people who signed in at the provider start with this. */
 export const PERSON = "sso:";
+/** Of all tabs: a person left without another signing in, so the provider must ask who signs in next. */
+export const LEFT = "rosrv.signed-out";
 const LAST_USE = "rosrv.used"; // time of the last use: a browser may unload a tab and reload it hours later
 const RANK = { viewer: 1, investigator: 1, operator: 2, admin: 3 };
 const USES = ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"];
@@ -79,8 +81,18 @@ export function end(why, heading = "Signed out") {
   session.update({ current: null, ended: why, heading, checking: false, waiting: null, locked: null });
 }
 
+/** Note that the person left: the provider asks who signs in next, in each tab. */
+export function leave() {
+  try {
+    if (stated("sign-on")) localStorage.setItem(LEFT, "yes");
+  } catch {
+    // the provider may then sign the same person in without a question
+  }
+}
+
 /** Lock the unused page: forget the token, but keep unsaved work. */
 export function lock() {
+  leave();
   const { current } = session.get();
   if (!current) return;
   clearTimeout(locking);
@@ -106,7 +118,10 @@ export async function unlocked() {
 export function kept() {
   try {
     const last = Number(sessionStorage.getItem(LAST_USE) ?? Date.now());
-    if (Date.now() - last >= UNUSED) forget();
+    if (Date.now() - last >= UNUSED) {
+      forget();
+      leave();
+    }
     return sessionStorage.getItem(KEY);
   } catch {
     return null;
@@ -122,7 +137,7 @@ export function may(role) {
 // A timer may be late (a suspended computer): input after the deadline does not extend the session.
 for (const kind of USES) {
   addEventListener(kind, () => {
-    if (session.get().current && since(used) >= UNUSED) lock();
+    if (since(used) >= UNUSED) lock();
     else if (since(used) >= 1000) use();
   }, { capture: true, passive: true });
 }

@@ -9,10 +9,9 @@ import { idOf, newToken, verifiersOf } from "./keys.js";
 import { Problem } from "./problem.js";
 import { ask } from "./rest.js";
 import { go } from "./router.js";
-import { end, open, PERSON, session, stated } from "./session.js";
+import { end, leave, LEFT, open, PERSON, session, stated } from "./session.js";
 
 const BEGUN = "rosrv.sign-on"; // the token, the state and the place of a sign-in that is not finished
-const LEFT = "rosrv.signed-out"; // the person signed out: the provider must ask who signs in next
 
 /** The provider's name; empty without one. */
 export const PROVIDER = stated("sign-on");
@@ -23,7 +22,7 @@ export const PROVIDER = stated("sign-on");
 export async function begin(keep) {
   const token = newToken();
   const verifiers = await verifiersOf(token);
-  const { body } = await ask("POST", "/v1/sso/begin", { json: { ...verifiers, again: stored(LEFT) !== null }, anonymous: true });
+  const { body } = await ask("POST", "/v1/sso/begin", { json: { ...verifiers, again: stored(LEFT, "localStorage") !== null }, anonymous: true });
   const place = location.pathname + location.search;
   try {
     sessionStorage.setItem(BEGUN, JSON.stringify({ token, state: body.state, keep, place }));
@@ -55,7 +54,7 @@ export async function complete() {
     const { state, token, keep } = begun;
     await ask("POST", "/v1/sso/complete", { json: { state, code: given.get("code"), iss: given.get("iss") ?? "" }, anonymous: true });
     const { body } = await ask("GET", "/v1/whoami", { token });
-    remove(LEFT);
+    remove(LEFT, "localStorage");
     open({ token, ...body }, keep);
   } catch (/** @type {any} */ failure) {
     end(failure.message, "Not signed in");
@@ -66,11 +65,7 @@ export async function complete() {
 export async function signOut() {
   const { current } = session.get();
   if (current?.name.startsWith(PERSON)) {
-    try {
-      sessionStorage.setItem(LEFT, "yes");
-    } catch {
-      // the provider may then sign the same person in without a question
-    }
+    leave();
     try {
       await ask("DELETE", `/v1/sso/sessions/${idOf(current.token)}`, { token: current.token, match: "*" });
     } catch (/** @type {any} */ failure) {
@@ -80,17 +75,17 @@ export async function signOut() {
   end(null);
 }
 
-function stored(/** @type {string} */ name) {
+function stored(/** @type {string} */ name, /** @type {"localStorage" | "sessionStorage"} */ where = "sessionStorage") {
   try {
-    return sessionStorage.getItem(name);
+    return window[where].getItem(name);
   } catch {
     return null;
   }
 }
 
-function remove(/** @type {string} */ name) {
+function remove(/** @type {string} */ name, /** @type {"localStorage" | "sessionStorage"} */ where = "sessionStorage") {
   try {
-    sessionStorage.removeItem(name);
+    window[where].removeItem(name);
   } catch {
     // nothing is stored
   }
