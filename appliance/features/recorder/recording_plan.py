@@ -14,6 +14,7 @@ restarts. A recording is charged to the cause of its first trigger: `ROBOT`, a h
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import without_binding
@@ -36,8 +37,8 @@ _MAX_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
 _OBSTACLE_LASTS = 60 * _SECOND
-_MAX_HOSTS = 4096  # hosts whose last recording's end is remembered
-
+_MAX_HOSTS = 4096  # hosts whose last recording's end, or failure, is remembered
+_V = TypeVar("_V")
 
 _BY_EVENT: dict[str, tuple[TriggerKind, ...]] = {
     "message dropped": ("drop",),
@@ -159,7 +160,7 @@ class RecordingPlan:
         self._limit = HourlyLimit(rules.per_hour, ())
         self._open: dict[str, tuple[str, RecordingSpan]] = {}
         self._ended: dict[str, int] = {}
-        self._obstacle = ("", -_OBSTACLE_LASTS)
+        self._obstacles: dict[str, tuple[str, int]] = {}
 
     def detail(
         self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
@@ -184,7 +185,7 @@ class RecordingPlan:
             recording_id, open_span = found
             self._open[own] = recording_id, replace(open_span, ends=open_span.prolonged(now))
             return recording_id, ""
-        why_not, since = self._obstacle
+        why_not, since = self._obstacles.get(own, ("", -_OBSTACLE_LASTS))
         if since <= now < since + _OBSTACLE_LASTS:  # not after the clock was set back
             return "", why_not
         others = [name for name, (_id, other) in self._open.items() if name != ROBOT and now <= other.ends]
@@ -220,15 +221,26 @@ class RecordingPlan:
     def closed(self, recording: Recording) -> None:
         own = recording_owner(recording.charged_to)
         self._close(own, recording.id)
-        self._ended[own] = max(recording.ended, self._ended.pop(own, 0))
-        if len(self._ended) > _MAX_HOSTS:
-            del self._ended[next(iter(self._ended))]
+        _remember(self._ended, own, max(recording.ended, self._ended.get(own, 0)))
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """End a recording that the recorder could not make. For a minute, no recording is made for this reason."""
-        self._close(recording_owner(charged_to), recording_id)
-        self._obstacle = why, now
+        """End a recording that the recorder could not make. For a minute, this owner gets no other one.
 
-    def _close(self, own: str, recording_id: str) -> None:
-        if own in self._open and self._open[own][0] == recording_id:
-            del self._open[own]
+        A recording that had already ended does not count: the recorder can make the owner's next one.
+        """
+        own = recording_owner(charged_to)
+        if self._close(own, recording_id):
+            _remember(self._obstacles, own, (why, now))
+
+    def _close(self, own: str, recording_id: str) -> bool:
+        if own not in self._open or self._open[own][0] != recording_id:
+            return False
+        del self._open[own]
+        return True
+
+
+def _remember(of_hosts: dict[str, _V], own: str, value: _V) -> None:
+    of_hosts.pop(own, None)
+    of_hosts[own] = value
+    if len(of_hosts) > _MAX_HOSTS:
+        del of_hosts[next(iter(of_hosts))]

@@ -117,6 +117,34 @@ def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict
     assert plan.detail("message changed", None, Severity.NOTICE, GUEST, NOW) == {}
 
 
+@pytest.mark.parametrize("failed", [*NAMES, None, "10.9.0.1"])
+def test_a_failed_recording_hinders_only_its_owner(
+    failed: str | None, dropped: Callable[..., dict[str, str]]
+) -> None:
+    ours = {"127.0.0.1", None}
+    for other in {*NAMES, None, "10.9.0.2"} - {failed}:
+        plan = made()
+        planned = dropped(plan, failed, NOW)
+        plan.missed(planned["charged_to"], planned["recording"], "recorder.disk is full", NOW)
+        said = dropped(plan, other, NOW + 2 * SECOND)
+        same = {failed, other} <= ours or ("10.9" in str(failed) and "10.9" in str(other))
+        assert ("not_recorded" in said) == same, other
+        assert "not_recorded" in dropped(plan, failed, NOW + 59 * SECOND)
+
+
+def test_a_report_about_a_recording_that_ended_hinders_nobody(dropped: Callable[..., dict[str, str]]) -> None:
+    """A recording that is too large ends early; triggers until control's notice still have its id."""
+    plan = made()
+    ended, late = (dropped(plan, "127.0.0.1", NOW + number)["recording"] for number in range(2))
+    assert ended == late
+    plan.closed(structs.replace(recording(10_000, charged_to=ROBOT), id=ended))
+    plan.missed(ROBOT, late, f"recording {late} had ended", NOW + SECOND)
+    following = dropped(plan, "127.0.0.1", NOW + 2 * SECOND)["recording"]
+    assert following != ended
+    plan.missed(ROBOT, late, f"recording {late} had ended", NOW + 3 * SECOND)
+    assert dropped(plan, "127.0.0.1", NOW + 4 * SECOND)["recording"] == following
+
+
 def test_a_clock_that_is_set_back_keeps_no_reason(dropped: Callable[..., dict[str, str]]) -> None:
     plan = made()
     later = NOW + 24 * HOUR
