@@ -25,9 +25,10 @@ RECORDER_DISK = QuotaRow(
     bounds=Bounds(whole=2 << 30, host=512 << 20, unknown=512 << 20, kept=512 << 20),
     at_limit="the host's oldest recording of the kind of trigger with most bytes is removed; a host starts at most six"
     " recordings an hour for each kind of trigger",
-    between="no host displaces recordings of the robot, which gets half of the whole back; two hosts besides the"
-    " robot are recorded at once",
-    counting="unknown: no rule names the host, or no host caused the recording; kept: for the robot and operators",
+    between="no host displaces recordings of the robot, of operators or of the appliance, which get half of the whole"
+    " back; two hosts besides the robot are recorded at once",
+    counting="unknown: no rule names the host, or no host caused the recording; kept: for the robot, operators and"
+    " the appliance",
     alarm="`recording removed`, `recording missed`; `detail.not_recorded` of the record",
     setting="recorder.disk (an eighth of it for one recording)",
     margin=HonestUse(

@@ -22,7 +22,13 @@ from appliance.channel import messages
 from appliance.features.recorder import recorder_link
 from appliance.features.recorder.recording import MAX_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.features.recorder.recording_answers import Recording, Trigger
-from appliance.features.recorder.recording_plan import KEPT, HourlyLimit, recording_owner, span, trigger_of
+from appliance.features.recorder.recording_plan import (
+    UNLIMITED,
+    HourlyLimit,
+    recording_owner,
+    span,
+    trigger_of,
+)
 from appliance.features.recorder.recording_store import MAX_TEMPORARY, RecordingStore
 from appliance.features.recorder.settings import RecorderRules
 
@@ -400,8 +406,8 @@ class Recorder:
 def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
     hold = progress.hold if after is None else int(after * _SECOND)
     progress.ends = max(progress.ends, min(trigger.time + hold, progress.latest))
-    if trigger.charged_to in KEPT and progress.charged_to not in KEPT:
-        progress.charged_to = trigger.charged_to  # from now on not removed in favour of a host's recording
+    if trigger.charged_to in UNLIMITED and progress.charged_to not in UNLIMITED:
+        progress.charged_to = trigger.charged_to  # from now on it does not use up the appliance's quota
     known = any(trigger.record == other.record for other in progress.triggers)
     if not known and len(progress.triggers) < MAX_TRIGGERS:
         progress.triggers.append(trigger)

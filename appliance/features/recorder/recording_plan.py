@@ -29,10 +29,12 @@ from appliance.features.recorder.recording_answers import (
 )
 from appliance.features.recorder.settings import RecorderRules
 
-KEPT = frozenset({ROBOT, OPERATORS})
+UNLIMITED = frozenset({ROBOT, OPERATORS})
+"""The owners that have no quota of the disk."""
+
+OURS = UNLIMITED | {APPLIANCE}
 """The owners whose recordings are never removed for another host's recording."""
 
-_OURS = KEPT | {APPLIANCE}
 _MAX_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
@@ -86,7 +88,7 @@ def _short(value: object) -> str:
 
 
 def recording_owner(charged_to: str) -> str:
-    return ROBOT if charged_to in _OURS else charged_to
+    return ROBOT if charged_to in OURS else charged_to
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@ garbage.
 
 1. A folder is renamed to its recording's id only when its whole content is on disk.
 2. Recordings never exceed `disk` bytes: room for the largest possible recording is made before it begins. Recordings
-   of hosts other than the robot use at most three quarters of it, and those of one host a quarter; they never replace
-   recordings of the robot or of operators. The first to be removed is the oldest of the kind of trigger that uses the
-   most bytes.
+   of hosts other than the robot use at most three quarters of it, and those of one host, or of the appliance, a
+   quarter. Hosts never replace recordings of the robot, of operators or of the appliance. The first to be removed is
+   the oldest of the kind of trigger that uses the most bytes. Nothing is removed for a recording that is then refused.
 3. The file `noted` marks a recording that is in the audit log. Other recordings are reported again.
 4. The file `lent` marks a temporary recording, which does not count in `disk`. A new one replaces the oldest of
    `MAX_TEMPORARY`, unless its reader may not have opened it yet.
@@ -18,7 +18,7 @@ garbage.
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,7 +26,7 @@ import msgspec
 import structlog
 
 from appliance.features.recorder.recording_answers import Recording
-from appliance.features.recorder.recording_plan import KEPT
+from appliance.features.recorder.recording_plan import OURS, UNLIMITED
 
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
 MAX_KEPT = 500
@@ -222,40 +222,57 @@ class RecordingStore:
         A reason without a recording means that none may be removed. If both are empty, there is space. `making` has
         the hosts of the recordings in progress.
         """
-        held = self._sizes(lambda found: found.charged_to)
-        held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})
-        guests = {name: size for name, size in held.items() if name not in KEPT}
+        reserved = [*making, charged_to]
+        stay = [] if charged_to in OURS else [found for found in self.recordings if found.charged_to in OURS]
+        if refused := self._excess(stay, reserved):
+            return None, refused
+        held = self._held(self.recordings, reserved)
         kept_here = {found.charged_to for found in self.recordings}
-        if charged_to not in KEPT and held[charged_to] > self._disk // 4 and charged_to in kept_here:
+        if charged_to not in UNLIMITED and held[charged_to] > self._disk // 4 and charged_to in kept_here:
             return self._oldest({charged_to}), f"{charged_to} used its quota of recorder.disk"
-        if charged_to not in KEPT and sum(guests.values()) > self._disk * 3 // 4:
-            why = "hosts other than the robot used their quota of recorder.disk"
-        elif sum(held.values()) > self._disk:
-            why = "recorder.disk is full"
-        elif len(self.recordings) + len(making) >= MAX_KEPT:
-            why = f"the limit is {MAX_KEPT} recordings"
-        elif sum(self._described.values()) > _MAX_DESCRIBED:
-            why = f"the descriptions of all recordings have more than {_MAX_DESCRIBED} bytes"
-        else:
+        why = self._excess(self.recordings, reserved)
+        if not why:
             return None, ""
-        others, own = kept_here - KEPT, kept_here & KEPT
-        if others and (charged_to not in KEPT or not own or sum(guests.values()) * 2 > self._disk):
+        others, own = kept_here - OURS, kept_here & OURS
+        if others and (charged_to not in OURS or not own or _of_guests(held) * 2 > self._disk):
             return self._oldest({max(others, key=lambda name: held[name])}), why
-        return (self._oldest(own), why) if own and charged_to in KEPT else (None, why)
+        return self._oldest(own), why
+
+    def _excess(self, kept: Sequence[Recording], reserved: Sequence[str]) -> str:
+        """Return why a recording of the last host in `reserved` has no room beside `kept` and those in progress."""
+        held = self._held(kept, reserved)
+        if reserved[-1] not in OURS and _of_guests(held) > self._disk * 3 // 4:
+            return "hosts other than the robot used their quota of recorder.disk"
+        if sum(held.values()) > self._disk:
+            return "recorder.disk is full"
+        if len(kept) + len(reserved) > MAX_KEPT:
+            return f"the limit is {MAX_KEPT} recordings"
+        if sum(self._described[found.id] for found in kept) > _MAX_DESCRIBED:
+            return f"the descriptions of all recordings have more than {_MAX_DESCRIBED} bytes"
+        return ""
+
+    def _held(self, kept: Sequence[Recording], reserved: Sequence[str]) -> Counter[str]:
+        held = _sizes(kept, lambda found: found.charged_to)
+        held.update({name: number * self.largest for name, number in Counter(reserved).items()})
+        return held
 
     def _oldest(self, charged_to: Collection[str]) -> Recording:
-        kinds = self._sizes(lambda found: _kind(found) if found.charged_to in charged_to else "")
-        del kinds[""]
+        kinds = _sizes((found for found in self.recordings if found.charged_to in charged_to), _kind)
         fullest = max(kinds, key=lambda kind: kinds[kind])
         return next(
             found for found in self.recordings if found.charged_to in charged_to and _kind(found) == fullest
         )
 
-    def _sizes(self, of: Callable[[Recording], str]) -> Counter[str]:
-        sizes: Counter[str] = Counter()
-        for recording in self.recordings:
-            sizes[of(recording)] += recording.size
-        return sizes
+
+def _of_guests(held: Counter[str]) -> int:
+    return sum(size for name, size in held.items() if name not in OURS)
+
+
+def _sizes(recordings: Iterable[Recording], of: Callable[[Recording], str]) -> Counter[str]:
+    sizes: Counter[str] = Counter()
+    for recording in recordings:
+        sizes[of(recording)] += recording.size
+    return sizes
 
 
 def _kind(recording: Recording) -> str:

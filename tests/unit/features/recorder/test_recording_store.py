@@ -1,9 +1,12 @@
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from random import Random
 
 import msgspec
 import pytest
 
-from appliance.base.actors import ROBOT
+from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
 from appliance.base.age_clock import AgeClock
 from appliance.base.clock import wall_ns
 from appliance.features.recorder.recording_answers import OPERATORS, Recording, Trigger, TriggerKind
@@ -51,10 +54,12 @@ def cleared(store: RecordingStore, now: int = 0, *, room: bool = False) -> list[
     return gone + (room_for(store, OPERATORS)[0] if room else [])
 
 
-def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recording, str]], str]:
+def room_for(
+    store: RecordingStore, charged_to: str, making: Sequence[str] = ()
+) -> tuple[list[tuple[Recording, str]], str]:
     gone: list[tuple[Recording, str]] = []
     while True:
-        kept, why = store.in_the_way(charged_to)
+        kept, why = store.in_the_way(charged_to, making)
         if kept is None:
             return gone, why
         store.remove(kept, "", why)
@@ -145,6 +150,34 @@ def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
     for number in range(8):
         put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
     assert room_for(store, "10.0.0.9") == ([], "recorder.disk is full")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_refused_recording_removes_nothing(tmp_path: Path, seed: int) -> None:
+    """Any owners in any order: hosts displace only hosts, and the robot, operators and the appliance get room."""
+    disk, chance = 64 * MIB, Random(seed)  # noqa: S311  a history by seed
+    ours, hosts = (ROBOT, OPERATORS, APPLIANCE), ("10.0.0.7", "10.0.0.9", UNKNOWN)
+    store = RecordingStore(tmp_path, disk=disk, reserve=0, seconds=None, clock=wall_ns)
+    refused: Counter[str] = Counter()
+    for number in range(150):
+        charged_to = chance.choice((*ours[: 1 + seed % 3], *hosts[: seed % 4], ROBOT, APPLIANCE))
+        making = chance.sample(hosts, chance.randrange(3))
+        gone, why_not = room_for(store, charged_to, making)
+        displaced = {kept.charged_to for kept, _why in gone}
+        if why_not:
+            refused[charged_to] += 1
+            assert not gone, (charged_to, why_not)
+            continue
+        assert charged_to in ours or displaced <= set(hosts)
+        size = chance.choice((1, 3, 8)) * MIB
+        put(store, recording(number, chance.choice(("stop", "drop")), size, charged_to))
+        held: Counter[str] = Counter()
+        for kept in store.recordings:
+            held[kept.charged_to] += kept.size
+        assert sum(held.values()) + len(making) * store.largest <= disk
+        assert all(held[name] <= disk // 4 for name in (*hosts, APPLIANCE))
+    assert not refused.keys() & set(ours)
+    assert seed % 4 == 0 or refused
 
 
 def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
