@@ -1,6 +1,7 @@
 """Keep the alarms that operators have acknowledged or silenced, across restarts and takeovers.
 
-1. An acknowledgement ends with its alarm, so the same condition is a new alarm when it comes back.
+1. An acknowledgement ends with its alarm, so the same condition is a new alarm when it comes back. After a start, it
+   waits up to `_START_SECONDS` for its alarm, because a condition such as `standby-away` is an alarm only after a time.
 2. A silence ends at its time, even without its alarm.
 """
 
@@ -13,6 +14,7 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 
 _SETTING = "handled alarms"
+_START_SECONDS = 300.0  # the alarms that take longest after a start need about 90 s
 SILENCES = EndKind("silence")
 
 
@@ -23,10 +25,17 @@ class HandledAlarms:
         self._store = store
         self._ends = ends
         self._rows = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, HandledAlarm])
+        self._awaited = {*self._rows}
+        """The kinds handled before this start whose alarm was not present since."""
+        self._began = clock.now()
         ends.when_due(SILENCES, self._due)
 
     def marked(self, status: Status) -> Status:
         present = {alarm.kind for alarm in (*open_alarms(status), *activity(status))}
+        self._awaited -= present
+        if clock.now() - self._began >= _START_SECONDS:
+            self._awaited.clear()
+        present |= self._awaited
         kept = {
             kind: row
             for kind, row in self._rows.items()

@@ -68,6 +68,34 @@ def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
     assert robot.events == ["alarm acknowledged by ann: rosmaster is acknowledged: spare part"]
 
 
+@pytest.mark.parametrize(("after", "handled"), [(0, True), (1, True), (61, True), (299, True), (301, False)])
+def test_an_acknowledgement_survives_a_restart_until_its_alarm_returns(
+    robot: Robot, after: float, handled: bool
+) -> None:
+    """Many conditions are alarms only some time after a start: at first, one line says `starting`."""
+    clock = VirtualClock()
+    with using(clock):
+        for start in range(2):
+            robot.fields = BAD
+            if start == 0:
+                robot.acknowledge()
+            robot.fields = GOOD
+            robot.restart()
+            for _second in range(round(after)):
+                assert robot.alarm() is None
+                clock.advance(1)
+            robot.fields = BAD
+            alarm = robot.alarm()
+            assert alarm is not None
+            assert bool(alarm.handled) == handled, start
+        robot.fields = GOOD
+        assert robot.alarm() is None
+        robot.fields = BAD
+        alarm = robot.alarm()
+        assert alarm is not None
+        assert alarm.handled == "", "it was present since the start, and ended"
+
+
 @pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "notice")])
 def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, severity: str) -> None:
     clock = VirtualClock()
