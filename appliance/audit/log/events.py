@@ -127,8 +127,8 @@ EVENTS: dict[str, str] = {
     "recording fetched": "The messages of a recording were fetched.",
     "recording read": "Messages of a recording were read, decoded.",
     "recording removed": "A recording was removed; `who` is `recorder` if it was removed for space or age.",
-    "recording missed": "A trigger made no recording: `reason` says why (limit of recordings per hour, or disk space);"
-    " `detail.recording` is the id that the trigger's record had promised.",
+    "recording missed": "A trigger made no recording: `reason` says why (limit of recordings per hour, or disk space),"
+    " or which recording has its time; `detail.recording` is the id that the trigger's record had promised.",
     "topic looked into": "Messages of a topic were shown; the record covers `seconds`.",
     "monitor looked into": "Variables of a monitor were shown. Further requests of the same client are in this record"
     " until none has come for a minute.",

@@ -234,12 +234,12 @@ class RecordingOrders:
                 self._plan.closed(recording)
                 self._on_close(recording)
                 self._note(recording.id)
-            case recorder_link.RecordingMissed(trigger, reason, planned):
+            case recorder_link.RecordingMissed(trigger, reason, planned, instead):
                 self._open.pop(planned, None)
                 about = {"what": trigger.what, "record": trigger.record, "charged_to": trigger.charged_to}
                 if planned:
                     about["recording"] = planned
-                    self._plan.missed(trigger.charged_to, planned, reason, clock.wall_ns())
+                    self._plan.missed(trigger.charged_to, planned, reason, clock.wall_ns(), instead)
                 self._trail.happened("recording missed", reason, more=about)
             case recorder_link.RecordingRemoved(_number, recording, who, reason):
                 self._kept.pop(recording.id, None)

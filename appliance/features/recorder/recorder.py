@@ -21,7 +21,7 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.features.recorder import recorder_link
 from appliance.features.recorder.recording import MAX_TRIGGERS, Progress, RecordingInProgress, load_progress
-from appliance.features.recorder.recording_answers import Recording, Trigger
+from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
 from appliance.features.recorder.recording_plan import (
     UNLIMITED,
     HourlyLimit,
@@ -79,11 +79,7 @@ class Recorder:
                 self._obey(message)
             except OSError as error:
                 _log.error("control's request failed", order=type(message).__name__, reason=str(error))
-        try:
-            for trigger, planned in self._new_triggers():
-                self._on_trigger(trigger, planned)
-        except LogUnreadableError as error:
-            _log.error("cannot read the audit log; retrying", reason=str(error))
+        self._follow()
         for making in tuple(self._making):
             try:
                 self._go_on(making)
@@ -126,6 +122,7 @@ class Recorder:
                 self._remove(number, recording_id, who)
 
     def _order(self, wanted: recorder_link.RecordingRequested) -> None:
+        self._follow()  # first, because earlier triggers have the ids that control planned
         making, why_not = self._record(wanted.trigger, wanted.before, wanted.after)
         if making is None:
             self._answers.append(recorder_link.RecordingRefused(wanted.number, why_not))
@@ -185,6 +182,13 @@ class Recorder:
 
     # --- triggers -----------------------------------------------------------------------------------------
 
+    def _follow(self) -> None:
+        try:
+            for trigger, planned in self._new_triggers():
+                self._on_trigger(trigger, planned)
+        except LogUnreadableError as error:
+            _log.error("cannot read the audit log; retrying", reason=str(error))
+
     def _new_triggers(self) -> list[tuple[Trigger, str]]:
         follower = self._follower or self._begin_to_follow()
         found: list[tuple[Trigger, str]] = []
@@ -236,17 +240,21 @@ class Recorder:
                     trigger, f"recording {planned} had ended: {kept.why_not or 'its time expired'}", planned
                 )
             return
-        if any(
-            recording_owner(kept.charged_to) == recording_owner(trigger.charged_to)
-            and kept.began <= trigger.time <= kept.ended
-            for kept in self._store.recordings
-        ):
-            return
+        for kept in self._store.recordings:
+            own = recording_owner(kept.charged_to) == recording_owner(trigger.charged_to)
+            if own and kept.began <= trigger.time <= kept.ended:
+                if planned:
+                    self._on_missed(trigger, f"recording {kept.id} has this time", planned)
+                return
         making, why_not = self._record(trigger, planned=planned)
         if making is None:
             self._on_missed(trigger, why_not, planned)
+        elif planned and planned != making.progress.id:
+            self._on_missed(trigger, f"it prolonged recording {making.progress.id}", planned, making.opened)
 
-    def _on_missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
+    def _on_missed(
+        self, trigger: Trigger, why: str, planned: str = "", instead: OpenRecording | None = None
+    ) -> None:
         """Unless a recording was planned, repeat the report only every ten minutes."""
         now, kind = self._clock(), (trigger.charged_to, trigger.what)
         if (
@@ -255,7 +263,7 @@ class Recorder:
             if len(self._told) > _MAX_TOLD:
                 self._told.clear()
             self._told[kind] = now
-            self._answers.append(recorder_link.RecordingMissed(trigger, why, planned))
+            self._answers.append(recorder_link.RecordingMissed(trigger, why, planned, instead))
 
     def _record(
         self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""

@@ -125,6 +125,8 @@ class RecordingMissed(Message, frozen=True):
     reason: str
     planned: str = ""
     """The recording that the trigger's audit record promised."""
+    instead: OpenRecording | None = None
+    """The recording of the same owner that the trigger prolonged."""
 
 
 RecorderLink = (

@@ -225,13 +225,20 @@ class RecordingPlan:
         self._close(own, recording.id)
         _remember(self._ended, own, max(recording.ended, self._ended.get(own, 0)))
 
-    def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
+    def missed(
+        self, charged_to: str, recording_id: str, why: str, now: int, instead: OpenRecording | None = None
+    ) -> None:
         """End a recording that the recorder could not make. For a minute, this owner gets no other one.
 
-        A recording that had already ended does not count: the recorder can make the owner's next one.
+        A recording that had already ended does not count: the recorder can make the owner's next one. If it makes
+        another one `instead`, further acts prolong that.
         """
         own = recording_owner(charged_to)
-        if self._close(own, recording_id):
+        if not self._close(own, recording_id):
+            return
+        if instead is not None:
+            self.opened(charged_to, instead.id, instead.began, instead.ends)
+        else:
             _remember(self._obstacles, own, (why, now))
 
     def _close(self, own: str, recording_id: str) -> bool:

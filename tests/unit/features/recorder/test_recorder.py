@@ -16,7 +16,7 @@ from appliance.features.recorder.excluded_topics import NAMED
 from appliance.features.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.features.recorder.recorder_ring import ExcludedStream
 from appliance.features.recorder.recording import RecordingInProgress
-from appliance.features.recorder.recording_answers import Recording, Trigger
+from appliance.features.recorder.recording_answers import OPERATORS, Recording, Trigger, TriggerKind
 from appliance.features.recorder.recording_store import MAX_TEMPORARY, RecordingStore
 from appliance.features.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
 from appliance.features.recorder.settings import RecorderRules
@@ -272,6 +272,56 @@ def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch
         assert (missed.planned, missed.trigger.record) == (name, record)
         assert missed.reason == "the disk is nearly full"
     scene.log.close()
+
+
+@pytest.mark.parametrize("what", ["order", "service"])
+@pytest.mark.parametrize("arrival", ["stop first", "order first", "earlier plan", "ended", "again"])
+def test_a_record_names_a_recording_that_exists_or_is_reported(
+    scene: Scene, what: TriggerKind, arrival: str
+) -> None:
+    """Control plans a recording for the record of a stop while an operator or a node orders one of the same owner."""
+    charged_to = {"order": OPERATORS, "service": "robot"}[what]
+
+    def ordered() -> recorder_link.RecordingRequested:
+        return recorder_link.RecordingRequested(
+            1, Trigger(scene.clock.now, what, "id", "eve", charged_to), 5, 5
+        )
+
+    scene.later(20)
+    x, told = "a" * 20, []
+    if arrival == "stop first":  # the order wakes the recorder, which had not read the log
+        planned(scene, x, "robot")
+        told += scene.later(0.1, ordered())
+    else:
+        told += scene.later(0.1, ordered())
+        if arrival == "ended":  # the record is read late
+            stopped = scene.clock.now
+            told += scene.later(11)
+            record = decision(
+                scene.log,
+                event="stop begun",
+                decision=None,
+                time=stopped,
+                detail={"recording": x, "charged_to": "robot"},
+            )
+            scene.log.record(record)
+            settle(scene.log)
+        else:
+            scene.clock.now += {"order first": 0, "earlier plan": 3 * SECOND, "again": 2 * SECOND}[arrival]
+            planned(scene, x, "robot")
+    told += scene.later(0.1)
+    if arrival == "again":
+        scene.begin_anew()
+    told += scene.later(0.1) + scene.later(9) + scene.later(9)
+    [recording] = scene.closed(told)
+    missed = [one for one in told if isinstance(one, recorder_link.RecordingMissed)]
+    assert {recording.id, *(one.planned for one in missed)} >= {x}
+    assert (recording.id == x) == (arrival == "stop first") == (not missed)
+    for one in missed:
+        assert recording.id in one.reason
+        assert one.instead is None or one.instead.id == recording.id
+        assert (one.instead is None) == (arrival == "ended")
+        assert recording.began <= one.trigger.time <= recording.ended
 
 
 def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ import msgspec
 import pytest
 
 from appliance.audit.log.ids import IdSource
+from appliance.audit.log.record import Severity
+from appliance.base.clock import wall_ns
 from appliance.channel import messages
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.channel import Channel
@@ -32,12 +34,9 @@ KEPT = Recording(
 class Scene:
     def __init__(self, **rules: Any) -> None:
         self.trail = FakeTrail()
-        self.orders = RecordingOrders(
-            RecorderRules(**{"enabled": True} | rules),
-            self.trail,
-            lambda: (4, 2),
-            RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
-        )
+        own = RecorderRules(**{"enabled": True} | rules)
+        self.plan = RecordingPlan(own, lambda host: host, IdSource().next)
+        self.orders = RecordingOrders(own, self.trail, lambda: (4, 2), self.plan)
 
     @property
     def state(self) -> RecorderState:
@@ -147,6 +146,28 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
     with pytest.raises(UnknownThingError, match="no recording"):
         await scene.orders.fetch(recording_requests.RecordingFetch("other"), "eve")
     recorder.close()
+
+
+async def test_a_record_after_a_missed_one_names_what_is_made_instead(scene: Scene) -> None:
+    ours, recorder = memory_link(recorder_link.RecorderLink)
+    scene.orders.link.attach(ours)
+
+    def planned() -> dict[str, str]:
+        now = wall_ns()
+        return scene.plan.detail("stop begun", None, Severity.WARNING, None, now)
+
+    trigger = Trigger(wall_ns(), "stop", "r", "t")
+    making = OpenRecording(KEPT.id, trigger.time, trigger.time + 10**10, trigger)
+    unmade = planned()["recording"]
+    recorder.send(recorder_link.RecordingMissed(trigger, "it prolonged another", unmade, making))
+    await told(scene, lambda: bool(scene.trail.events))
+    [row] = scene.trail.rows
+    assert (row["event"], row["recording"], row["reason"]) == (
+        "recording missed",
+        unmade,
+        "it prolonged another",
+    )
+    assert planned()["recording"] == KEPT.id
 
 
 @pytest.mark.nightly

@@ -145,6 +145,19 @@ def test_a_report_about_a_recording_that_ended_hinders_nobody(dropped: Callable[
     assert dropped(plan, "127.0.0.1", NOW + 4 * SECOND)["recording"] == following
 
 
+def test_acts_prolong_the_recording_that_is_made_instead(dropped: Callable[..., dict[str, str]]) -> None:
+    """A new control does not know yet what the recorder is making."""
+    plan = made()
+    unmade = dropped(plan, "127.0.0.1", NOW)["recording"]
+    making = OpenRecording("y", NOW - SECOND, NOW + 10 * SECOND, Trigger(NOW, "order", "r", "t", OPERATORS))
+    plan.missed(ROBOT, unmade, "it prolonged recording y", NOW, making)
+    assert dropped(plan, None, NOW + SECOND)["recording"] == "y"
+    following = dropped(plan, "127.0.0.1", NOW + 30 * SECOND)["recording"]
+    assert following not in {"y", unmade}
+    plan.missed(ROBOT, unmade, "it prolonged recording y", NOW, making)
+    assert dropped(plan, "127.0.0.1", NOW + 31 * SECOND)["recording"] == following
+
+
 def test_a_clock_that_is_set_back_keeps_no_reason(dropped: Callable[..., dict[str, str]]) -> None:
     plan = made()
     later = NOW + 24 * HOUR
