@@ -12,7 +12,7 @@ garbage.
 4. The file `lent` marks a temporary recording, which does not count in `disk`. A new one replaces the oldest of
    `MAX_TEMPORARY`, unless its reader may not have opened it yet.
 5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
-   atomically before anything in it is removed.
+   atomically before anything in it is removed. A folder that a person removed counts as removed when its turn comes.
 """
 
 import re
@@ -125,10 +125,11 @@ class RecordingStore:
         return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
 
     def _discard(self, folder: Path) -> None:
-        """Remove a folder without an audit record."""
+        """Remove a folder without an audit record. A person may have removed it."""
         rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
-        folder.rename(rest)
-        shutil.rmtree(rest)
+        with suppress(FileNotFoundError):
+            folder.rename(rest)
+            shutil.rmtree(rest)
 
     def discard_part(self, recording_id: str) -> None:
         with suppress(OSError):
@@ -177,8 +178,12 @@ class RecordingStore:
     def remove(self, recording: Recording, who: str, reason: str) -> None:
         kept, gone = self._folder / recording.id, self._gone(recording.id)
         with suppress(OSError):  # the disk may be full, since recordings are then removed
+            if not (kept / ABOUT).exists():  # a person removed it; its removal is still reported
+                kept.mkdir(mode=0o750, exist_ok=True)
+                (kept / ABOUT).write_bytes(msgspec.json.encode(recording))
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
-        kept.rename(gone)
+        with suppress(FileNotFoundError):
+            kept.rename(gone)
         self.recordings.remove(recording)
         del self._described[recording.id], self._since[recording.id]
         (gone / BAG).unlink(missing_ok=True)

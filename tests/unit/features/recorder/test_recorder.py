@@ -1,6 +1,7 @@
 import hashlib
 import json
 import mmap
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -162,6 +163,7 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
     second = lent(BEGAN + 21 * SECOND, scene.clock.now + SECOND)
     assert (second.ended, len(scene.bag(second))) == (scene.clock.now, 1)
     assert there() == {first.id, second.id}
+    shutil.rmtree(scene.folder / first.id)  # by hand, which hinders no later one
     [refused] = scene.later(0, recorder_link.MemoryWanted(2, trigger, 0, BEGAN + 5 * SECOND))
     assert isinstance(refused, recorder_link.RecordingRefused)
     assert (refused.unknown, "the last 10 seconds" in refused.reason) == (True, True)

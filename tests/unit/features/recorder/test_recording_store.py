@@ -1,5 +1,6 @@
+import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from random import Random
 
@@ -206,6 +207,42 @@ def test_old_recordings_are_removed(tmp_path: Path) -> None:
     assert not cleared(make(), 5000 * SECOND)  # whatever the machine's clock says
     age += 1
     assert cleared(make()) == [(recording(1), "it is older than recorder.days")]
+
+
+@pytest.mark.parametrize("by_hand", [shutil.rmtree, lambda folder: (folder / ABOUT).unlink()])
+@pytest.mark.parametrize("way", ["age", "room", "order"])
+def test_a_recording_that_a_person_removed_stops_no_removal(
+    tmp_path: Path, way: str, by_hand: Callable[[Path], None]
+) -> None:
+    """Its removal is reported as that of the others, also by the next recorder."""
+    age = 0
+
+    def make() -> RecordingStore:
+        return RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=10, clock=lambda: age)
+
+    store = make()
+    kept = [put(store, recording(number, size=8 * MIB)) for number in range(1, 9)]
+    store.note(kept[0].id)
+    for one in (kept[0], kept[2]):
+        by_hand(tmp_path / one.id)
+    if way == "age":
+        age = 11 * SECOND
+        assert [one for one, _why in cleared(store)] == kept
+    elif way == "room":
+        gone = [one for _recording in range(8) for one, _why in displaced(store)]
+        assert gone == kept
+    else:
+        for one in kept:
+            store.remove(one, "eve", "")
+    assert store.recordings == []
+    assert [one for one, _who, _why in make().removed()] == kept
+
+
+def displaced(store: RecordingStore) -> list[tuple[Recording, str]]:
+    """Make room, for as many recordings in progress as there are removed ones."""
+    gone, why_not = room_for(store, ROBOT, [ROBOT] * (7 - len(store.recordings) + 1))
+    assert not why_not
+    return gone
 
 
 def test_a_recording_of_an_earlier_version_ages_from_the_first_start(tmp_path: Path) -> None:
