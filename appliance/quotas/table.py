@@ -229,8 +229,8 @@ RELAY_FRAMES = QuotaRow(
 RELAY_QUEUES = QuotaRow(
     thing="bytes that wait for subscribers and clients in one relay",
     bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0, share=1),
-    at_limit="messages for the host's slow subscribers are dropped; a subscriber that reads nothing for ten seconds"
-    " is disconnected",
+    at_limit="messages for the host's slow subscribers are dropped, and service calls that cannot be passed on at"
+    " once are cut; a subscriber that reads nothing for ten seconds is disconnected",
     between="a host gets at most as much as is left for all others",
     alarm="`rosrv_relay_dropped_total`, `rosrv_relay_memory_bytes`",
     setting="relay.memory_bytes (a quarter of it)",

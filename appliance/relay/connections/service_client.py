@@ -361,13 +361,19 @@ class ServiceClient:
             self._weigh()
 
     def _weigh(self) -> None:
+        """Cut the connection if a part has no memory left.
+
+        A whole message may wait even if it exceeds the quota, as for a subscriber: the host's next one has no memory.
+        """
+        *incomplete, waiting = self._weights
+        full = self._unsent > max(SMALL, waiting.size) and waiting.share.exhausted
+        waiting.set(self._unsent)
         of_service = self._exchange.held_replies + size_of(self._header)
-        parts = (self._exchange.held, of_service, self._unsent)
-        for weight, size in zip(self._weights, parts, strict=True):
+        for weight, size in zip(incomplete, (self._exchange.held, of_service), strict=True):
             weight.set(size)
-            if size > SMALL and weight.share.exhausted:
-                self.cut("the relay has no memory left for messages of this host")
-                return
+            full = full or (size > SMALL and weight.share.exhausted)
+        if full:
+            self.cut("the relay has no memory left for messages of this host")
 
     @property
     def _unsent(self) -> int:

@@ -17,7 +17,7 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.relay_limits import MIB
-from roswire.tcpros import encode_frame, encode_header
+from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 
 pytestmark = pytest.mark.usefixtures("sockets")
@@ -146,6 +146,32 @@ def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World)
         peer.reset()
     world.until(lambda: share.used == 0)
     carries_images(world, publisher, quick)
+
+
+@pytest.mark.parametrize("part", ["request", "reply"])
+def test_a_service_call_may_be_as_large_as_a_message(world: World, part: str) -> None:
+    """It waits in a queue whose quota is half of that. A host that has used its quota gets no further one."""
+    large, small = bytes(14 * MIB), b"small"
+    request, reply = (large, small) if part == "request" else (small, large)
+    share = world.engine.memory.queues.of(LOOPBACK)
+    client = world.connect(encode_header(CALL | {"persistent": "1"}))
+    service = world.accept(world.service)
+    world.gets_header(service)
+    service.send(encode_header({"callerid": "/talker", "type": "x/Y", "md5sum": "m"}))
+    world.gets_header(client)
+    world.push(client, encode_frame(request))
+    world.gets(service, encode_frame(request))
+    world.push(service, encode_service_reply(reply))
+    world.gets(client, encode_service_reply(reply))
+    assert share.used == 0
+    share.add(8 * MIB)
+    with contextlib.suppress(ConnectionError):
+        world.pour(client, encode_frame(request))
+        if part == "reply":
+            world.gets(service, encode_frame(request))
+            world.pour(service, encode_service_reply(reply))
+    assert "no memory left" in world.hears(ConnectionClosed).reason
+    assert share.used == 8 * MIB
 
 
 def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> None:
