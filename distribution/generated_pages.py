@@ -194,6 +194,12 @@ def metrics_markdown() -> str:
 
 # Generate the end of docs/reference/audit-log.md: the fields of audit records.
 
+CHAIN = {
+    "previous": "hash of the record before",
+    "hash": "hash of this record",
+    "then": "list of the hashes of the contents of records that were left out after it; null in records of 0.1.0",
+    "checkpoint": "signed checkpoint that seals the records up to this one (`rosrv audit checkpoints`), or null",
+}
 _FORMS = {"string": "text", "integer": "integer", "object": "object", "null": "null"}
 
 
@@ -203,7 +209,11 @@ def audit_record_markdown() -> str:
     lines += [
         "",
         "A record has all of these fields (`decision` only if something was decided), and no others. A line of an",
-        "export also has `chain`, and `robot` if `appliance.yaml` names the robot and the appliance runs.",
+        "export also has `robot`, if `appliance.yaml` names the robot and the appliance runs, and `chain`, its",
+        "place in the hash chain:",
+        "",
+        *(f"- `{name}`: {text}" for name, text in CHAIN.items()),
+        "",
         "`GET /v1/openapi.json` has the JSON schema, `AuditRecord`.",
         "The names of `event`, each with its fields of `detail`: [audit-events.md](generated/audit-events.md).",
         "",

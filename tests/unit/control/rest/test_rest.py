@@ -148,7 +148,7 @@ async def test_requests_that_wait_block_no_other_requests(world: Everything, api
     assert sum(answer_of(one).ok for one in (await api.until(22))[1:]) == 17
 
 
-@pytest.mark.parametrize("kind", sorted(ORDERS, key=lambda kind: kind.__name__))
+@pytest.mark.parametrize("kind", sorted(ORDERS, key=str))
 async def test_no_order_blocks_other_requests(
     kind: type[Any], world: Everything, link: RestLink, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
