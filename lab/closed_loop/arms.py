@@ -37,6 +37,8 @@ from lab.closed_loop.world import COMMAND, NEVER, SLACK, World
 
 TRAJECTORY, GOAL = "trajectory_msgs/JointTrajectory", "control_msgs/FollowJointTrajectoryActionGoal"
 _NEAR = 1e-5
+_ROUNDING = 1e-9
+"""Seconds."""
 _STEP = 0.0025
 """Seconds between two looks at the arm, at most."""
 
@@ -376,10 +378,11 @@ class JointsWorld(World):
         # It begins at the last update of the controller, or the state before.
         times = self.time, self.controller.updated(self.time)
         for joint, begin in enumerate(self.begins):
-            if self.unknown or begin <= self.time:
+            begun = begin <= max(times) + _ROUNDING
+            if self.unknown or begun:
                 fastest = max(abs(self.controller.state(joint, time)[1]) for time in times)
                 way = fastest * (0.625 * self.stopping + 2 * self.controller.period) + _NEAR
-                self.rest[joint] = way if begin <= self.time else max(way, self.rest[joint])
+                self.rest[joint] = way if begun else max(way, self.rest[joint])
         self.begins = [math.inf] * len(JOINTS)
         self.unknown = False
         self.controller.stop(self.time)
@@ -416,7 +419,7 @@ class JointsWorld(World):
         if not self.extra[joint] <= self.jump + _NEAR:
             gained = f"{JOINTS[joint]} has gained {self.extra[joint]:.3f} rad on 1.1 vMax"
             self.broken("L3", f"{gained}, and a jump is {self.jump}")
-        if time <= self.begins[joint]:
+        if time < self.begins[joint] - _ROUNDING:  # then its first point, if that is at 0 s, is a jump
             self.rest[joint] -= moved
             if not self.rest[joint] >= -_NEAR:
                 self.broken("L3", f"{JOINTS[joint]} moves on after a stop by more than the way of a stop")
