@@ -651,7 +651,7 @@ class RelayedTopic:
         self._startup_replay.expire(now)
         if self.latch.batch is not None:
             for member in self._served.row:
-                if member.missed:
+                if member.missed and member.admits(self.latch.batch):  # only its first refusal is counted
                     self._served.deliver(self.latch.batch, member)
         self._served.trim(stalled=True)
         self._newcomers.heard(self.counters.following, now)

@@ -27,6 +27,9 @@ class TopicSubscriber(Protocol):
     def greet(self, header: Mapping[str, str]) -> bool:
         """Send the publisher's header; return False if the subscriber has a different type."""
 
+    def admits(self, batch: Batch) -> bool:
+        """Whether the subscriber's rate limit lets the whole batch pass now."""
+
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; return how many messages are dropped."""
 

@@ -190,6 +190,9 @@ class Subscriber:
             self._write(True)
         return self._live
 
+    def admits(self, batch: Batch) -> bool:
+        return self._flow is None or self._flow.room(batch, self._loop.clock()) == batch.messages
+
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; drop a large one while the host has no memory: its rest could not be kept."""
         if self._flow is not None:

@@ -530,6 +530,34 @@ def test_the_host_with_most_makes_room_for_one_with_less() -> None:
     world.close()
 
 
+def test_a_latched_message_that_waits_for_a_limit_counts_once(world: World) -> None:
+    """It is offered each second, to a subscriber beside those that got it."""
+
+    def limited() -> int:
+        found = (row for one in world.told if isinstance(one, MessagesLimited) for row in one.rows)
+        return sum(row.messages for row in found)
+
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/slow", FlowLimit(messages=0.001)))
+    quick = world.connect(encode_header(ASK))
+    publisher = world.upstream(HEADER | {"latching": "1"})
+    world.gets_header(quick)
+    slow = world.connect(encode_header(ASK | {"callerid": "/slow"}))
+    world.gets_header(slow)
+    for text in (b"1", b"2", b"3", b"4"):
+        world.push(publisher, encode_frame(text))
+        world.gets(quick, encode_frame(text))
+    several_reports = clock.now() + 6 * LIMITS.report_every
+    world.until(lambda: clock.now() > several_reports)
+    slow.read()
+    passed = len(slow.data) // len(encode_frame(b"1"))
+    assert 0 < passed < 4
+    assert limited() == 4 - passed
+    slow.data.clear()
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/slow", FlowLimit(messages=1000)))
+    world.gets(slow, encode_frame(b"4"))
+    assert limited() == 4 - passed
+
+
 def test_limits_are_kept_for_publishers_and_for_each_subscriber_and_change_while_they_run(
     world: World,
 ) -> None:

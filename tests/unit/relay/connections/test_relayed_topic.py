@@ -73,6 +73,9 @@ class RecordedMember:
         self.header = header
         return self._fits
 
+    def admits(self, _batch: Batch) -> bool:
+        return True
+
     def deliver(self, batch: Batch) -> int:
         self.received += bytes(batch.view)
         return 0
