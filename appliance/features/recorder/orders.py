@@ -87,9 +87,10 @@ class RecordingOrders:
         self._require()
         before = self._rules.before if request.before is None else request.before
         after = self._rules.after if request.after is None else request.after
-        if not 0 <= before <= self._rules.longest or not 0 < after <= self._rules.longest:
+        if before < 0 or after <= 0 or before + after > self._rules.longest:
             raise SenselessError(
-                f"before must be 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
+                f"before is {before:g} and after {after:g} seconds: after must be more than 0, and both together at"
+                f" most {self._rules.longest:g} (recorder.longest)"
             )
         text = f"{who}: {request.note}" if request.note else who
         begun = await self._begin("order", request.note, text, who, (before, after))

@@ -170,6 +170,19 @@ async def test_a_record_after_a_missed_one_names_what_is_made_instead(scene: Sce
     assert planned()["recording"] == KEPT.id
 
 
+@pytest.mark.parametrize(
+    ("before", "after"), [(601, None), (None, 0), (600, 10), (591, None), (None, 541), (540, 300), (-1, None)]
+)
+async def test_an_order_for_more_than_the_longest_recording_is_rejected(
+    scene: Scene, before: float | None, after: float | None
+) -> None:
+    ours, _recorder = memory_link(recorder_link.RecorderLink)
+    scene.orders.link.attach(ours)
+    with pytest.raises(SenselessError, match=r"both together at most 600 \(recorder.longest\)"):
+        await scene.orders.now(recording_requests.RecordNow(before, after), "eve")
+    assert not scene.trail.events
+
+
 @pytest.mark.nightly
 async def test_orders_have_the_name_of_their_operator() -> None:
     scene = Scene()
@@ -187,10 +200,6 @@ async def test_orders_have_the_name_of_their_operator() -> None:
         return []
 
     recorder = scene.attach(answer)
-    for senseless in (recording_requests.RecordNow(before=601.0), recording_requests.RecordNow(after=0.0)):
-        with pytest.raises(SenselessError):
-            await scene.orders.now(senseless, "eve")
-    assert not scene.trail.events
     begun = await scene.orders.now(recording_requests.RecordNow(after=5, note="why"), "eve")
     assert (begun.id, begun.ends) == (KEPT.id, 9)
     assert scene.trail.rows[0]["who"] == "eve"
