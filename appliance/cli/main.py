@@ -190,7 +190,7 @@ def main() -> None:
 
 
 def _lost(lines: int, _since: str) -> str:
-    return f"rosrv: {counted(lines, 'line')} of this output were lost\n"
+    return f"rosrv: {counted(lines, 'line of this output was', 'lines of this output were')} lost\n"
 
 
 def _open_closed_streams() -> None:

@@ -232,7 +232,7 @@ async def _wait(graph: MasterGraph, topics: MotionTopics, longest: float, hearin
     for found in (topics.commands, topics.odometry):
         if len(found) > _MAX:
             raise NotStandingError(
-                f"{counted(len(found), 'topic')} of a base are more than can be heard ({_MAX})"
+                f"a base has {counted(len(found), 'topic')}, more than can be heard ({_MAX})"
             )
     judge, until = StandingJudge(topics), clock.now() + longest
     types = {topic: graph.types[topic] for topic in sorted({*topics.commands, *topics.odometry})}

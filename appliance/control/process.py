@@ -69,8 +69,8 @@ def record_removal(trail: AuditTrail, message: messages.RulesRestored) -> None:
     span = f"{'' if message.reported else 'at most '}{message.seconds:g} s"
     trail.happened(
         "firewall restored",
-        f"{message.by or 'another program'} removed {counted(len(message.rules), 'rule')} of the firewall, which are in"
-        f" force again after {span}; {counted(message.connections, 'connection')} of that time ended",
+        f"{message.by or 'another program'} removed {counted(len(message.rules), 'rule')} of the firewall, now in"
+        f" force again, after {span}; {counted(message.connections, 'connection')} of that time ended",
         seconds=message.seconds,
         by=message.by or None,
         rules=message.rules,

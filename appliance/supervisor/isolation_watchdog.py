@@ -269,14 +269,14 @@ class IsolationWatchdog:
         task.add_done_callback(self._ending.discard)
 
     async def _restored(self, missing: list[str], by: str, seconds: float, *, reported: bool) -> None:
-        log.critical("another program removed rules of the firewall, which are in force again",
+        log.critical("another program removed rules of the firewall, now in force again",
                      by=by, seconds=round(seconds, 3), rules=missing)  # fmt: skip
         at = self._intact_at
         ended = await self._end_once()
         self._begin(self._end_later())
         since = f"for {seconds:.2g} s" if reported else f"for at most {math.ceil(seconds)} s"
         self._removed = at, (
-            f"{by or 'another program'} removed {counted(len(missing), 'rule')} of the firewall {since}, which are in"
+            f"{by or 'another program'} removed {counted(len(missing), 'rule')} of the firewall {since}, now in"
             f" force again; {counted(ended, 'connection')} of that time ended. Other machines could reach the robot:"
             " let that program replace only its own tables (rosrv audit search --event 'firewall restored')"
         )  # fmt: skip

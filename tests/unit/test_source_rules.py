@@ -205,6 +205,7 @@ MISCOUNTED = re.compile(
 )
 LIMIT = re.compile(r"[A-Z_]{3,}|most|limit|bound|longest|least|range")
 """Names of numbers that are never 1."""
+PLURAL = re.compile(r"[^.,;:(]*?(?:, which)? (?:are|do|have|keep|name|use|were)\b")
 
 
 def miscounted(source: Source) -> Iterator[tuple[int, str]]:
@@ -214,8 +215,16 @@ def miscounted(source: Source) -> Iterator[tuple[int, str]]:
     for node in source.nodes:
         if not isinstance(node, ast.JoinedStr) or id(node) in chosen:
             continue
+        shared = False  # with another number, as in `1 of 2 hosts` and `1 host and 1 node`
         for number, behind in pairwise(node.values):
             match number, behind:
+                case ast.Constant(value=str(text)), _:
+                    shared = text.endswith((" of ", " and "))
+                case (
+                    ast.FormattedValue(value=ast.Call(func=ast.Name(id="counted")) as value),
+                    ast.Constant(value=str(text)),
+                ) if PLURAL.match(text) and not shared:
+                    yield node.lineno, f"{{{ast.unparse(value)}}}{text[:30]}"
                 case ast.FormattedValue(value=value), ast.Constant(value=str(text)):
                     if MISCOUNTED.match(text) and not LIMIT.search(ast.unparse(value)):
                         yield node.lineno, f"{{{ast.unparse(value)}}}{text[:30]}"
@@ -254,9 +263,11 @@ RULES = {
     ),
     "counted": Rule(
         WITH_FLEET, miscounted,
-        forbid("counted(number, noun) of appliance/base/counted.py or roswire/counted.py: there may be one"),
-        ["f'{self.left} more errors are not shown'", "f'{len(found)} hosts'"],
-        ["f'more than {_MAX} hosts'", "'1 host' if n == 1 else f'{n} hosts'", "f'{counted(n, \"host\")} left'"],
+        forbid("counted(number, noun) or counted(number, 'noun is', 'nouns are') of appliance/base/counted.py or"
+               " roswire/counted.py: there may be one"),
+        ["f'{self.left} more errors are not shown'", "f'{len(found)} hosts'", "f'{counted(n, \"host\")} of a are up'"],
+        ["f'more than {_MAX} hosts'", "'1 host' if n == 1 else f'{n} hosts'", "f'{counted(n, \"host\")} left'",
+         "f'{counted(n, \"host\")} and {counted(n, \"node\")} are up'"],
     ),
 }  # fmt: skip
 

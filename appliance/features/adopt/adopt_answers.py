@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.channel.answers.field_docs import doc
 
 
@@ -68,3 +69,9 @@ class GiveBackReport(msgspec.Struct, frozen=True):
     withheld: int = 0
     withheld_from: str = ""
     seconds: float = 0.0
+
+    @property
+    def in_words(self) -> str:
+        """Which master the nodes use now."""
+        master = self.master or "the robot's own master"
+        return f"{counted(self.nodes, 'node uses', 'nodes use')} {master} again"

@@ -260,15 +260,15 @@ def release(
     if report.withheld:
         withheld = counted(report.withheld, "registration")
         text = (
-            f"{_VERB}: {counted(report.nodes, 'node')} keep their topics, but {withheld}"
+            f"{_VERB}: {counted(report.nodes, 'node keeps its topics', 'nodes keep their topics')}, but {withheld}"
             f" and the parameters are not given back: {report.withheld_from}. Stop that master, start the robot's own,"
             " and restart the robot's nodes"
         )
         typer.echo(printable(text), err=True)
         raise typer.Exit(1)
     say(
-        f"released in {report.seconds:g} s: {counted(report.nodes, 'node')} use {report.master or 'their own master'}"
-        f" again; {counted(report.given, 'registration')} given back, {report.ended} ended"
+        f"released in {report.seconds:g} s: {report.in_words}; {counted(report.given, 'registration')}"
+        f" given back, {report.ended} ended"
     )
     if report.started:
         say("the robot had no master of its own, so one was started: rosrv-left-master")

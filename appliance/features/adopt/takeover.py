@@ -465,8 +465,8 @@ class AdoptOperation:
         if unknown or begun:
             self.graph.trail.happened(
                 "graph restored",
-                f"{counted(len(unknown), 'registration')} that only the robot's own master had were unregistered there;"
-                f" {counted(len(begun), 'node')} of this machine taken over",
+                f"unregistered {counted(len(unknown), 'registration')} that only the robot's own master had; took over"
+                f" {counted(len(begun), 'node')} of this machine",
                 unregistered=[f"{' '.join(entry)} {there.nodes.get(entry[2], '')}" for entry in unknown[:_MAX_SHOWN]],
                 nodes=begun or None, seconds=round(clock.now() - began, 2),
             )  # fmt: skip
@@ -754,13 +754,14 @@ class AdoptOperation:
         await self.passed("forget")
         await self.machine("phase", phase=Phase.FREE)
         report = msgspec.structs.replace(report, seconds=round(clock.now() - began, 2))
-        use = f"use {report.master or 'their own master'} again"
+        released = report.in_words
         if report.withheld:
+            keep = counted(report.nodes, "node keeps its topics", "nodes keep their topics")
             withheld = counted(report.withheld, "registration")
-            use = f"keep their topics; {withheld} not given back: {report.withheld_from}"
+            released = f"{keep}; {withheld} not given back: {report.withheld_from}"
         self.graph.trail.happened(
             "graph released",
-            f"{counted(report.nodes, 'node')} {use}",
+            released,
             nodes=report.nodes,
             given=report.given,
             withheld=report.withheld or None,

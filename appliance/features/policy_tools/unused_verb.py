@@ -43,13 +43,14 @@ def list_unused(
     if not appliance.as_json:
         unused, unknown = (sum(row.state == state for row in rows) for state in ("unused", "unknown"))
         start = local_text(period.start, digits=0)
-        text = f"{unused} of {counted(len(rows), 'rule')} name hosts that did not use them since {start}"
+        name = "names hosts that did not use it" if unused == 1 else "name hosts that did not use them"
+        text = f"{unused} of {counted(len(rows), 'rule')} {name} since {start}"
         say(f"{text}; {unknown} unknown", "yellow" if unused else "green")
         if period.removed:
             say("the log's records before that time are removed", "yellow")
         for host, count in sorted(period.unnamed.items()):
             who = "several hosts" if host == "*" else appliance.host_in_words(host)
-            say(f"{counted(count, 'request')} of {who} are only counted in the log, without names", "yellow")
+            say(f"{counted(count, 'request')} of {who} only counted in the log, without names", "yellow")
 
 
 def _say_row(row: RuleUse, *, as_json: bool) -> None:

@@ -6,6 +6,7 @@ refused with the first.
 
 from collections.abc import Iterator
 
+from appliance.base.counted import counted
 from appliance.features.standby.answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.view import Trouble
 
@@ -90,7 +91,7 @@ def is_blind(other: OtherAppliance) -> bool:
 
 
 def lag_of(other: OtherAppliance) -> str:
-    changes = "1 change" if other.behind_changes == 1 else f"{other.behind_changes} changes"
+    changes = counted(other.behind_changes, "change")
     return f"{changes} ({other.behind_bytes} bytes) behind" if other.behind_changes else "catching up"
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import cast
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel.answers.host_answers import Host, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
@@ -168,4 +169,4 @@ def span(seconds: float) -> str:
         return f"{int(seconds // 86_400)} days"
     if seconds >= 7200:
         return f"{int(seconds // 3600)} hours"
-    return f"{int(seconds // 60)} minutes" if seconds >= 120 else f"{math.ceil(seconds)} seconds"
+    return f"{int(seconds // 60)} minutes" if seconds >= 120 else counted(math.ceil(seconds), "second")

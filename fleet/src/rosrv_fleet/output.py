@@ -20,7 +20,7 @@ def say_json(fields: dict[str, object]) -> None:
 
 
 def _lost(lines: int, since: str) -> str:
-    return f"{counted(lines, 'line')} of the log were lost since {since}\n"
+    return f"{counted(lines, 'line of the log was', 'lines of the log were')} lost since {since}\n"
 
 
 def configure_log() -> None:

@@ -55,7 +55,7 @@ export function Lanes({ line, at, move, zoom, all, topics, choose, about }) {
     ${seen.slice(0, most).map((/** @type {any} */ one) => html`<${Lane} key=${`${one.topic} ${one.type}`} name=${one.topic} counts=${one.counts} tone="flow" what="message" senders=${one.senders} picked=${topics.includes(one.topic)} pick=${() => toggle(one.topic)} ...${draw} />`)}
     ${!seen.length && html`<p class="muted small lane-note">${line.topics.length ? "No topic name matches." : "No message was recorded."}</p>`}
     ${seen.length > most && html`<div class="lane-note"><button class="button small" onClick=${() => setMost(most + MORE)}>${counted(seen.length - most, "more topic")}</button></div>`}
-    ${line.more_topics > 0 && html`<p class="muted small lane-note">${counted(line.more_topics, "topic")} with fewer messages are in the bag only.</p>`}</div>`;
+    ${line.more_topics > 0 && html`<p class="muted small lane-note">In the bag only: ${counted(line.more_topics, "topic")} with fewer messages.</p>`}</div>`;
 }
 
 /** One lane: its name, a bar for each column, and the total number. */
