@@ -327,9 +327,7 @@ class BundleGate:
             refused and (refused.path, refused.sha256),
         ):
             return
-        if (
-            ordered or self._for_order != offered
-        ):  # else an operator may order it also while it is checked again
+        if ordered or self._for_order != offered:  # else it can be ordered during the check
             self._waits, self._for_order = "", None
         if self._unconfirmed:
             self._waits, self._for_order = _UNCONFIRMED_CHANGE, None
@@ -342,8 +340,8 @@ class BundleGate:
             self._waits, self._for_order = "", None
             self._refuse(offered.path, offered.sha256, str(error))
             return
-        if self._ordered == offered:
-            return  # meanwhile: `run` tries it now
+        if self._ordered == offered:  # since the check began: `run` tries it now
+            return
         self._waits, self._for_order = "", None
         if held:
             self._waits = f"{offered.path} waits until no message passes for a minute: {held[0]}"

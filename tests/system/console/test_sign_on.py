@@ -160,4 +160,4 @@ def test_the_provider_asks_who_signs_in_once_a_person_has_left(
         other = page.context.new_page()
         other.goto(f"{URL}/console")
         other.get_by_role("button", name="Sign in with").click()
-        expect(other.locator(".who-name")).to_have_text("sso:alice")  # without a question: nobody has left
+        expect(other.locator(".who-name")).to_have_text("sso:alice")  # without a question: alice is here

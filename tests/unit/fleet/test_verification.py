@@ -148,7 +148,7 @@ _EMPTY = gzip.compress(b"", 1)
     ],
     ids=["plain", "padded", "empty first", "divided header", "empty later", "empty last", "zeros last"],
 )
-def test_what_is_stored_costs_its_readers_no_more_than_its_content(
+def test_a_stored_segment_costs_its_readers_no_more_than_its_content(
     packed: Callable[[bytes, bytes], bytes],
     reason: str,
     store: SegmentStore,

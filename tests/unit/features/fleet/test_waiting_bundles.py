@@ -147,7 +147,7 @@ async def test_a_bundle_that_would_hold_moving_topics_does_not_wait_for_an_order
 async def test_the_bundle_that_waits_can_be_ordered_while_a_poll_offers(
     again: bool, ordered: BundleRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The check of a large bundle takes long, and each poll offers it again."""
+    """The check of a large bundle takes a long time, and each poll offers it again."""
     checked = asyncio.Event()
 
     async def check(*_content: object) -> None:
