@@ -423,7 +423,7 @@ class JointsWorld(World):
             self.rest[joint] -= moved
             if not self.rest[joint] >= -_NEAR:
                 self.broken("L3", f"{JOINTS[joint]} moves on after a stop by more than the way of a stop")
-        elif not abs(place) <= self.most + _NEAR and not abs(place) < abs(before):
+        elif not abs(place) <= self.most + _NEAR and abs(place) > abs(before):
             self.broken("L1", f"{JOINTS[joint]} is out of its limits: {place:.3f}")
 
     def ended(self) -> None:
