@@ -55,7 +55,8 @@ class MonitorValues:
             return MonitorReadout(monitor, {}, {}, None, why or _ELSEWHERE)
         age = max(0.0, clock.now() - kept.at)
         ages = {event: None if past is None else past + age for event, past in kept.seen.ages.items()}
-        return MonitorReadout(monitor, kept.seen.values or {}, ages, age, why)
+        now = None if kept.seen.now_ns is None else kept.seen.now_ns / 1e9 + age
+        return MonitorReadout(monitor, kept.seen.values or {}, ages, age, why, now)
 
     async def _ask(self, monitor: str) -> str:
         """Ask the relay, or join a query that waits for its answer. Return why there is no answer, or an empty text."""

@@ -64,6 +64,9 @@ class MonitorReadout(msgspec.Struct, frozen=True):
         float | None, doc("seconds since the relay answered, or null if it has not answered since the load")
     ]
     why_old: Annotated[str, doc("why the values are not the present ones; empty if they are")] = ""
+    now_seconds: Annotated[
+        float | None, doc("the present time of the monitors' clock, for values that are times since 1970")
+    ] = None
 
 
 class MonitorState(msgspec.Struct, frozen=True):

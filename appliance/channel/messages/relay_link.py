@@ -607,11 +607,13 @@ class ValuesSeen(Message):
     """The variables, within limits (`rosmop/run/readout.py`); None if this relay does not run the monitor.
 
     `ages` has the seconds since the last message of each event whose age the monitor uses; None: never.
+    `now_ns` is the time of the monitors' clock.
     """
 
     number: int
     values: dict[str, object] | None
     ages: dict[str, float | None] = msgspec.field(default_factory=dict)
+    now_ns: int | None = None
 
 
 class SyntheticMessage(msgspec.Struct, array_like=True):

@@ -16,7 +16,10 @@ from appliance.features.guards.requests import GuardsWanted
 from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import refused, say
 
-_REMARK = re.compile(r"^ {4}\w[^/]*;\s+// (.+)$", re.MULTILINE)
+_REMARK = re.compile(r"^ {4}(\w.*?;) +// (.+)$", re.MULTILINE)
+_NAME = re.compile(r"\b([A-Za-z_]\w*)(?:\[[^]]*\])?\s*(?:=[^,;]*)?[,;]")
+_FIRST_TIME, _LAST_TIME = 1e9, 1e10
+"""Numbers between them are times of the monitors' clock: seconds since 1970."""
 
 
 @speaks
@@ -46,7 +49,7 @@ def show(
     found = appliance.ask_or_exit(admin.MonitorValuesWanted(name))
     if appliance.as_json:
         say_json({"guard": row, "values": found.values, "ages": found.ages, "age_seconds": found.age_seconds,
-                  "why_old": found.why_old})  # fmt: skip
+                  "why_old": found.why_old, "now_seconds": found.now_seconds})  # fmt: skip
         return
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
     _say_guard(row)
@@ -57,9 +60,8 @@ def remarks(text: str) -> dict[str, str]:
     """Return the remark behind the declaration of each variable of a specification."""
     found: dict[str, str] = {}
     for line in _REMARK.finditer(text):
-        declared = line[0].partition("//")[0]
-        for name in re.findall(r"\b([A-Za-z_]\w*)\b(?=\s*[=,;])", declared):
-            found.setdefault(name, line[1])
+        for name in _NAME.findall(line[1]):
+            found.setdefault(name, line[2])
     return found
 
 
@@ -84,13 +86,19 @@ def _say_values(found: MonitorReadout, meanings: dict[str, str]) -> None:
         say("its present values:")
     table = table_of("    value", "", "meaning")
     for name, value in found.values.items():
-        add_row(table, f"    {name}", _shown(value), meanings.get(name, ""))
+        add_row(table, f"    {name}", _shown(value, found.now_seconds), meanings.get(name, ""))
     say_table(table)
     for event, past in found.ages.items():
         say(f"    {event}: {'never' if past is None else f'{past:.2f} s ago'}")
 
 
-def _shown(value: object) -> str:
+def _shown(value: object, now: float | None) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, list):
+        return f"[{', '.join(repr(one) if isinstance(one, str) else _shown(one, now) for one in value)}]"
+    if not isinstance(value, float):
+        return str(value)
+    if now is None or not _FIRST_TIME <= value < _LAST_TIME:
+        return f"{value:.6g}"
+    return f"in {value - now:.2f} s" if value > now else f"{now - value:.2f} s ago"

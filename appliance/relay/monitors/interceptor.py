@@ -292,8 +292,9 @@ class Interceptor:
         elif isinstance(message, StopWanted):
             self._reporter.send(StopBegun(message.number, self._stoppers(message.topic, begin=message.begin)))
         elif isinstance(message, ValuesWanted):
-            found = None if self.monitors is None else self.monitors.read_out(message.monitor, self.now())
-            self._reporter.send(ValuesSeen(message.number, *(found or (None, {}))))
+            now = self.now()
+            found = None if self.monitors is None else self.monitors.read_out(message.monitor, now)
+            self._reporter.send(ValuesSeen(message.number, *(found or (None, {})), now))
         else:
             self._given[message.name] = dict(message.values)
             self._apply()

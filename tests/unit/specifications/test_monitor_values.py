@@ -44,7 +44,7 @@ class Desk:
             return False
         self.asked.append(message.monitor)
         if not self.silent:
-            answer = ValuesSeen(message.number, {"x": self.x}, {"pose": 0.5, "foreign": None})
+            answer = ValuesSeen(message.number, {"x": self.x}, {"pose": 0.5, "foreign": None}, 7_000_000_000)
             asyncio.get_running_loop().call_later(0.01, self.values.received, answer)
         return True
 
@@ -76,6 +76,7 @@ async def test_without_the_relay_the_last_answer_is_shown_with_its_age(desk: Des
     assert found.age_seconds == pytest.approx(5, abs=ANSWER_SECONDS + 0.1)
     assert found.age_seconds is not None
     assert found.ages == {"pose": pytest.approx(found.age_seconds + 0.5), "foreign": None}
+    assert found.now_seconds == pytest.approx(found.age_seconds + 7)
     assert "relay process" in found.why_old
     setattr(desk, how, False)
     assert (await desk.values.of("fence", "ann")).why_old == ""

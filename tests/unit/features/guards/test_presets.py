@@ -22,11 +22,14 @@ from appliance.features.guards.presets import (
     values_in,
     with_values,
 )
+from appliance.features.guards.show_verb import remarks
 from appliance.supervisor.sandbox.private_view import program_folders
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import fast_path_of
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
+from rosmop.text.parser import parse
+from rosmop.text.tree import GivenValue
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import covering
 from tests.support.features.guards.guarded_robot import rows
@@ -70,6 +73,19 @@ def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) ->
         assert (
             types.get("by") != "sensor_msgs/LaserScan" or running.lane(preset.given_topics["by"]) is not None
         )
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_a_declaration_has_the_remark_of_its_line_or_no_meaning(preset: Preset) -> None:
+    text = text_of(Guard("mine", preset))
+    lines, found = text.splitlines(), remarks(text)
+    [made] = parse(text, "mine.rv").specifications
+    for declaration in made.declarations:
+        line = lines[declaration.position.line - 1]
+        own = [one.name for one in declaration.declarators if re.search(rf"\b{one.name}\b", line)]
+        assert {name: found.get(name, "") for name in own} == dict.fromkeys(own, line.partition(" // ")[2])
+    for given in (one for one in made.givens if isinstance(one, GivenValue)):
+        assert found.get(given.name, "") == lines[given.position.line - 1].partition(" // ")[2]
 
 
 OF_THE_SITE = {("separation", "margin"), *((name, "publishers") for name in ("estop", "hold_to_run", "mode"))}

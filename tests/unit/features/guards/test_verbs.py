@@ -1,6 +1,7 @@
 import contextlib
 import errno
 import json
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +17,13 @@ from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitor_answers import (
     GivenSet,
     GivenState,
+    MonitorReadout,
     Monitors,
     MonitorState,
     Replacement,
     Switched,
 )
-from appliance.features.guards import suggest_verb, verbs
+from appliance.features.guards import show_verb, suggest_verb, verbs
 from appliance.features.guards.guard_answers import (
     GuardList,
     GuardPlan,
@@ -70,6 +72,7 @@ class Robot:
     as_json = False
     place: str | None = None
     off = False
+    readout = MonitorReadout("fence", {}, {}, 0.0)
 
     def __init__(self, folder: Path | None, *guards: Guard, shadow: bool = False) -> None:
         self.orders: list[Any] = []
@@ -104,6 +107,8 @@ class Robot:
             case admin.MonitorsWanted():
                 loaded = example(Monitors, files=self.files, folder=self.folder)
                 return msgspec.structs.replace(loaded, monitors=self.rows)
+            case admin.MonitorValuesWanted():
+                return self.readout
         self.orders.append(request)
         if isinstance(request, GuardNew):
             preset = PRESETS[request.preset]
@@ -322,6 +327,25 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})
     assert lines[2]["left_out"].startswith("/estop_enabled")
     assert lines[3:] == [{"not_protected": "no button stops /cmd_vel"}]
+
+
+@pytest.mark.parametrize(("now", "shown"), [(1.7e9 + 65, ("15.00 s ago", "[65.00 s ago, in 0.50 s, 0]")),
+                                            (None, ("1.7e+09", "[1.7e+09, 1.7e+09, 0]"))])  # fmt: skip
+def test_a_value_that_is_a_time_has_an_age(
+    now: float | None, shown: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = Robot(None, FENCE)
+    robot.loaded = [msgspec.structs.replace(LOADED[0], file="fence.rv")]
+    values = {"until": 1.7e9 + 50, "gap": 0.25, "top": [1.7e9, 1.7e9 + 65.5, 0.0], "lastX": 1e300}
+    robot.readout = MonitorReadout("fence", values, {}, 0.0, now_seconds=now)
+    run(show_verb.show, robot, "fence")
+    lines = [re.split(r"  +", line.strip()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[-4:] == [
+        ["until", shown[0], "seconds: the age of the position until which it is permitted"],
+        ["gap", "0.25", "seconds between two positions"],
+        ["top", shown[1], "the fastest motion and turn since the position"],
+        ["lastX", "1e+300", "the motion in force"],
+    ]
 
 
 def test_each_guard_of_the_list_has_its_digest_in_json(capsys: pytest.CaptureFixture[str]) -> None:
