@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import msgspec
 
 MASTER_PORT = 11311
+APPLIANCE = "a ROSRV appliance"
 LISTENERS = {MASTER_PORT: "a ROS master", 9090: "rosbridge", 8765: "foxglove_bridge"}
 """Ports of programs that give the graph to any host."""
 
@@ -89,6 +90,8 @@ class GraphInventory(msgspec.Struct, frozen=True):
     """The parts that a limit of the survey left out, in words."""
     own: tuple[str, ...] = ()
     """All addresses of nodes on the machine of the master, if the survey ran on that machine."""
+    protected: bool = False
+    """Whether an appliance answers as the master: its policy decides what each host may do."""
 
     def host_of(self, node: str) -> str:
         return self.hosts.get(node, "")

@@ -9,16 +9,18 @@ for well-known ports: a registered URI makes no other host a target.
 import asyncio
 import ipaddress
 import itertools
+import re
 import socket
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.base.host_names import addresses_of
 from appliance.rpc.graph_inventory import (
+    APPLIANCE,
     LISTENERS,
     MASTER_PORT,
     GraphInventory,
@@ -37,6 +39,8 @@ from roswire.xmlrpc import Value, XmlRpcLimits
 _CALLER = "/rosrv_survey"
 _LIMITS = XmlRpcLimits(body=16 << 20)
 _LONGEST = 256  # characters of a name or text
+_LONGEST_DENIAL = 2048
+_RECORD = re.compile(r" \[[0-9a-f]{20}\]$")  # the end of a denial
 _HOST_SHARE = 0.25  # of the whole time
 _PORT_SECONDS = 1.0  # of a well-known port
 
@@ -67,6 +71,10 @@ async def survey(uri: str, limits: SurveyLimits) -> GraphInventory:
     return await _Survey(master, uri, limits).read()
 
 
+class _DeniedError(CallFailedError):
+    """An appliance answers, and its policy denies the call."""
+
+
 class _Asked(NamedTuple):
     """The answers of a node; `problem` is why it could not be asked."""
 
@@ -90,6 +98,7 @@ class _Survey:
         )
         try:
             state = await self._asked(master, "getSystemState")
+            protected = await self._is_appliance(master)
             types = dict(_pairs(await self._asked(master, "getTopicTypes")))
             parameters = _names(await self._asked(master, "getParamNames"))
             publishers, subscribers, services = (
@@ -108,6 +117,10 @@ class _Survey:
             )
             nodes, rates = await self._nodes(master, names)
             found = await self._services(master, self._cut("services", sorted(services)), services)
+        except _DeniedError as error:
+            raise SurveyError(
+                f"{error}. An appliance answers as the master: its policy decides what this host may read"
+            ) from None
         except CallFailedError as error:
             raise SurveyError(f"{error}. Is {self._uri} the robot's ROS_MASTER_URI?") from None
         finally:
@@ -128,9 +141,10 @@ class _Survey:
         answering = {node.host for node in nodes if not node.problem}
         return GraphInventory(
             self._uri, host, nodes, topics, found, tuple(self._cut("parameters", sorted(parameters))),
-            await self._listeners(host, answering), self._calls,
+            await self._listeners(host, answering, protected=protected), self._calls,
             round(clock.now() - self._began, 2), tuple(self._left_out),
             tuple(sorted(filter(is_here, {*hosts} - {""}))) if is_here(host) else (),
+            protected,
         )  # fmt: skip
 
     def _cut(self, what: str, names: Sequence[str]) -> Sequence[str]:
@@ -147,6 +161,8 @@ class _Survey:
         """Return the value of an answer. Raises `CallFailedError`."""
         answer = await self._answer(client, method, *parameters)
         if not (isinstance(answer, list) and len(answer) == 3 and answer[0] == 1):
+            if _is_denial(answer):
+                raise _DeniedError(f"{method} was denied: {_text(answer[1], _LONGEST_DENIAL)}")
             said = _text(answer[1]) if isinstance(answer, list) and len(answer) > 1 else "not a ROS answer"
             raise CallFailedError(f"{method} was answered with: {said}")
         return answer[2]
@@ -156,6 +172,13 @@ class _Survey:
             raise CallFailedError(f"the survey takes longer than {self._limits.whole:g} s")
         self._calls += 1
         return await client.call(method, _CALLER, *parameters)
+
+    async def _is_appliance(self, master: XmlRpcClient) -> bool:
+        try:
+            ports = await self._asked(master, "getRVState")
+        except CallFailedError as error:
+            return isinstance(error, _DeniedError)
+        return isinstance(ports, list) and len(ports) == 3
 
     async def _nodes(
         self, master: XmlRpcClient, names: Sequence[str]
@@ -251,8 +274,10 @@ class _Survey:
                 name: next(iter(sorted(found[name], key=lambda one: ":" in one)), "") for name in new
             }
 
-    async def _listeners(self, master: str, hosts: set[str]) -> tuple[OpenPort, ...]:
+    async def _listeners(self, master: str, hosts: set[str], *, protected: bool) -> tuple[OpenPort, ...]:
         """Connect to well-known ports of these hosts, and close at once."""
+        place = master, self._master.port
+        own = OpenPort(*place, APPLIANCE if protected else LISTENERS[MASTER_PORT])
 
         async def one(row: tuple[str, int]) -> OpenPort | None:
             host, port = row
@@ -262,12 +287,11 @@ class _Survey:
             except (OSError, TimeoutError):
                 return None
             writer.close()
-            return OpenPort(host, port, LISTENERS[port])
+            return OpenPort(host, port, LISTENERS[port]) if row != place else own
 
         pairs = itertools.product(sorted({master, *hosts} - {""}), LISTENERS)
         seconds = 2 * _PORT_SECONDS
         found = await serve_by_host({row: row[0] for row in pairs}, one, HostShare(seconds, seconds))
-        own = OpenPort(master, self._master.port, LISTENERS[MASTER_PORT])
         return tuple(dict.fromkeys([own, *filter(None, found.values())]))
 
 
@@ -282,11 +306,19 @@ def is_here(address: str) -> bool:
     return False
 
 
-def _text(value: object) -> str:
+def _is_denial(answer: Value) -> TypeGuard[list[Value]]:
+    """Return whether an answer names its audit record, as only an appliance's does."""
+    return (
+        isinstance(answer, list) and len(answer) == 3 and isinstance(answer[1], str)
+        and _RECORD.search(answer[1]) is not None
+    )  # fmt: skip
+
+
+def _text(value: object, longest: int = _LONGEST) -> str:
     """Return a text of a node, without control characters, or its type in brackets."""
     if not isinstance(value, str):
         return f"<{type(value).__name__}>"
-    return "".join(char if char.isprintable() else "?" for char in value[:_LONGEST])
+    return "".join(char if char.isprintable() else "?" for char in value[:longest])
 
 
 def _connection(row: list[Value]) -> NodeConnection:

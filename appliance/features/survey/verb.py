@@ -28,6 +28,8 @@ from appliance.rpc.graph_reader import SurveyError, SurveyLimits
 from appliance.rpc.graph_reader import survey as read_graph
 from rosmop.tool.terminal import say
 
+_PROTECTED = "an appliance answers as the master; its policy decides for each host: rosrv policy who-may"
+
 # Make the HTML page and the text of an inventory. The page has no scripts, and all that robots wrote is escaped.
 
 
@@ -38,7 +40,10 @@ def page(inventory: GraphInventory, draft: PolicyDraft | None) -> str:
         f"<p>{text(summary(inventory))}</p>\n",
     ]
     parts += [f"<p>Not complete: {text(reason)}.</p>\n" for reason in inventory.left_out]
-    parts += section("Any host that reaches the master may today", (), exposure(inventory).items())
+    if inventory.protected:
+        parts.append(f"<p>{text(_PROTECTED)}.</p>\n")
+    else:
+        parts += section("Any host that reaches the master may today", (), exposure(inventory).items())
     parts += section(
         "Ports that answered", ("host", "port", "what is usually there"),
         [(listener.host, listener.port, listener.what) for listener in inventory.listeners],
@@ -92,8 +97,11 @@ def report(inventory: GraphInventory) -> Iterator[str]:
     """Yield the lines for a terminal: the same in the order of what a reader asks first."""
     yield summary(inventory)
     yield from (f"not complete: {reason}" for reason in inventory.left_out)
-    yield "any host that reaches the master may today:"
-    yield from (f"  {what}: {number}" for what, number in exposure(inventory).items())
+    if inventory.protected:
+        yield _PROTECTED
+    else:
+        yield "any host that reaches the master may today:"
+        yield from (f"  {what}: {number}" for what, number in exposure(inventory).items())
     yield from (f"open: {each.host}:{each.port} ({each.what})" for each in inventory.listeners)
     yield from (f"wrong: {fault}" for fault in problems(inventory))
     yield from (f"host {host}: {nodes}" for host, nodes in _hosts(inventory))

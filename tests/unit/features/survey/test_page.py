@@ -28,6 +28,13 @@ def test_the_report_says_in_numbers_what_any_host_may_do() -> None:
     assert "named like a secret: /wifi/password" in lines
 
 
+def test_behind_an_appliance_no_host_is_said_to_be_free() -> None:
+    found = inventory(protected=True, listeners=())
+    for text in ("\n".join(report(found)), page(found, None)):
+        assert "its policy decides for each host: rosrv policy who-may" in text
+        assert not any(said in text for said in ("any host", "Any host", "nodes that it can end"))
+
+
 def test_the_report_on_the_page_is_this_one() -> None:
     text = (Path(__file__).parents[4] / "docs" / "try-for-an-hour.md").read_text()
     shown = text.partition("--policy draft.ini\n")[2].partition("    …")[0]

@@ -39,7 +39,7 @@ class FakeClient:
         answer = self.answers.get(method, (MASTER if self.is_master else NODE).get(method))
         if isinstance(answer, Exception):
             raise answer
-        return [1, "", answer]
+        return list(answer) if isinstance(answer, tuple) else [1, "", answer]
 
     def close(self) -> None:
         pass
@@ -81,7 +81,7 @@ def test_messages_are_counted_by_both_clients(run: Any, row: list[object]) -> No
 
 def test_only_calls_that_read_are_made(run: Any) -> None:
     run()
-    assert set(FakeClient.asked) == {*MASTER, *NODE}
+    assert set(FakeClient.asked) == {"getRVState", *MASTER, *NODE}
     assert not any(
         method.startswith(("register", "unregister", "set", "delete", "shutdown"))
         for method in FakeClient.asked
@@ -122,6 +122,26 @@ def test_a_master_that_answers_nonsense_is_an_error_or_an_empty_list(
     else:
         assert method != "getSystemState"
         assert len(found.nodes) == 2
+
+
+DENIED = (0, f"{'a' * 300} is not granted [18e9aa02efc40abb0e51]", [])
+
+
+@pytest.mark.parametrize(
+    ("answer", "protected"),
+    [(DENIED, True), ((1, "", [11312, 11311, []]), True), ((0, "not supported", 0), False), ((1, "", 0), False),
+     ((-1, "unknown [12]", 0), False), (UnansweredError("no such method"), False)],
+)  # fmt: skip
+def test_an_appliance_at_the_master_is_recognised(run: Any, answer: object, protected: bool) -> None:
+    found = run(getRVState=answer)
+    assert found.protected is protected
+    assert [port.what for port in found.listeners] == ["a ROSRV appliance" if protected else "a ROS master"]
+
+
+def test_a_denied_visitor_gets_the_record_and_is_not_sent_elsewhere(run: Any) -> None:
+    with pytest.raises(SurveyError, match=r"\[18e9aa02efc40abb0e51\]") as error:
+        run(getSystemState=DENIED)
+    assert "ROS_MASTER_URI" not in str(error.value)
 
 
 def test_a_limit_is_named_in_the_inventory(run: Any) -> None:
