@@ -31,7 +31,7 @@ from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.machine_side import master_of, start_stand_in
 from appliance.features.adopt.operator_orders import RELEASE, ordered
 from appliance.features.adopt.places import call_node
-from appliance.features.adopt.requests import ReleaseOrder
+from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
 from appliance.features.adopt.robot_side import MASTER_PORT, remove_drop_ins, running_settings
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation
 from appliance.master.graph.graph import Grants, RosGraph
@@ -255,7 +255,7 @@ def release(
         say_json(msgspec.to_builtins(report))
         return
     if not report.nodes:
-        say("nothing was adopted: the robot's nodes use their own master")
+        say("nothing is adopted: nodes that use this appliance go on using it")
         return
     if report.withheld:
         withheld = counted(report.withheld, "registration")
@@ -291,6 +291,9 @@ def _order(appliance: Appliance, state: Path) -> GiveBackReport:
 
 def _stand(appliance: Appliance, within: float) -> None:
     try:
+        adopted = appliance.ask(AdoptStatus())
+        if adopted.ok and adopted.given().phase == "free":
+            return
         answer = appliance.ask(StatusWanted())
     except NotRunningError:
         return

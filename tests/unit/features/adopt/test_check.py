@@ -1,6 +1,7 @@
 import asyncio
 import ipaddress
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,16 +9,21 @@ import msgspec
 import pytest
 
 from appliance.base.shipped import SHIPPED
+from appliance.channel.admin import AdminAnswer
 from appliance.features.adopt import adopt_check, release_verb
+from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import RobotMaster
 from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
 from appliance.features.adopt.robot_side import AUDIT_ONLY, make_audit_only
 from appliance.network.listening_sockets import TcpSocket
 from appliance.network.namespaces import NetworkError
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.graph_inventory import GraphInventory, SurveyedNode, SurveyedService, SurveyedTopic
+from tests.support.answers import example
+from tests.support.memory_call import call_of
 
 MASTER = RobotMaster(1, "/usr/bin/rosmaster", "robot", "roscore.service", "system.slice/roscore.service")
 LINK = ipaddress.ip_address("10.111.0.1")
@@ -164,6 +170,23 @@ def test_a_release_without_the_appliance_looks_for_the_master_on_its_port(
     machine = release_verb.DeadMachine(tmp_path, AdoptRecord(), release_verb.port_of_master(tmp_path))
     asyncio.run(machine("look"))
     assert asked == [int(listen[-5:])]
+
+
+@pytest.mark.parametrize("phase", ["free", "taken"])
+def test_a_robot_that_was_never_adopted_is_released_without_a_wait(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], phase: str
+) -> None:
+    def answer(request: object) -> object:
+        if isinstance(request, AdoptStatus):
+            return example(AdoptState, phase=phase)
+        assert isinstance(request, ReleaseOrder) or phase == "taken"
+        return GiveBackReport() if isinstance(request, ReleaseOrder) else AdminAnswer(False, error="down")
+
+    monkeypatch.setattr(release_verb.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(release_verb, "ordered", lambda _state, _order: nullcontext())
+    monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
+    release_verb.release.function(call_of(answer), dead=False, force=False, within=1.0)
+    assert capsys.readouterr().out == "nothing is adopted: nodes that use this appliance go on using it\n"
 
 
 def test_connections_that_would_be_cut_are_counted() -> None:
