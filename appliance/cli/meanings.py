@@ -118,6 +118,7 @@ REMARKS = {
 }
 """Remarks on first words. In braces are the keys of `_service`."""
 
+_STOPS = "stop halt freeze brake panic emergency estop e-stop emergency-stop pause"
 IN_GROUPS = {
     "approval": ("list ls show approve grant accept allow", "approve", ""),
     "config": (
@@ -125,9 +126,9 @@ IN_GROUPS = {
         "config check",
         "Change appliance.yaml, and restart the appliance: {restart}.",
     ),
-    "drive": ("stop halt estop", "", "{estop}"),
+    "drive": (_STOPS, "", "{estop}"),
     "fleet": ("list ls status info show", "status", ""),
-    "guard": ("disable off stop pause", "monitor disable", ""),
+    "guard": (_STOPS, "", "{estop}"),
     "report": ("list show generate create print", "report interventions", ""),
     "topic": ("pub publish", "", "This program sends no message: rostopic pub."),
     "node": ("kill stop cleanup", "", "{kill}"),

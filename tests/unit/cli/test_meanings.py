@@ -61,7 +61,7 @@ GUESSES = """
     systemctl stop|docker compose stop|Ctrl-C: stop shutdown down kill
     systemctl restart|docker compose restart|Ctrl-C: restart reboot
     rosnode kill NODE: kill, node kill
-    stops no robot: estop halt freeze stop emergency-stop, drive stop
+    stops no robot: estop halt freeze stop emergency-stop, drive stop, guard stop, guard pause, guard halt
     tools of ROS: run launch pub exec call
     clears nothing: flush reset clear
     at boot|at each boot: enable disable
