@@ -166,7 +166,8 @@ def _show(found: Granted, record: str) -> None:
         say(printable(finding), "red")
     if found.tool_needs:
         more = counted(len(found.tool_needs), "more line")
-        say(f"{found.tool} needs {more} to work: rosrv policy grant {shlex.quote(record)} --tool", "yellow")
+        all_of_it = f"rosrv policy grant {shlex.quote(record)} --tool"
+        say(f"other verbs of {found.tool} need up to {more}: {all_of_it}", "yellow")
 
 
 def _granted(appliance: Appliance, record: str, *, tool: bool, until: str) -> Granted:
