@@ -25,6 +25,7 @@ from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
 from appliance.specifications.checking import check
 from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder
+from appliance.supervisor.clock_sync import clock_is_synchronised
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.state_directory import foreign, made_before_0_4
@@ -225,6 +226,8 @@ def _clock(state: Path) -> Iterator[SelftestFinding]:
         yield fail(
             "clock", f"the last record of the audit log is {ahead:.0f} s in the future", "set the clock"
         )
+    elif clock_is_synchronised() is False:
+        yield warn("clock", "no time service synchronises it", "run chrony or systemd-timesyncd")
     else:
         yield ok("clock", clock.utc_now().strftime("%Y-%m-%d %H:%MZ"))
 

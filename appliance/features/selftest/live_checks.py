@@ -20,7 +20,7 @@ from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.channel.alarms import SWITCHED_OFF, open_alarms
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.audit_source import AuditSource, audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.cli.status_verb import troubles_of
@@ -178,6 +178,9 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 1.0
 def running(appliance: Appliance) -> Iterator[SelftestFinding]:
     try:
         answer = appliance.ask(StatusWanted())
+    except AccessDeniedError as error:
+        yield fail("appliance", str(error), "sudo rosrv selftest" if appliance.place is None else "")
+        return
     except NotRunningError as error:
         yield fail(
             "appliance",

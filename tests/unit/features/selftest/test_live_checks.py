@@ -2,6 +2,7 @@ import secrets
 import time
 from collections.abc import Iterator
 from itertools import chain, islice, repeat
+from typing import NoReturn
 
 import httpx
 import pytest
@@ -10,6 +11,7 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.base import clock
 from appliance.channel.answers.status import Status
+from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.features.selftest import live_checks
 from tests.support.answers import example
@@ -79,6 +81,16 @@ def test_an_unreadable_log_is_not_a_defect() -> None:
     found, text, _searches = outcome(DENIED)
     assert found == "skip"
     assert "too many requests" in text
+
+
+@pytest.mark.parametrize(("error", "advice"), [(AccessDeniedError("use sudo"), "sudo rosrv selftest"),
+                                               (NotRunningError("away"), "start it (rosrv up)")])  # fmt: skip
+def test_a_user_without_access_is_not_told_to_start_it(error: Exception, advice: str) -> None:
+    def answer(_request: object) -> NoReturn:
+        raise error
+
+    [found] = live_checks.running(call_of(answer))
+    assert (found.outcome, found.advice.partition(",")[0]) == ("fail", advice)
 
 
 OFF = {"about": "monitors", "name": "gun", "what": "monitor gun is disabled", "again": "rosrv monitor enable gun",
