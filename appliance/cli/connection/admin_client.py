@@ -94,6 +94,9 @@ class AdminSocket:
         except TimeoutError:
             text = f"{path}: the appliance did not answer within {self._seconds:g} s"
             raise NotRunningError(f"{text}; {UNKNOWN}") from None
+        except ConnectionError as error:
+            text = str(error) if error.errno is None else f"the appliance ended before it answered; {UNKNOWN}"
+            raise NotRunningError(f"{path}: {text}") from None
         except OSError as error:
             raise NotRunningError(f"{path}: {error.strerror or error}") from error
         try:
