@@ -94,10 +94,11 @@ async def _of_http(request: Request, error: Exception) -> Response:
                 headers={"Link": f'<{PATH}>; rel="service-doc"'},
             )
         case 405:
-            allowed = {"Allow": ", ".join(sorted(_methods(request)))}
+            allowed = ", ".join(sorted(_methods(request)))
             problem = ProblemError(
-                405, "wrong-method", "this path does not have that method", headers=allowed
-            )
+                405, "wrong-method", f"this path does not have that method; it has: {allowed}",
+                headers={"Allow": allowed},
+            )  # fmt: skip
         case status:
             problem = ProblemError(status, "bad-request", str(error.detail), headers=error.headers)
     return _answer(request, problem)
@@ -121,4 +122,4 @@ def _methods(request: Request) -> set[str]:
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101  registered for it
     bad = [BadInput(where=".".join(map(str, found["loc"])), text=refusal(found)) for found in error.errors()]
-    return _answer(request, bad_input(bad))
+    return _answer(request, bad_input([*dict.fromkeys(bad)]))

@@ -117,12 +117,12 @@ class TokenAuthenticator:
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the bearer. Raises `ProblemError` (401, 429, 503)."""
-        if authorization is None:
-            raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
+        scheme, _space, text = (authorization or "").partition(" ")
+        text = text.strip() if scheme.lower() == "bearer" else ""
+        if not text:
+            raise self._refusal("no token: send it (or its reading key) as `Authorization: Bearer TOKEN`")
         if not self._stated:
             raise ProblemError(503, "not-available", "the appliance is starting: try again", retry_after=1)
-        scheme, _space, text = authorization.partition(" ")
-        text = text.strip() if scheme.lower() == "bearer" else ""
         parsed = parse_token(text)
         kept = self._tokens.get(parsed[0] if parsed is not None else reading_id(text) or "")
         if kept is not None and (

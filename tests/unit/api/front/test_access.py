@@ -63,6 +63,15 @@ def test_a_step_back_of_the_clock_revives_no_token() -> None:
         assert door.end_of(bearer, "10.0.0.9")
 
 
+def test_a_request_that_sends_no_token_is_told_so_and_counts_as_no_wrong_one() -> None:
+    door = TokenAuthenticator(1, lambda _token: None)
+    door.state([])
+    for header in (None, "", "Basic dTpw", "Bearer", "Bearer  ", "Basic dTpw"):
+        with pytest.raises(ProblemError, match="no token: "):
+            run(door.recognise(header, "10.0.0.1"))
+    assert [recognise(door, "Bearer x") for _ in range(2)] == [401, 429]
+
+
 def test_an_expired_token_is_refused() -> None:
     row, text = make_token("a", "viewer", now=clock.wall() - 100, seconds=50)
     door = TokenAuthenticator(10, lambda _token: None)

@@ -45,6 +45,7 @@ def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, A
     told = [", ".join(sorted(method.upper() for method in contract["paths"][path])) for path in paths]
     found = [(answer.status_code, answer.headers["allow"]) for answer in answers]
     assert found == [(405, methods) for methods in told]
+    assert all(answer.json()["detail"].endswith(f"; it has: {answer.headers['allow']}") for answer in answers)
 
 
 def _unbounded(
