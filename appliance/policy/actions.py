@@ -26,8 +26,8 @@ def parse_action(text: str) -> tuple[Category, str]:
     verb, _, name = text.strip().partition(" ")
     category = VERBS.get(verb)
     if category is None:
-        guess = meant(verb, VERBS) or f"; one of {', '.join(VERBS)}"
-        raise BadWordError(f"{quoted(text)} does not begin with a known verb{guess}")
+        verbs = ", ".join(VERBS)
+        raise BadWordError(f"{quoted(text)} does not begin with a known verb; one of {verbs}")
     return category, check_resource(category, name.strip())
 
 

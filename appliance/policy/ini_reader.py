@@ -63,6 +63,10 @@ def read(text: str, findings: Findings) -> list[SectionText]:
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(Place(), f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []
+    if (at := text.find("\0")) >= 0:
+        place = Place(text.count("\n", 0, at) + 1, at - text.rfind("\n", 0, at))
+        findings.error(place, f"unexpected character {quoted(text[at])}: this is not a text file")
+        return []
     sections: list[SectionText] = []
     for number, raw in enumerate(text.removeprefix("\ufeff").split("\n"), start=1):
         line = _without_comment(raw.removesuffix("\r"))

@@ -297,7 +297,7 @@ def explain_request(
         raise usage_error("give exactly one action of the host: --publish TOPIC, --command CALL, …")
     policy = compiled(appliance, file, robot, enrolled)
     if not chosen:
-        raise typer.Exit(_list_rights(appliance, policy, host))
+        raise typer.Exit(_list_rights(appliance, policy, host, "in force" if file is None else str(file)))
     category, name = chosen[0]
     try:
         request = Request(asking_host(host, policy), node, category, check_resource(category, name))
@@ -337,9 +337,7 @@ def show_host(
     """
     policy = compiled(appliance, None, None, None)
     host = _known_as(name, policy)
-    if not appliance.as_json:
-        say(f"{host}, by the policy in force:", "bold")
-    status = _list_rights(appliance, policy, host)
+    status = _list_rights(appliance, policy, host, "in force")
     address = asking_host(host, policy)
     for part in parts_of_host(policy, address):
         if appliance.as_json:
@@ -358,11 +356,13 @@ def _known_as(name: str, policy: Policy) -> str:
     return name
 
 
-def _list_rights(appliance: Appliance, policy: Policy, host: str) -> int:
+def _list_rights(appliance: Appliance, policy: Policy, host: str, which: str) -> int:
     try:
         address = asking_host(host, policy)
     except BadWordError as error:
         raise usage_error(str(error)) from error
+    if not appliance.as_json:
+        say(f"{host}, by the policy {which}:", "bold")
     rights = list(rights_of_host(policy, address))
     for right in rights:
         if appliance.as_json:
