@@ -64,6 +64,7 @@ OUTPUT_LINES = 40  # last lines kept of a failing process
 _LONGEST_LINE = 500  # characters
 _SUSPENDED_SECONDS = 0.2  # until a start is tried again that a pause delays
 _AGREED_SECONDS = 10.0  # that an ordered end waits for control
+_UNANSWERED = "the supervisor killed it, because it did not answer"
 _MAX_UNANSWERED = 4096  # requests of control at once
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
@@ -677,8 +678,9 @@ class Supervisor:
         else:
             process.ping()
         if process.is_hanging:
-            log.error("process does not answer and is killed", role=process.role, pid=process.pid)
-            process.reason = "the supervisor killed it, because it did not answer"
+            if process.reason != _UNANSWERED:
+                log.error("process does not answer and is killed", role=process.role, pid=process.pid)
+            process.reason = _UNANSWERED
             process.kill()
 
     def _ask(self, process: ProcessHandle) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from appliance.backup.contents import BackupError
 from appliance.base.erasure import write_over
+from appliance.base.user_errors import with_remedy
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
 
@@ -20,7 +21,7 @@ def require_state_directory(state: Path) -> None:
     try:
         reason = foreign(state.absolute())
     except OSError as error:
-        reason = f"{state}: {error.strerror}"
+        reason = with_remedy(error, state)
     if reason is not None:
         raise BackupError(reason)
 
@@ -41,7 +42,7 @@ def purge(state: Path) -> tuple[int, int]:
     except StartError as error:
         raise BackupError(str(error)) from None
     except OSError as error:
-        raise BackupError(f"{state}: {error.strerror}") from error
+        raise BackupError(with_remedy(error, state)) from error
     try:
         counts = _write_over(state)
         # The lock is still held, so no appliance can start in between.
@@ -53,7 +54,7 @@ def purge(state: Path) -> tuple[int, int]:
         os.sync()
     except OSError as error:
         raise BackupError(
-            f"{error.filename or state}: {error.strerror}; the remaining files are unchanged"
+            f"{with_remedy(error, error.filename or state)}; the remaining files are unchanged"
         ) from error
     finally:
         lock.close()

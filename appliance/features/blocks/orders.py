@@ -194,7 +194,8 @@ class BlockOrders:
             some = ", ".join(
                 str(network).removesuffix("/32").removesuffix("/128") for network in networks[:_MAX_NAMED]
             )
-            raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
+            shown = "" if "/" in text else f" ({some})"
+            raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time{shown}")
         return plain_address(str(networks[0].network_address))
 
     def _require_possible(self, address: Address) -> None:

@@ -57,6 +57,7 @@ def times_in_words(times: GuardTimes) -> str:
     """Say how late a guard has been, with what was measured, and since when."""
     since = datetime.fromtimestamp(times.since, UTC)
     span = f"{times.seconds / 3600:.1f} h" if times.seconds >= 3600 else f"{times.seconds / 60:.0f} min"
+    span = span if times.seconds >= 60 else f"{times.seconds:.0f} s"
     return (
         f"in {span} in force since {since:%Y-%m-%d %H:%MZ}, {times.late:,} of {times.timed:,} ticks and messages came"
         f" more than {times.limit * 1e3:g} ms late, the latest {times.latest * 1e3:.1f} ms"
