@@ -294,7 +294,7 @@ class Interceptor:
         elif isinstance(message, ValuesWanted):
             now = self.now()
             found = None if self.monitors is None else self.monitors.read_out(message.monitor, now)
-            self._reporter.send(ValuesSeen(message.number, *(found or (None, {})), now))
+            self._reporter.send(ValuesSeen(message.number, *(found or (None, {})), now_ns=now))
         else:
             self._given[message.name] = dict(message.values)
             self._apply()

@@ -124,7 +124,7 @@ def test_a_master_that_answers_nonsense_is_an_error_or_an_empty_list(
         assert len(found.nodes) == 2
 
 
-DENIED = (0, f"{'a' * 300} is not granted [18e9aa02efc40abb0e51]", [])
+DENIED: tuple[int, str, list[str]] = (0, f"{'a' * 300} is not granted [18e9aa02efc40abb0e51]", [])
 
 
 @pytest.mark.parametrize(
