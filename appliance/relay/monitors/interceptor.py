@@ -294,7 +294,8 @@ class Interceptor:
         elif isinstance(message, ValuesWanted):
             now = self.now()
             found = None if self.monitors is None else self.monitors.read_out(message.monitor, now)
-            self._reporter.send(ValuesSeen(message.number, *(found or (None, {})), now_ns=now))
+            values, ages = found or (None, dict[str, float | None]())
+            self._reporter.send(ValuesSeen(message.number, values, ages, now))
         else:
             self._given[message.name] = dict(message.values)
             self._apply()
