@@ -4,10 +4,12 @@ import contextlib
 import os
 import re
 import signal
+import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.support.appliance import Appliance
 from tests.system.console.reader import LIMIT, Reader
@@ -82,3 +84,96 @@ def test_a_page_whose_computer_slept_is_not_taken_for_live(opened: Callable[...,
     expect(page.locator("[data-standing=live]")).to_be_visible()
     page.evaluate(f"window.shifted = {HOUR}")
     expect(page.get_by_role("dialog", name="Locked")).to_be_visible(timeout=2 * LIMIT)
+
+
+_STANDBY = {
+    "role": "standby", "name": "b", "address": "10.0.0.2", "since": "2026-01-02T03:04:05Z", "epoch": 2,
+    "fixed": "10.0.0.9", "obstacle": "", "troubles": [], "not_serving": "", "answers_alone": False,
+    "other": {"name": "a", "address": "10.0.0.1", "connected": True},
+    "witness": {"address": "10.0.0.3", "answered_seconds": 1.0, "holder": "a", "refusal": "", "trouble": ""},
+}  # fmt: skip
+
+
+def _group(holder: str) -> dict[str, Any]:
+    group = {"group": "base", "names": ["/cmd_vel"], "holder": holder, "held_seconds": 1.0, "lease": 5.0}
+    return group | {"left_seconds": 5.0, "waiting": [], "ranks": [], "not_carried": []}
+
+
+def _kept(page: Page, path: str) -> list[Route]:
+    routes: list[Route] = []
+
+    def keep(route: Route) -> None:
+        routes.append(route)
+
+    page.route(path, keep)
+    return routes
+
+
+def _held(page: Page, routes: list[Route], number: int) -> Route:
+    """Wait for a request that the test answers; the waiting is the page's, so that it goes on."""
+    until = time.monotonic() + LIMIT / 1000
+    while len(routes) < number and time.monotonic() < until:
+        page.wait_for_timeout(50)
+    return routes[number - 1]
+
+
+def test_a_slow_answer_is_shown(opened: Callable[..., Reader]) -> None:
+    """Each answer takes longer than the pause between two requests."""
+    reader = opened()
+    routes = _kept(reader.page, "**/v1/drive")
+    page = reader.go("now")
+    for number in range(1, 4):
+        route = _held(page, routes, number)
+        page.wait_for_timeout(3000)
+        assert len(routes) == number, "no further request while one runs"
+        route.fulfill(json={"groups": [_group(f"10.0.0.{number}")]})
+        expect(page.get_by_role("link", name=re.compile("^Drives"))).to_contain_text(f"10.0.0.{number}")
+
+
+def test_what_no_answer_confirms_has_its_age(opened: Callable[..., Reader]) -> None:
+    reader = opened()
+    routes = _kept(reader.page, "**/v1/drive")
+    page = reader.go("now")
+    drives = page.get_by_role("link", name=re.compile("^Drives"))
+    _held(page, routes, 1).fulfill(json={"groups": [_group("10.0.0.1")]})
+    expect(drives).to_have_text(re.compile(r"^Drives[^,]*10\.0\.0\.1"))
+    _held(page, routes, 2)
+    expect(drives).to_have_text(re.compile(r"^Drives, \d+ s ago.*10\.0\.0\.1"))
+
+
+@pytest.mark.parametrize(
+    ("view", "path", "answer"),
+    [
+        ("robot", "drive", {"groups": [_group("10.0.0.1")]}),
+        ("robot", "doors", {"doors": []}),
+        ("robot", "door", {"door": {"name": "d", "node": "/d", "address": "10.0.0.1", "trouble": "starts"}}),
+        ("hosts", "hosts", None),
+        ("standby", "standby", _STANDBY),
+    ],
+)
+def test_a_request_that_fails_later_is_seen(
+    opened: Callable[..., Reader], view: str, path: str, answer: dict[str, Any] | None
+) -> None:
+    reader = opened()
+    page = reader.page
+    answered: list[Route] = []
+
+    def answer_once(route: Route) -> None:
+        answered.append(route)
+        if len(answered) > 1:
+            route.abort()
+        elif answer is None:
+            route.continue_()
+        else:
+            route.fulfill(json=answer)
+
+    page.route(f"**/v1/{path}", answer_once)
+    if view == "standby":
+        passive = {"type": "urn:rosrv:problem:standby", "title": "Standby", "active": "10.0.0.1"}
+        page.route("**/v1/live*", lambda route: route.fulfill(status=503, json=passive))
+        reader.page.goto(f"{reader.url}/console/now")
+    else:
+        reader.go(view)
+    if view == "hosts":
+        page.get_by_role("button", name="Reload hosts.yaml").click()
+    expect(page.get_by_text(re.compile(r"What is shown is of \d+ s ago"))).to_be_visible()

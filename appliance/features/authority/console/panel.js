@@ -16,9 +16,10 @@ import { isSilent, isStuck, NotCarried, useGroups } from "./situation.js";
 const VERBS = { assign: "Assign", free: "Free", ask: "Ask" }; // as those of `rosrv drive`
 
 export function Drive() {
-  const { value, error, again, rows } = useGroups();
+  const { value, error, heard, again, rows } = useGroups();
   return html`<section class="panel" aria-labelledby="drive"><div class="panel-head"><h2 id="drive">Who drives</h2></div>
-    ${error && !value ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${2} />`
+    ${error && html`<div class="panel-body"><${Failure} error=${error} retry=${again} heard=${heard} /></div>`}
+    ${!value ? !error && html`<${Loading} rows=${2} />`
       : !rows.length ? html`<${Empty} icon="hosts" title="No command authority">Every host with the right to publish commands the robot. <code>[Authority]</code> in the policy names topics that one host at a time commands.</${Empty}>`
       : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Group</th><th>Driver or holder</th><th>Waits</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((/** @type {any} */ one) => html`<${Group} key=${one.group} group=${one} again=${again} />`)}</tbody></table></div>`}</section>`;

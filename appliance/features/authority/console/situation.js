@@ -1,6 +1,6 @@
 /** Who drives, in the situation, and what both this line and the robot's page read. */
 
-import { html, useEffect } from "#console/html.js";
+import { html } from "#console/html.js";
 import { lasting } from "#console/moments.js";
 import { Badge } from "#console/parts/badge.js";
 import { Fact } from "#console/parts/fact.js";
@@ -13,20 +13,16 @@ const EVERY = 2000; // milliseconds
 const MAX = 2; // hosts by name
 
 export function useGroups() {
-  const { value, error, again } = useResource((signal) => get("/v1/drive", {}, signal), []);
-  useEffect(() => {
-    const timer = setInterval(again, EVERY);
-    return () => clearInterval(timer);
-  }, []);
-  return { value, error, again, rows: value?.groups ?? [] };
+  const drive = useResource((signal) => get("/v1/drive", {}, signal), [], EVERY);
+  return { ...drive, rows: drive.value?.groups ?? [] };
 }
 
 /** Who drives, in the situation: one line for each group. */
 export function Drives() {
-  const { value, error, rows } = useGroups();
+  const { value, error, heard, rows } = useGroups();
   const silent = rows.some((/** @type {any} */ one) => isSilent(one));
   const waits = rows.some((/** @type {any} */ one) => one.waiting.length);
-  return html`<${Fact} name="Drives" to="/console/robot" tone=${silent || waits || rows.some(isStuck) ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
+  return html`<${Fact} name="Drives" to="/console/robot" failed=${error && heard} tone=${silent || waits || rows.some(isStuck) ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
     ${one.ranks.length ? html`<${Given} value=${one.group} most=${40} /> <${Badge} word=${one.standing} tone=${isStuck(one) ? "warn" : ""} /> ${one.held_seconds !== null && html`<span class="nowrap">for ${lasting(one.held_seconds)}</span>: `}<span class="muted"><${Sentence} value=${one.why} most=${200} /></span>` : one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
     ${one.not_carried.filter((/** @type {any} */ each) => each.order).slice(0, MAX).map((/** @type {any} */ each) => html`<div class="muted small"><${NotCarried} one=${each} /></div>`)}
     ${one.waiting.length > 0 && html` <${Badge} word="waits" tone="warn" /> <${Host} value=${one.waiting[0]} />${one.waiting.length > 1 && ` and ${one.waiting.length - 1} more`}`}</div>`)}</${Fact}>`;

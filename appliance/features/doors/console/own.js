@@ -18,7 +18,7 @@ const STARTING = 2000; // milliseconds between two looks at a door that does not
 const PARTS = { Button, Failure, Field, Given, Loading, Notice, ask, failed, optional };
 
 export function OwnDoor() {
-  const { value, error, again } = useResource((signal) => get("/v1/door", {}, signal), []);
+  const { value, error, heard, again } = useResource((signal) => get("/v1/door", {}, signal), [], (value) => (value?.door?.trouble ? STARTING : 0));
   const [open, setOpen] = useState(/** @type {{Teleop: any, ticket: string} | null} */ (null));
   const [ended, setEnded] = useState("");
   const signedIn = useStore(session, ({ current }) => current !== null);
@@ -26,11 +26,6 @@ export function OwnDoor() {
   useEffect(() => {
     if (!signedIn) setOpen(null);
   }, [signedIn]);
-  useEffect(() => {
-    if (!door?.trouble) return undefined;
-    const timer = setInterval(again, STARTING);
-    return () => clearInterval(timer);
-  }, [door?.trouble]);
   const enter = async () => {
     setEnded("");
     try {
@@ -59,7 +54,8 @@ export function OwnDoor() {
   const rights = door && `/console/policy?${new URLSearchParams({ tab: "explain", host: `door:${door.name}`, node: door.node })}`;
   return html`<section class="panel" aria-labelledby="own-door"><div class="panel-head"><h2 id="own-door">Your door</h2>${door && html`<${Badge} word=${`door:${door.name}`} tone="note" />`}
       ${door && html`<span class="end"><${Link} class="button small" to=${rights}>Rights</${Link}>${open ? html`<${Button} small onClick=${() => leave("")}>Close</${Button}>` : html`<${Button} small tone="primary" disabled=${door.trouble !== ""} why=${door.trouble} onClick=${enter}>Open</${Button}>`}</span>`}</div>
-    ${error && !value ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${1} />`
+    ${error && html`<div class="panel-body"><${Failure} error=${error} retry=${again} heard=${heard} /></div>`}
+    ${!value ? !error && html`<${Loading} rows=${1} />`
       : !door ? html`<div class="panel-body row"><span><${Given} value=${value.reason} most=${300} /></span>${value.name && html`<${Button} small role="admin" onClick=${add}>Add door ${value.name}</${Button}>`}</div>`
       : open && signedIn ? html`<${open.Teleop} key=${open.ticket} parts=${PARTS} ticket=${open.ticket} name=${door.name} address=${door.address} ended=${leave} />`
       : html`<div class="panel-body stack-tight">${ended && html`<${Notice} tone="warn" title="Closed" role="status"><${Given} value=${ended} most=${300} /></${Notice}>`}

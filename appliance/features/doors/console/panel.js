@@ -1,6 +1,6 @@
 /** Doors on the robot's page: who is connected, by which ticket, and where each door's rights are explained. */
 
-import { html, useEffect, useState } from "#console/html.js";
+import { html, useState } from "#console/html.js";
 import { Moment } from "#console/moments.js";
 import { count, counted } from "#console/numbers.js";
 import { Badge } from "#console/parts/badge.js";
@@ -19,17 +19,14 @@ const EVERY = 5000; // milliseconds
 const HOURS = /** @type {[string, string][]} */ ([["1", "1 hour"], ["8", "8 hours"], ["24", "1 day"], ["168", "7 days"]]);
 
 export function Doors() {
-  const { value, error, again } = useResource((signal) => get("/v1/doors", {}, signal), []);
+  const { value, error, heard, again } = useResource((signal) => get("/v1/doors", {}, signal), [], EVERY);
   const [adding, setAdding] = useState(false);
-  useEffect(() => {
-    const timer = setInterval(again, EVERY);
-    return () => clearInterval(timer);
-  }, []);
   const rows = value?.doors ?? [];
   const connected = rows.reduce((/** @type {number} */ sum, /** @type {any} */ one) => sum + one.connections, 0);
   return html`<section class="panel" aria-labelledby="doors"><div class="panel-head"><h2 id="doors">Doors</h2>${rows.length > 0 && html`<span class="muted small">${counted(connected, "connection")}</span>`}
       <span class="end"><${Button} small role="admin" onClick=${() => setAdding(true)}><${Icon} name="plus" size=${14} />Add a door…</${Button}></span></div>
-    ${error && !value ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${2} />`
+    ${error && html`<div class="panel-body"><${Failure} error=${error} retry=${again} heard=${heard} /></div>`}
+    ${!value ? !error && html`<${Loading} rows=${2} />`
       : !rows.length ? html`<${Empty} icon="key" title="No door">A door lets a browser, a viewer or an agent in, with rights of its own: the policy names it <code>door:NAME</code>.</${Empty}>`
       : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Door</th><th>Opened by</th><th class="number">Connected</th><th class="number">Received</th><th class="number">Sent</th><th class="number">Dropped</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((/** @type {any} */ one) => html`<${DoorRow} key=${one.name} door=${one} again=${again} />`)}</tbody></table></div>`}

@@ -16,12 +16,8 @@ const EVERY = 3000; // milliseconds
 
 export function StandbyPage() {
   const { active } = useStore(passive);
-  const { value, error, again } = useResource((signal) => get("/v1/standby", {}, signal), []);
-  useEffect(() => {
-    entitle("Standby");
-    const timer = setInterval(again, EVERY);
-    return () => clearInterval(timer);
-  }, []);
+  const { value, error, heard } = useResource((signal) => get("/v1/standby", {}, signal), [], EVERY);
+  useEffect(() => entitle("Standby"), []);
   useEffect(() => {
     if (value?.role === "active") passive.update({ active: "" });
   }, [value]);
@@ -31,7 +27,8 @@ export function StandbyPage() {
     <a class="button primary" href=${there} rel="noreferrer"><span>Open the console of ${value ? html`<${Given} value=${value.other.name} most=${40} />` : "the active appliance"}</span></a>
     ${value?.not_serving && html`<${Banner} text=${`${value.other.name} is active and does not serve the robot: ${value.not_serving}`} />`}
     ${value?.troubles.map((/** @type {string} */ text) => html`<${Banner} key=${text} text=${text} />`)}
-    ${value ? html`<${Pair} state=${value} />` : error ? html`<${Failure} error=${error} />` : html`<section class="panel"><${Loading} rows=${3} /></section>`}
+    <${Failure} error=${error} heard=${heard} />
+    ${value ? html`<${Pair} state=${value} />` : !error && html`<section class="panel"><${Loading} rows=${3} /></section>`}
     <div class="row row-apart"><span class="muted small"><${Given} value=${there} mono /></span><button class="button small" onClick=${signOut}>Sign out</button></div>
   </div></main>`;
 }

@@ -15,7 +15,7 @@ import { send } from "#console/rest.js";
 const HOW = /** @type {[string, string][]} */ ([["token", "One-time token: the host creates its own key"], ["kit", "Kit: an archive with a private key, to copy to the host"]]);
 const LASTS = /** @type {[string, string][]} */ ([["900", "15 minutes"], ["3600", "1 hour"], ["86400", "1 day"], ["604800", "7 days"]]);
 
-/** @param {{host?: any, etag: string, close: () => void, after: () => Promise<void>}} given `host`: one that is there already */
+/** @param {{host?: any, etag: string, close: () => void, after: () => void}} given `host`: one that is there already */
 export function Enrol({ host, etag, close, after }) {
   const [form, setForm] = useState({ name: host?.name ?? "", how: "token", endpoint: reachedAt(location.hostname), days: "90", token_seconds: "3600", open: "", address: "" });
   const [error, setError] = useState(/** @type {unknown} */ (null));
@@ -32,7 +32,7 @@ export function Enrol({ host, etag, close, after }) {
         done(`The kit of ${form.name} is saved`, "It contains a private key: keep it secret, and delete it afterwards.");
         close();
       }
-      await after();
+      after();
     } catch (failure) {
       setError(failure);
     }

@@ -9,7 +9,7 @@ import { Failure } from "#console/parts/notice.js";
 import { done } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
 
-/** @param {{host: any, etag: string, close: () => void, after: () => Promise<void>}} given */
+/** @param {{host: any, etag: string, close: () => void, after: () => void}} given */
 export function Revoke({ host, etag, close, after }) {
   const [typed, setTyped] = useState("");
   const [error, setError] = useState(/** @type {unknown} */ (null));
@@ -18,11 +18,11 @@ export function Revoke({ host, etag, close, after }) {
     try {
       const { body } = await ask("DELETE", `/v1/hosts/${encodeURIComponent(host.name)}`, { match: etag });
       done(`${host.name} is revoked`, `${body.taken_back} registrations and grants were removed.`);
-      await after();
+      after();
       close();
     } catch (failure) {
       setError(failure);
-      await after();
+      after();
     }
   };
   const foot = html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" disabled=${typed !== host.name} why="Type the host's name first" onClick=${go}>Revoke ${host.name}</${Button}>`;

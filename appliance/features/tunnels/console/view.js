@@ -1,6 +1,6 @@
 /** Hosts: tunnels, certificates, open ports; enrol and revoke. */
 
-import { html, useEffect, useState } from "#console/html.js";
+import { html, useState } from "#console/html.js";
 import { live } from "#console/live.js";
 import { lasting, Moment } from "#console/moments.js";
 import { bytes, counted } from "#console/numbers.js";
@@ -10,6 +10,7 @@ import { Given } from "#console/parts/given.js";
 import { Host } from "#console/parts/host.js";
 import { Icon } from "#console/parts/icon.js";
 import { Empty, Failure, Loading, Notice } from "#console/parts/notice.js";
+import { useResource } from "#console/parts/resource.js";
 import { done, failed } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
 import { useStore } from "#console/store.js";
@@ -17,42 +18,30 @@ import { Block, Blocked } from "#console/hosts/block.js";
 import { Enrol } from "./enrol.js";
 import { Revoke } from "./revoke.js";
 
-const EVERY = 5000;
+const EVERY = 30_000; // milliseconds
 const TONES = { up: "allow", down: "warn", expired: "deny", revoked: "", "not wanted": "", awaited: "note", "not enrolled": "" };
 
 export function Hosts() {
-  const [state, setState] = useState({ body: /** @type {any} */ (null), etag: "", error: /** @type {unknown} */ (null) });
   const [open, setOpen] = useState(/** @type {{what: "enrol" | "again" | "revoke", host?: any} | null} */ (null));
   const mark = useStore(live, (one) => JSON.stringify(one.status?.ipsec ?? null));
   const blocks = useStore(live, (one) => JSON.stringify(one.status?.blocks ?? null));
   const isolation = useStore(live, (one) => one.status?.isolation);
-  const again = async () => {
-    try {
-      const { body, etag } = await ask("GET", "/v1/hosts");
-      setState({ body, etag: etag ?? "", error: null });
-    } catch (error) {
-      setState((state) => ({ ...state, error }));
-    }
-  };
-  useEffect(() => {
-    again();
-    const timer = setInterval(() => document.hidden || again(), EVERY * 6);
-    return () => clearInterval(timer);
-  }, [mark]);
-  const { body, error, etag } = state;
+  const { value, error, heard, again } = useResource((signal) => ask("GET", "/v1/hosts", { signal }), [mark], EVERY);
+  const body = value?.body;
+  const etag = value?.etag ?? "";
   if (!body) return html`<div class="head"><h1>Hosts</h1></div>${error ? html`<${Failure} error=${error} retry=${again} />` : html`<section class="panel"><${Loading} rows=${8} /></section>`}`;
   const reload = async () => {
     try {
       const { body: now } = await ask("POST", "/v1/hosts/reload", { match: etag });
       done("hosts.yaml was read again", `${counted(now.declared.length, "host")} declared.`);
-      await again();
+      again();
     } catch (failure) {
       failed(failure);
     }
   };
   return html`<div class="head"><h1>Hosts</h1><span class="head-sub">${counted(body.hosts.length, "tunnel")}, ${body.hosts.filter((/** @type {any} */ one) => one.state === "up").length} up; ${counted(body.machines.length, "other machine")} without a tunnel</span>
       <div class="head-actions"><${Button} role="operator" onClick=${reload} title=${`Read ${body.hosts_file} again`}><${Icon} name="again" size=${16} />Reload hosts.yaml</${Button}><${Block}>Block a host…</${Block}><${Button} role="admin" tone="primary" onClick=${() => setOpen({ what: "enrol" })}><${Icon} name="plus" size=${16} />Enrol a host</${Button}></div></div>
-    <div class="standing">${isolation === "none" && html`<${Notice} title="Tunnels need isolation netns or container">With isolation none the appliance shares the robot's network, and no host can be enrolled.</${Notice}>`}
+    <div class="standing"><${Failure} error=${error} retry=${again} heard=${heard} />${isolation === "none" && html`<${Notice} title="Tunnels need isolation netns or container">With isolation none the appliance shares the robot's network, and no host can be enrolled.</${Notice}>`}
       ${body.troubles.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn" title="Needs attention"><${Given} value=${one} most=${400} /></${Notice}>`)}</div>
     <div class="stack"><${Blocked} mark=${blocks} /><section class="panel" aria-label="Hosts with tunnels">${!body.hosts.length ? html`<${Empty} icon="hosts" title="No host is enrolled">Enrol an operator's laptop or a second robot: it gets a name (host:NAME in the policy) and an address that no other host can use.</${Empty}>` : html`<${HostTable} hosts=${body.hosts} open=${setOpen} />`}</section>
       <section class="panel" aria-labelledby="machines"><div class="panel-head"><h2 id="machines">Other machines without a tunnel</h2></div>${!body.machines.length ? html`<${Empty} icon="hosts" title="No other machine runs nodes without a tunnel">Nodes on the appliance's own machine are in the graph only.</${Empty}>` : html`<${MachineTable} machines=${body.machines} />`}</section>

@@ -111,6 +111,15 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
     }  # fmt: skip
 
 
+def test_a_repeated_request_waits_for_its_answer_and_shows_its_age() -> None:
+    """A timer of its own would cut off each answer that takes longer than its pause."""
+    texts = {source: source.read_text() for source in SOURCES}
+    assert [one.name for one, text in texts.items() if re.search(r"setInterval\([^\n]*\bagain\b", text)] == []
+    repeated = [text for text in texts.values() if re.search(r"useResource\(.*\], [^)]", text)]
+    assert len(repeated) == 5
+    assert all("heard=${heard}" in text or "error && heard" in text for text in repeated)
+
+
 def test_a_view_is_loaded_when_it_is_opened(client: Client) -> None:
     """Each module is in the page's script or in late ones, and in none twice."""
     [name] = re.findall(r"/console/static/js/main\.\w+\.js", client.get("/console").text)

@@ -1,6 +1,8 @@
 /** Messages: errors, hints, empty states, results. */
 
+import { since } from "../elapsed.js";
 import { html } from "../html.js";
+import { lasting, useSeconds } from "../moments.js";
 import { headline, Problem } from "../problem.js";
 import { Given } from "./given.js";
 import { Icon } from "./icon.js";
@@ -15,16 +17,22 @@ export function Notice({ tone = "note", title, children, role }) {
   </div>`;
 }
 
-/** The error of a failed request. @param {{error: unknown, retry?: () => void}} given */
-export function Failure({ error, retry }) {
+/** The error of a failed request. @param {{error: unknown, retry?: () => void, heard?: import("../elapsed.js").Mark | null}} given `heard`: when the value came that is still shown */
+export function Failure({ error, retry, heard }) {
   if (!error) return null;
   const text = error instanceof Error ? error.message : String(error);
   const problem = error instanceof Problem ? error : null;
   return html`<${Notice} tone=${problem?.passing ? "warn" : "deny"} title=${headline(error)} role="alert">
     <${Given} value=${text} most=${1200} />
     ${problem && problem.errors.length > 1 && html`<ul>${problem.errors.map((one) => html`<li><code><${Given} value=${one.where} /></code>: <${Given} value=${one.text} /></li>`)}</ul>`}
+    ${heard && html`<div><${Earlier} heard=${heard} /></div>`}
     ${retry && html`<div><button class="button small" onClick=${retry}>Try again</button></div>`}
   </${Notice}>`;
+}
+
+function Earlier(/** @type {{heard: import("../elapsed.js").Mark}} */ { heard }) {
+  useSeconds();
+  return html`What is shown is of ${lasting(since(heard) / 1000)} ago.`;
 }
 
 /** An empty state: it describes the missing content and the next step. @param {{icon: any, title: string, children?: any}} given */

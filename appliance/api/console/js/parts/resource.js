@@ -1,28 +1,49 @@
 /** A fetched resource: its value, whether it is loading, its error, and a function to fetch it again. */
 
+import { mark } from "../elapsed.js";
 import { useCallback, useEffect, useRef, useState } from "../html.js";
+import { Problem } from "../problem.js";
+import { unlocked } from "../session.js";
+
+const PATIENCE = 8000; // milliseconds without an answer, after which a repeated request has failed
 
 /**
  * @template T
  * @param {(signal: AbortSignal) => Promise<T>} fetching
  * @param {any[]} inputs fetched again when one of them changes
- * @returns {{value: T | null, error: unknown, loading: boolean, again: () => void, set: (value: T) => void}}
+ * @param {number | ((value: T | null) => number)} [every] milliseconds after each answer or failure until it is fetched again; 0: not
+ * @returns {{value: T | null, error: unknown, heard: import("../elapsed.js").Mark | null, loading: boolean, again: () => void, set: (value: T) => void}}
+ * `heard`: when the value came. After an `error`, the value is an earlier one, and is shown with its age.
  */
-export function useResource(fetching, inputs) {
-  const [state, setState] = useState({ value: /** @type {T | null} */ (null), error: /** @type {unknown} */ (null), loading: true });
+export function useResource(fetching, inputs, every = 0) {
+  const [state, setState] = useState({ value: /** @type {T | null} */ (null), error: /** @type {unknown} */ (null), heard: /** @type {import("../elapsed.js").Mark | null} */ (null), loading: true });
   const [round, setRound] = useState(0);
   const newest = useRef(fetching);
   newest.current = fetching;
   useEffect(() => {
     const controller = new AbortController();
     setState((state) => ({ ...state, loading: true }));
-    newest.current(controller.signal).then(
-      (value) => controller.signal.aborted || setState({ value, error: null, loading: false }),
-      (error) => controller.signal.aborted || setState((state) => ({ ...state, error, loading: false })),
-    );
-    return () => controller.abort();
+    const failed = (/** @type {unknown} */ error) => controller.signal.aborted || setState((state) => ({ ...state, error, loading: false }));
+    newest.current(controller.signal).then((value) => controller.signal.aborted || set(value), failed);
+    let late = 0;
+    const wait = () => {
+      if (controller.signal.aborted) return;
+      late = setTimeout(() => {
+        failed(new Problem(0, { detail: `No answer in ${PATIENCE / 1000} s.` }));
+        controller.abort();
+      }, PATIENCE);
+    };
+    if (every) unlocked().then(wait, () => {}); // a locked page asks nothing
+    return () => (controller.abort(), clearTimeout(late));
   }, [...inputs, round]);
   const again = useCallback(() => setRound((n) => n + 1), []);
-  const set = useCallback((/** @type {T} */ value) => setState({ value, error: null, loading: false }), []);
+  const set = useCallback((/** @type {T} */ value) => setState({ value, error: null, heard: mark(), loading: false }), []);
+  // Counted from the answer: a request that takes longer than the pause is not cut off by the next one.
+  const pause = typeof every === "number" ? every : every(state.value);
+  useEffect(() => {
+    if (state.loading || !pause) return undefined;
+    const timer = setTimeout(again, pause);
+    return () => clearTimeout(timer);
+  }, [state, pause]);
   return { ...state, again, set };
 }
