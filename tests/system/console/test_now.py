@@ -132,3 +132,31 @@ def test_changes_of_the_appliance_are_not_shown_as_those_of_a_person(opened: Cal
     authors = ["alice", DISK, UNCONFIRMED, "disk2"]
     assert page.evaluate(shown, authors) == [actor(who) for who in authors]
     assert page.evaluate(shown, [DISK, None]) == ["the appliance (disk)", None]
+
+
+def _alarm(identity: str, sequence: int) -> dict[str, Any]:
+    found = {"schema": 1, "id": identity, "sequence": sequence, "event": "log replaced", "severity": "alarm"}
+    return found | {"time": "2026-01-02T03:04:05Z", "reason": identity, "category": None, "detail": {}}
+
+
+def test_an_alarm_of_another_log_is_not_taken_for_reviewed(opened: Callable[..., Reader]) -> None:
+    """A new state begins its log at 1: its alarms have lower sequence numbers than those that were reviewed."""
+    reader = opened()
+    record = _alarm("1" * 20, 900)
+    reader.page.route(
+        "**/v1/audit?*severity=alarm*",
+        lambda route: route.fulfill(json={"records": [record], "cursor": None}),
+    )
+    page = reader.go("now")
+    alarms = page.get_by_role("region", name="Open alarms")
+    expect(alarms).to_contain_text("1" * 20)
+    alarms.get_by_role("button", name="Mark as reviewed").click()
+    expect(alarms).not_to_contain_text("1" * 20)
+    record = _alarm("2" * 20, 5)
+    reader.go("now")
+    expect(alarms).to_contain_text("2" * 20)
+    record = _alarm("1" * 20, 900)
+    reader.go("now")
+    expect(page.get_by_role("region", name="Recently denied")).to_be_visible()
+    expect(page.get_by_role("link", name=re.compile("^Denied"))).not_to_contain_text("…")
+    expect(alarms).not_to_contain_text("1" * 20)

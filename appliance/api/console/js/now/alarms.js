@@ -12,6 +12,7 @@ import { Link } from "../router.js";
 
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
 const SEEN = "rosrv.reviewed";
+const KEPT = 1000; // reviewed alarms, also those of another robot at this address
 const MAX = 8;
 const ORDER = ["alarm", "warning", "notice"];
 
@@ -22,17 +23,17 @@ export function placeOf(alarm) {
 }
 
 export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ { alarms, incidents }) {
-  const [seen, setSeen] = useState(reviewed());
+  const [seen, setSeen] = useState(reviewed);
   const now = useApplianceTime();
-  const open = (incidents ?? []).filter((one) => one.sequence > seen);
+  const open = (incidents ?? []).filter((one) => !seen.has(one.id));
   const review = () => {
-    const last = Math.max(seen, ...open.map((one) => one.sequence));
+    const ids = [...open.map((one) => one.id), ...seen].slice(0, KEPT);
     try {
-      localStorage.setItem(SEEN, String(last));
+      localStorage.setItem(SEEN, JSON.stringify(ids));
     } catch {
       // without storage, the review is remembered only until the page is closed
     }
-    setSeen(last);
+    setSeen(new Set(ids));
   };
   return html`<section class="panel spaced" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>${incidents !== null && !alarms.length && !open.length && html`<span class="muted small">No open alarms</span>`}
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
@@ -50,10 +51,12 @@ function Told(/** @type {{text: string}} */ { text }) {
   return html`<${Sentence} value=${at < 0 ? text : text.slice(0, at)} most=${300} />${at >= 0 && html`<${Given} value=${text.slice(at)} most=${200} />`}`;
 }
 
+/** The ids, and no sequence number: another log at this address, such as that of a new state, begins again at 1. */
 function reviewed() {
   try {
-    return Number(localStorage.getItem(SEEN)) || 0;
+    const ids = JSON.parse(localStorage.getItem(SEEN) ?? "[]");
+    return new Set(Array.isArray(ids) ? ids : []);
   } catch {
-    return 0;
+    return new Set();
   }
 }
