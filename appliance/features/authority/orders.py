@@ -215,6 +215,7 @@ class DriveOrders:
     async def take(self, request: requests.DriveTake, who: str) -> requests.GroupState:
         group, host = self._held_group(request.group), self._host(request.host)
         async with self._turn(group):
+            self._require_holder(group, request.holder)
             await self._taken(group, host, who)
         return self._state(group)
 
@@ -230,6 +231,7 @@ class DriveOrders:
                 f"{to} has no claim to {group.name}: add it to the line `ask {group.name}` in [Authority]"
             )
         async with self._turn(group):
+            self._require_holder(group, request.holder)
             if self._groups.holder(group.name) is None and to is None:
                 return self._state(group)  # free already
             await self._hand_over(group, to, f"given by {who}", who)
@@ -241,6 +243,16 @@ class DriveOrders:
         async with self._turn(group):
             await self._asked(group, host, who)
         return self._state(group)
+
+    def _require_holder(self, group: AuthorityGroup, seen: str | None) -> None:
+        """Raise `SenselessError` if the order is meant for another holder: the group was handed over meanwhile."""
+        holding = self._groups.holder(group.name)
+        now = "" if holding is None else str(holding.host)
+        if seen is not None and seen != now:
+            raise SenselessError(
+                f"{group.name} was handed over meanwhile: {now or 'no host'} holds it, not {seen or 'no host'}. Nothing"
+                " was changed; look again before you order"
+            )
 
     # --- nodes ---
 

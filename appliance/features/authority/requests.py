@@ -14,6 +14,12 @@ GroupName = Annotated[str, parameter("name of the group", min_length=1, max_leng
 
 
 Host = Annotated[str, doc("address or name of a host", min_length=1, max_length=300)]
+Seen = Annotated[
+    str | None,
+    doc(
+        "address of the holder for whom the order is meant, or empty for none; refused if another one holds it"
+    ),
+]
 _GROUP_HOST = Body("GroupHost", "The host that takes or asks for a group.")
 
 
@@ -62,6 +68,7 @@ class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
 
     group: GroupName
     host: Host
+    holder: Seen = None
 
 
 @rest(
@@ -76,6 +83,7 @@ class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
 
     group: GroupName
     to: Annotated[str, doc("address or name of a host", max_length=300)] = ""
+    holder: Seen = None
 
 
 @rest(

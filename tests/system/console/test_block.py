@@ -74,3 +74,24 @@ def test_a_blocked_host_is_listed_until_it_is_unblocked(
     expect(reader.toast(f"{HOST} is no longer blocked")).to_be_visible()
     expect(blocked).to_have_count(0)
     assert appliance.rest().get("/v1/blocks").json == {"blocks": []}
+
+
+def test_undo_leaves_the_block_of_another_operator(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    reader = opened()
+    page = reader.go("hosts")
+    page.get_by_role("button", name="Block a host").press("Enter")
+    dialog = page.get_by_role("dialog", name="Block this host?")
+    dialog.get_by_label("Address").fill(HOST)
+    dialog.get_by_role("button", name="Block the host").press("Enter")
+    undo = page.locator(".toasts").get_by_role("button", name="Undo")
+    expect(undo).to_be_visible()
+    rest = appliance.rest()
+    longer = rest.post("/v1/blocks", {"address": HOST, "for_seconds": 86_400, "note": "mine"}, match="*")
+    assert longer.status == 200, longer.body
+    undo.click()
+    expect(page.locator(".toasts")).to_contain_text("that block stays")
+    [block] = rest.get("/v1/blocks").json["blocks"]
+    assert block["note"] == "mine"
+    assert rest.request("DELETE", f"/v1/blocks/{HOST}", None, {"If-Match": "*"}).status == 200

@@ -38,12 +38,13 @@ function Group(/** @type {{group: any, again: () => void}} */ { group, again }) 
 
 function HandOver(/** @type {{verb: keyof typeof VERBS, group: any, again: () => void, close: () => void}} */ { verb, group, again, close }) {
   const [host, setHost] = useState(verb === "free" ? (group.waiting[0] ?? "") : "");
+  const [holder] = useState(group.holder); // the order is for the state that the person saw when the dialog opened
   const hosts = useHosts();
   const id = useId();
   const free = verb === "free";
   const go = async () => {
     try {
-      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: free ? { to: host } : { host }, match: "*" });
+      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: group.ranks.length ? {} : { free: { to: host, holder }, assign: { host, holder }, ask: { host } }[verb], match: "*" });
       done(body.ranks.length ? `${body.group} is ${body.standing}` : body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
       close();
     } catch (failure) {
@@ -52,8 +53,8 @@ function HandOver(/** @type {{verb: keyof typeof VERBS, group: any, again: () =>
     again();
   };
   const text = {
-    assign: "The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.",
-    free: group.ranks.length ? "The group is handed back: the next node that moves drives." : "The holder loses the group. It goes to this host, or without one to the first that waits.",
+    assign: html`${holder && html`<${Host} value=${holder} /> loses the group. `}The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.`,
+    free: group.ranks.length ? "The group is handed back: the next node that moves drives." : html`<${Host} value=${holder} /> loses the group. It goes to this host, or without one to the first that waits.`,
     ask: "The host waits for the group. It gets the group once that is free, if the policy lets it take the group.",
   }[verb];
   const submit = (/** @type {Event} */ event) => {

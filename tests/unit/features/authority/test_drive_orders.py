@@ -1,6 +1,6 @@
 import asyncio
 import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 
 import pytest
 
@@ -172,6 +172,24 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
     assert site.handed_over() == handed_over
     with pytest.raises(UnknownThingError, match="its groups: base"):
         await orders.take(DriveTake("arm", PILOT), "op")
+
+
+async def test_an_order_for_another_holder_than_the_present_one_is_refused(site: Site) -> None:
+    orders = site.orders
+    await orders.take(DriveTake("base", PILOT, holder=""), "op")
+    await orders.take(DriveTake("base", BOSS, holder=PILOT), "other")
+    late: list[Callable[[], Awaitable[object]]] = [
+        lambda: orders.give(DriveGive("base", holder=PILOT), "op"),
+        lambda: orders.give(DriveGive("base", AGENT, holder=""), "op"),
+        lambda: orders.take(DriveTake("base", BOSS, holder=PILOT), "op"),
+    ]
+    for order in late:
+        with pytest.raises(SenselessError, match=f"handed over meanwhile: {BOSS} holds it"):
+            await order()
+        assert (await site.state()).holder == BOSS
+    assert (await orders.give(DriveGive("base", holder=BOSS), "op")).holder == ""
+    with pytest.raises(SenselessError, match=f"no host holds it, not {BOSS}"):
+        await orders.give(DriveGive("base", holder=BOSS), "op")
 
 
 async def test_a_holder_loses_a_group(site: Site) -> None:

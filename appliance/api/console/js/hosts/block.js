@@ -11,6 +11,7 @@ import { Given } from "../parts/given.js";
 import { Failure } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { done, failed } from "../parts/toast.js";
+import { Problem } from "../problem.js";
 import { ask, get } from "../rest.js";
 
 const TIMES = /** @type {[string, string][]} */ ([["900", "15 minutes"], ["3600", "1 hour"], ["28800", "8 hours"], ["86400", "1 day"], ["", "Until it is unblocked"]]);
@@ -56,8 +57,13 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
     ${error?.status === 422 && html`<${Check} label="Block it even if it is the robot's own host, or yours" on=${force} set=${setForce} />`}</${Dialog}>`;
 }
 
-/** Lift a block, or bring back the one that it replaced. @param {any} block */
-async function takeBack({ address, name, replaced }) {
+/** Lift a block, or bring back the one that it replaced; a block that another operator has given since then stays. @param {any} block */
+async function takeBack({ address, name, since, who, replaced }) {
+  const { blocks } = await get("/v1/blocks");
+  const now = blocks.find((/** @type {any} */ one) => one.address === address);
+  if (now?.since !== since || now?.who !== who) {
+    throw new Problem(412, { detail: now ? `${now.who} has blocked ${name || address} again since then: that block stays. Hosts lists it.` : `The block of ${name || address} has ended since then.` });
+  }
   if (!replaced) await ask("DELETE", `/v1/blocks/${encodeURIComponent(address)}`, { match: "*" });
   else {
     const left = replaced.until === null ? null : Math.max(1, replaced.until - applianceNow());
