@@ -160,3 +160,46 @@ def test_an_alarm_of_another_log_is_not_taken_for_reviewed(opened: Callable[...,
     expect(page.get_by_role("region", name="Recently denied")).to_be_visible()
     expect(page.get_by_role("link", name=re.compile("^Denied"))).not_to_contain_text("…")
     expect(alarms).not_to_contain_text("1" * 20)
+
+
+def test_what_is_not_known_is_not_said_to_be_nothing(opened: Callable[..., Reader]) -> None:
+    reader = opened()
+    page = reader.page
+    failing = True
+    for path in ("**/v1/audit?*severity=notice*", "**/v1/approvals"):
+        page.route(path, lambda route: route.abort() if failing else route.fallback())
+    reader.go("now")
+    waits, denied = (page.get_by_role("link", name=re.compile(f"^{name}")) for name in ("Waits", "Denied"))
+    expect(waits).to_contain_text("not known")
+    for region in ("Recently denied", "Recent actions of monitors"):
+        expect(page.get_by_role("region", name=region).locator(".skeleton").first).to_be_visible()
+    expect(denied).to_contain_text("…")
+    failing = False
+    expect(waits).to_contain_text("no call waits")
+    expect(denied).not_to_contain_text("…")
+    expect(page.locator(".skeleton")).to_have_count(0)
+
+
+def test_the_denials_of_the_last_hour_are_counted_again_without_a_new_one(
+    opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
+    reader = opened()
+    reader.context.add_init_script(
+        "const real = setTimeout;"
+        "setTimeout = (run, wait, ...more) => real(run, wait === 300000 ? 1000 : wait, ...more);"
+    )
+    page = reader.go("now")
+    table = page.get_by_role("table", name="Denials by host")
+    expect(table).to_be_visible()
+    page.route("**/v1/audit/summary*", lambda route: route.fulfill(json={"hosts": []}))
+    expect(table).to_have_count(0)
+
+
+def test_each_refusal_has_its_own_heading(opened: Callable[..., Reader]) -> None:
+    headings = """async (kinds) => {
+      const { headline, Problem } = await import("/console/static/js/problem.js");
+      return kinds.map((kind) => headline(new Problem(403, { type: `urn:rosrv:problem:${kind}`, title: kind })));
+    }"""
+    kinds = ["not-for-this-role", "host-blocked", "foreign-origin"]
+    assert opened().go("now").evaluate(headings, kinds) == ["Not for this role", *kinds[1:]]

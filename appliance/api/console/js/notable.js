@@ -10,6 +10,7 @@ import { createStore } from "./store.js";
 
 const KEPT = 400;
 const NEAR = "1d";
+const AGAIN = 5000; // milliseconds after a failure
 
 /** @typedef {Record<string, any>} AuditRecord as docs/reference/audit-log.md describes it */
 
@@ -28,11 +29,17 @@ export async function startNotable() {
   const mine = (generation += 1);
   running = { stop: () => {}, retry: () => {} };
   const past = (/** @type {Record<string, any>} */ query) =>
-    get("/v1/audit", { since: NEAR, limit: 100, equality: 1, ...query }).then(compared, () => []);
-  const [denials, doings, incidents] = await Promise.all([
+    get("/v1/audit", { since: NEAR, limit: 100, equality: 1, ...query }).then(compared);
+  const all = () => Promise.all([
     past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
-  ]);
-  if (mine !== generation) return;
+  ]).catch(() => null);
+  let lists = await all();
+  while (!lists && mine === generation) {
+    await new Promise((done) => setTimeout(done, AGAIN)); // until they come they are not known, and never empty
+    if (mine === generation) lists = await all();
+  }
+  if (!lists || mine !== generation) return;
+  const [denials, doings, incidents] = lists;
   notable.update({ denials, doings, incidents });
   const last = Math.max(0, ...[...denials, ...doings, ...incidents].map((one) => one.sequence));
   running = follow(() => `/v1/audit/stream?severity=notice&equality=1&since=${NEAR}`, heard, () => {}, String(last));

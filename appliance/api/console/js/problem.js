@@ -34,7 +34,7 @@ export function headline(error) {
   const known = {
     0: "The appliance does not answer",
     401: "Token rejected",
-    403: "Not for this role",
+    403: error.kind === "not-for-this-role" ? "Not for this role" : error.title || "Refused",
     404: "Not found",
     412: "Changed by someone else",
     413: "Too large",

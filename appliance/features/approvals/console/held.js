@@ -47,14 +47,14 @@ async function fetchOnce() {
 }
 
 /**
- * Fetch them when a record or the state says that they changed, and with each state while there are any. The bar, which
+ * Fetch them when a record or the state says that they changed, and with each state while there are any or the last request failed. The bar, which
  * is on every page, calls this.
  */
 export function useHeldCalls() {
   const mark = useStore(live, (one) => {
     const counts = one.status?.approvals;
     if (!counts) return "";
-    const some = counts.waiting + counts.leases > 0 || held.get().rows?.length;
+    const some = counts.waiting + counts.leases > 0 || held.get().rows?.length || held.get().error;
     return [one.status.since, counts.waiting, counts.leases, some ? one.heard : ""].join(" ");
   });
   const record = useStore(notable, (one) => (one.latest?.event.startsWith("approval ") ? one.latest.sequence : 0));

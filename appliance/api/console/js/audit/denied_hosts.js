@@ -16,6 +16,7 @@ const SHOWN = 5;
 const MOST_COUNTED = 200;
 const FOLDER = /\s\/\S*\/(?=[^/\s]+:\d+$)/; // of the policy's file, before its name and line
 const EVERY = 30_000; // milliseconds between two summaries while denials arrive
+const LATER = 300_000; // and while none do: what is older than the period leaves it
 
 /** @param {{since: string, until?: string, mark: unknown, title?: string}} given `mark`: another one after a new denial; the block is empty without denials */
 export function DeniedHosts({ since, until, mark, title = "" }) {
@@ -42,13 +43,12 @@ export function useDeniedCounts(mark) {
   return useMemo(() => new Map(/** @type {[string, number][]} */ ((value?.hosts ?? []).map((/** @type {any} */ one) => [one.host, one.count]))), [value]);
 }
 
-/** The latest mark, but at most one every `EVERY`. */
+/** Another value after a new mark, but at most one every `EVERY`, and without one after `LATER`. */
 function useSlowly(/** @type {unknown} */ mark) {
   const [seen, setSeen] = useState({ mark, at: 0 });
   useEffect(() => {
-    if (seen.mark === mark) return undefined;
-    const timer = setTimeout(() => setSeen({ mark, at: Date.now() }), Math.max(0, seen.at + EVERY - Date.now()));
+    const timer = setTimeout(() => setSeen({ mark, at: Date.now() }), seen.mark === mark ? LATER : Math.max(0, seen.at + EVERY - Date.now()));
     return () => clearTimeout(timer);
   }, [mark, seen]);
-  return seen.mark;
+  return seen;
 }
