@@ -61,7 +61,7 @@ def graph_of(registry: Registry, relay: RelayControl) -> Graph:
     shown = [
         incarnation
         for incarnation in registry.all()
-        if incarnation.life is not Life.REPLACED and not incarnation.own
+        if incarnation.life is not Life.REPLACED and not incarnation.own and not incarnation.gone
     ]
     live = [incarnation for incarnation in shown if incarnation.life is Life.LIVE]
     names = {incarnation.key: incarnation.name for incarnation in shown}
@@ -169,7 +169,7 @@ def measures_of(
 
     For histograms, the limit is `MAX_DELAYED`.
     """
-    lives = Counter(incarnation.life for incarnation in registry.all() if not incarnation.own)
+    lives = Counter(one.life for one in registry.all() if not one.own and not one.gone)
     kinds = Counter(registration.kind.value for node, registration in registry.in_order() if not node.own)
     records = monitors.records
     relayed, delayed = carried_of(carried)
@@ -302,8 +302,8 @@ class Queries:
 
     def _status(self) -> Status:
         registry, relay, meter, states = self.registry, self.relay, self.trail.meter, self.features()
-        # The appliance's own nodes are not counted; the graph leaves them out also.
-        lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
+        # The graph leaves the same nodes out.
+        lives = [one.life for one in registry.all() if not one.own and not one.gone]
         named = {
             (registration.kind, registration.resource)
             for node, registration in registry.in_order()

@@ -100,6 +100,11 @@ class Incarnation:
         return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
 
     @property
+    def gone(self) -> bool:
+        """Whether it has unregistered everything: it has ended, or registers nothing. It is kept for its next call."""
+        return self.life is Life.LIVE and not (self.registrations or self.shelf)
+
+    @property
     def only_listens(self) -> bool:
         kinds = {kind for kind, _resource in self.registrations}
         return bool(kinds) and not kinds & {Kind.PUBLICATION, Kind.SERVICE}

@@ -41,3 +41,22 @@ async def test_each_connection_is_read_once() -> None:
     assert {row.name: len(row.connections) for row in graph.topics if row.connections} == {topic: CONNECTIONS}
     assert len(graph.services) == TOPICS
     assert connections.looks <= 3 * CONNECTIONS
+
+
+async def test_a_node_that_ended_is_not_shown_and_a_lost_or_withdrawn_one_is() -> None:
+    world = await ControlParts.begun()
+    nodes = {name: world.node(f"/{name}") for name in ("there", "ended", "withdrawn", "lost")}
+    for node in nodes.values():
+        world.registry.register(node, Kind.PUBLICATION, f"/topic{node.name}", "std_msgs/String")
+    topic = Kind.PUBLICATION, "/topic/ended"
+    world.registry.unregister(nodes["ended"], *topic)
+    [withdrawn] = nodes["withdrawn"].registrations.values()
+    world.registry.shelve(nodes["withdrawn"], withdrawn)
+    world.registry.unregister(nodes["withdrawn"], withdrawn.kind, withdrawn.resource)
+    world.registry.overshadow(nodes["lost"], 1.0)
+    graph = graph_of(world.registry, world.relay)
+    assert {one.name: one.state for one in graph.nodes} == {
+        "/there": "live", "/withdrawn": "live", "/lost": "lost",
+    }  # fmt: skip
+    world.registry.register(nodes["ended"], *topic, "std_msgs/String")
+    assert "/ended" in {one.name for one in graph_of(world.registry, world.relay).nodes}
