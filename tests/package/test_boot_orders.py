@@ -81,8 +81,10 @@ def restarts_and_faults(debian: BootedDebian) -> None:
     serves(debian)
     for _ in range(6):  # more than any limit of starts
         debian.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "rosrv")
-        seen = debian.seen_by_visitor()  # on a busy machine, perhaps after the restart
-        assert seen in ("refused", "held") or debian.master_of_visitor() == "RVMaster", "a crash opened the port"
+        there = debian.seen_by_visitor()  # on a busy machine, perhaps after the restart
+        assert there in ("refused", "held") or debian.master_of_visitor() == "RVMaster", (
+            "a crash opened the port"
+        )
         serves(debian)
     debian.shell("echo 'nonsense: 1' >> /etc/rosrv/appliance.yaml")
     debian.run("systemctl", "restart", "rosrv")
