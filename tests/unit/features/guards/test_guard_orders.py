@@ -240,7 +240,9 @@ async def test_delays_of_a_guard_add_up_over_restarts_of_the_relay_and_of_contro
     other = orders_of(monitors, store=store, relay=Relay(late=50.0))
     timed(monitors, 10)
     other.look()
-    assert (times := (await row(other)).times) is not None and (times.timed, times.limit) == (10, 0.05)
+    times = (await row(other)).times
+    assert times is not None
+    assert (times.timed, times.limit) == (10, 0.05)
 
 
 async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: SpecificationManager) -> None:
