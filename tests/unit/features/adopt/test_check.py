@@ -182,7 +182,7 @@ def test_a_robot_that_was_never_adopted_is_released_without_a_wait(
         assert isinstance(request, ReleaseOrder) or phase == "taken"
         return GiveBackReport() if isinstance(request, ReleaseOrder) else AdminAnswer(False, error="down")
 
-    monkeypatch.setattr(release_verb.os, "geteuid", lambda: 0)
+    monkeypatch.setattr("os.geteuid", lambda: 0)
     monkeypatch.setattr(release_verb, "ordered", lambda _state, _order: nullcontext())
     monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
     release_verb.release.function(call_of(answer), dead=False, force=False, within=1.0)
