@@ -2,13 +2,14 @@
 
 Beside the assumptions of `world.py`:
 
-- The clocks of senders, controller and the nodes that report agree. That of the guard differs by up to a quarter of an
-  hour, unless reports have no stamps.
+- The clocks of senders, controller and the nodes that report agree. The guard's clock differs from theirs by up to a
+  quarter of an hour, unless reports have no stamps.
 - A trajectory reaches the controller within 10 ms, and a report the guard within 20 ms; the controller runs every 10 ms
   or oftener, and the arm follows it exactly.
 - Trajectories come only through the guard. A goal may also be cancelled beside it, which stops the arm. Bytes that are
   no report let the guard begin again, and with it a stop.
-- A joint may gain at most one `jump` on 1.1 `vMax`, over any time. A stop takes the controller's
+- A joint may gain at most one `jump` on 1.1 `vMax`, over any time, and what it moves in one update of the controller,
+  of which the guard does not know. To enable the guard does not stop what passed while it was off. A stop takes the controller's
   `stop_trajectory_duration`, and adds its way: five eighths of the velocity times the duration.
 """
 
@@ -120,6 +121,8 @@ class JointsWorld(World):
         """When the trajectory of each joint begins: with an update of the controller, or later."""
         self.unknown = False
         """Whether this or the last stop is beside the guard, which does not know of it: then its own begins again."""
+        self.loose = 0.0
+        """When the last trajectory ends that passed while the guard was off; to enable the guard does not stop it."""
         self.ends = 0.0
         """When the last trajectory that was sent ends."""
         self.kept: list[Sent] = []
@@ -297,6 +300,7 @@ class JointsWorld(World):
             if passes and sent.points:
                 begin = self.time if sent.stamp is None else max(self.time, sent.stamp)
                 self.ends = begin + sent.points[-1].at if math.isfinite(sent.points[-1].at) else begin
+                self.loose = max(self.loose, self.ends) if self.switched_off else self.loose
         return passes
 
     def cancel(self) -> None:
@@ -385,12 +389,15 @@ class JointsWorld(World):
                 self.rest[joint] = way if begun else max(way, self.rest[joint])
         self.begins = [math.inf] * len(JOINTS)
         self.unknown = False
+        self.loose = min(self.loose, self.time)
         self.controller.stop(self.time)
 
     @property
     def unjudged(self) -> bool:
         return (
-            self.switched_off or self.now < self.fresh_from + 100 + SLACK + self.delay + 1000 * self.stopping
+            self.switched_off
+            or self.time < self.loose + self.stopping
+            or self.now < self.fresh_from + 100 + SLACK + self.delay + 1000 * self.stopping
         )
 
     def move(self, until: int) -> None:
@@ -416,7 +423,7 @@ class JointsWorld(World):
             return
         moved = abs(place - before)
         self.extra[joint] = max(0.0, self.extra[joint] + moved - OVERSHOOT * self.fastest * passed)
-        if not self.extra[joint] <= self.jump + _NEAR:
+        if not self.extra[joint] <= self.jump + OVERSHOOT * self.fastest * self.controller.period + _NEAR:
             gained = f"{JOINTS[joint]} has gained {self.extra[joint]:.3f} rad on 1.1 vMax"
             self.broken("L3", f"{gained}, and a jump is {self.jump}")
         if time < self.begins[joint] - _ROUNDING:  # then its first point, if that is at 0 s, is a jump

@@ -15,7 +15,7 @@ GroupName = Annotated[str, parameter("name of the group", min_length=1, max_leng
 
 Host = Annotated[str, doc("address or name of a host", min_length=1, max_length=300)]
 Seen = Annotated[
-    str | None,
+    Annotated[str, msgspec.Meta(max_length=300)] | None,
     doc(
         "address of the holder for whom the order is meant, or empty for none; refused if another one holds it"
     ),

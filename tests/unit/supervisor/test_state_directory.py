@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 
 from appliance.base.atomic_files import name_to_make
-from appliance.features.standby.membership import path_of as path_of_membership
-from appliance.features.standby.process import EPOCH
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
@@ -208,10 +206,10 @@ def said_in_a_container(tmp_path: Path, verb: str, *, before: bool) -> str:
     if not before:
         store.save_setting("ends", "1")
     store.close()
-    (tmp_path / "lease" / EPOCH).write_text("7")
+    (tmp_path / "lease" / "epoch").write_text("7")
     (tmp_path / "lock").touch()
-    path_of_membership(tmp_path).parent.mkdir()
-    path_of_membership(tmp_path).touch()
+    (tmp_path / "standby").mkdir()
+    (tmp_path / "standby" / "membership.json").touch()
     for name in ("control", "lease"):
         for path in (tmp_path / name, *(tmp_path / name).iterdir()):
             os.chown(path, 61_999, 61_999)

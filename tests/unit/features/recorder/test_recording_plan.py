@@ -132,7 +132,9 @@ def test_a_failed_recording_hinders_only_its_owner(
         assert "not_recorded" in dropped(plan, failed, NOW + 59 * SECOND)
 
 
-def test_a_report_about_a_recording_that_ended_hinders_nobody(dropped: Callable[..., dict[str, str]]) -> None:
+def test_a_report_about_a_recording_that_ended_hinders_no_host(
+    dropped: Callable[..., dict[str, str]],
+) -> None:
     """A recording that is too large ends early; triggers until control's notice still have its id."""
     plan = made()
     ended, late = (dropped(plan, "127.0.0.1", NOW + number)["recording"] for number in range(2))
