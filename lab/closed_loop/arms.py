@@ -9,8 +9,9 @@ Beside the assumptions of `world.py`:
 - Trajectories come only through the guard. A goal may also be cancelled beside it, which stops the arm. Bytes that are
   no report let the guard begin again, and with it a stop.
 - A joint may gain at most one `jump` on 1.1 `vMax`, over any time, and what it moves in one update of the controller,
-  of which the guard does not know. To enable the guard does not stop what passed while it was off. A stop takes the controller's
-  `stop_trajectory_duration`, and adds its way: five eighths of the velocity times the duration.
+  of which the guard does not know. To enable the guard does not stop what passed while it was off.
+- A stop takes the controller's `stop_trajectory_duration`, and adds its way: five eighths of the velocity times the
+  duration.
 """
 
 import math
