@@ -185,16 +185,16 @@ def test_a_state_has_the_mark_of_0_4_once_it_has_a_policy(tmp_path: Path) -> Non
 
 @pytest.mark.real
 @pytest.mark.skipif(os.geteuid() != 0, reason="a folder of another user than root")
-@pytest.mark.parametrize(("verb", "before", "shown"), [
-    ("selftest", False, "ok state {state}, mode 711"),
-    ("selftest", True, "fail state {state}: the state was made by a version before 0.4"),
-    ("config check", True, "state: {state}: the state was made by a version before 0.4"),
-    ("standby repair", False, "Epoch 7 is forgotten"),
-])  # fmt: skip
-def test_root_of_a_container_reads_the_folders_of_processes(verb: str, before: bool, shown: str) -> None:
-    with tempfile.TemporaryDirectory() as folder:  # whose parents other users may pass
-        said = said_in_a_container(Path(folder), verb, before=before)
-        assert shown.format(state=folder) in " ".join(said.split())
+def test_root_of_a_container_reads_the_folders_of_processes() -> None:
+    for verb, before, shown in (
+        ("selftest", False, "ok state {state}, mode 711"),
+        ("selftest", True, "fail state {state}: the state was made by a version before 0.4"),
+        ("config check", True, "state: {state}: the state was made by a version before 0.4"),
+        ("standby repair", False, "Epoch 7 is forgotten"),
+    ):
+        with tempfile.TemporaryDirectory() as folder:  # whose parents other users may pass
+            said = said_in_a_container(Path(folder), verb, before=before)
+            assert shown.format(state=folder) in " ".join(said.split()), verb
 
 
 def said_in_a_container(tmp_path: Path, verb: str, *, before: bool) -> str:
