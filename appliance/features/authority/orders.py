@@ -245,13 +245,13 @@ class DriveOrders:
         return self._state(group)
 
     def _require_holder(self, group: AuthorityGroup, seen: str | None) -> None:
-        """Raise `SenselessError` if the order is meant for another holder: the group was handed over meanwhile."""
+        """Raise `SenselessError` if the order is meant for another holder than the present one."""
         holding = self._groups.holder(group.name)
         now = "" if holding is None else str(holding.host)
         if seen is not None and seen != now:
             raise SenselessError(
-                f"{group.name} was handed over meanwhile: {now or 'no host'} holds it, not {seen or 'no host'}. Nothing"
-                " was changed; look again before you order"
+                f"{group.name} was handed over in the meantime: {now or 'no host'} holds it, not {seen or 'no host'}."
+                " Nothing was changed; look again before you order"
             )
 
     # --- nodes ---

@@ -20,7 +20,7 @@ Seen = Annotated[
         "address of the holder for whom the order is meant, or empty for none; refused if another one holds it"
     ),
 ]
-_GROUP_HOST = Body("GroupHost", "The host that takes or asks for a group.")
+_GROUP_HOST = Body("GroupHost", "The host that asks for a group.")
 
 
 class GroupState(msgspec.Struct, frozen=True):
@@ -61,7 +61,8 @@ class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/assign", name="drive_assign", body=_GROUP_HOST, problems=_NO_GROUP,
+    "operator", "POST", "/v1/drive/{group}/assign", name="drive_assign", problems=_NO_GROUP,
+    body=Body("GroupAssignment", "The host that takes a group."),
 )  # fmt: skip
 class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
     """Assign a group to a host that may take it, or that may override its holder."""

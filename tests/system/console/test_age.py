@@ -130,7 +130,7 @@ def test_a_slow_answer_is_shown(opened: Callable[..., Reader]) -> None:
         expect(page.get_by_role("link", name=re.compile("^Drives"))).to_contain_text(f"10.0.0.{number}")
 
 
-def test_what_no_answer_confirms_has_its_age(opened: Callable[..., Reader]) -> None:
+def test_a_value_that_no_answer_confirms_has_its_age(opened: Callable[..., Reader]) -> None:
     reader = opened()
     routes = _kept(reader.page, "**/v1/drive")
     page = reader.go("now")

@@ -162,7 +162,7 @@ def test_an_alarm_of_another_log_is_not_taken_for_reviewed(opened: Callable[...,
     expect(alarms).not_to_contain_text("1" * 20)
 
 
-def test_what_is_not_known_is_not_said_to_be_nothing(opened: Callable[..., Reader]) -> None:
+def test_unknown_records_are_not_shown_as_none(opened: Callable[..., Reader]) -> None:
     reader = opened()
     page = reader.page
     failing = True

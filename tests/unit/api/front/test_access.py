@@ -63,7 +63,7 @@ def test_a_step_back_of_the_clock_revives_no_token() -> None:
         assert door.end_of(bearer, "10.0.0.9")
 
 
-def test_a_request_that_sends_no_token_is_told_so_and_counts_as_no_wrong_one() -> None:
+def test_a_request_without_a_token_is_refused_for_that_and_counts_as_no_wrong_one() -> None:
     door = TokenAuthenticator(1, lambda _token: None)
     door.state([])
     for header in (None, "", "Basic dTpw", "Bearer", "Bearer  ", "Basic dTpw"):

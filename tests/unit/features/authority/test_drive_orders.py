@@ -184,7 +184,7 @@ async def test_an_order_for_another_holder_than_the_present_one_is_refused(site:
         lambda: orders.take(DriveTake("base", BOSS, holder=PILOT), "op"),
     ]
     for order in late:
-        with pytest.raises(SenselessError, match=f"handed over meanwhile: {BOSS} holds it"):
+        with pytest.raises(SenselessError, match=f"handed over in the meantime: {BOSS} holds it"):
             await order()
         assert (await site.state()).holder == BOSS
     assert (await orders.give(DriveGive("base", holder=BOSS), "op")).holder == ""

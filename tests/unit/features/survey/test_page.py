@@ -28,7 +28,7 @@ def test_the_report_says_in_numbers_what_any_host_may_do() -> None:
     assert "named like a secret: /wifi/password" in lines
 
 
-def test_behind_an_appliance_no_host_is_said_to_be_free() -> None:
+def test_behind_an_appliance_no_host_is_reported_as_free() -> None:
     found = inventory(protected=True, listeners=())
     for text in ("\n".join(report(found)), page(found, None)):
         assert "its policy decides for each host: rosrv policy who-may" in text
