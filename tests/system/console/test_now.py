@@ -134,52 +134,6 @@ def test_changes_of_the_appliance_are_not_shown_as_those_of_a_person(opened: Cal
     assert page.evaluate(shown, [DISK, None]) == ["the appliance (disk)", None]
 
 
-def _alarm(identity: str, sequence: int) -> dict[str, Any]:
-    found = {"schema": 1, "id": identity, "sequence": sequence, "event": "log replaced", "severity": "alarm"}
-    return found | {"time": "2026-01-02T03:04:05Z", "reason": identity, "category": None, "detail": {}}
-
-
-def test_an_alarm_of_another_log_is_not_taken_for_reviewed(opened: Callable[..., Reader]) -> None:
-    """A new state begins its log at 1: its alarms have lower sequence numbers than those that were reviewed."""
-    reader = opened()
-    record = _alarm("1" * 20, 900)
-    reader.page.route(
-        "**/v1/audit?*severity=alarm*",
-        lambda route: route.fulfill(json={"records": [record], "cursor": None}),
-    )
-    page = reader.go("now")
-    alarms = page.get_by_role("region", name="Open alarms")
-    expect(alarms).to_contain_text("1" * 20)
-    alarms.get_by_role("button", name="Mark as reviewed").click()
-    expect(alarms).not_to_contain_text("1" * 20)
-    record = _alarm("2" * 20, 5)
-    reader.go("now")
-    expect(alarms).to_contain_text("2" * 20)
-    record = _alarm("1" * 20, 900)
-    reader.go("now")
-    expect(page.get_by_role("region", name="Recently denied")).to_be_visible()
-    expect(page.get_by_role("link", name=re.compile("^Denied"))).not_to_contain_text("…")
-    expect(alarms).not_to_contain_text("1" * 20)
-
-
-def test_unknown_records_are_not_shown_as_none(opened: Callable[..., Reader]) -> None:
-    reader = opened()
-    page = reader.page
-    failing = True
-    for path in ("**/v1/audit?*severity=notice*", "**/v1/approvals"):
-        page.route(path, lambda route: route.abort() if failing else route.fallback())
-    reader.go("now")
-    waits, denied = (page.get_by_role("link", name=re.compile(f"^{name}")) for name in ("Waits", "Denied"))
-    expect(waits).to_contain_text("not known")
-    for region in ("Recently denied", "Recent actions of monitors"):
-        expect(page.get_by_role("region", name=region).locator(".skeleton").first).to_be_visible()
-    expect(denied).to_contain_text("…")
-    failing = False
-    expect(waits).to_contain_text("no call waits")
-    expect(denied).not_to_contain_text("…")
-    expect(page.locator(".skeleton")).to_have_count(0)
-
-
 def test_the_denials_of_the_last_hour_are_counted_again_without_a_new_one(
     opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
