@@ -120,8 +120,8 @@ class JointsWorld(World):
         """How far each joint may still move since a stop, until its trajectory begins."""
         self.begins = [math.inf] * len(JOINTS)
         """When the trajectory of each joint begins: with an update of the controller, or later."""
-        self.unknown = False
-        """Whether this or the last stop is beside the guard, which does not know of it: then its own begins again."""
+        self.unknown = 0
+        """How many of the next stops begin again, as the guard does not know of the last one, which was beside it."""
         self.loose = 0.0
         """When the last trajectory ends that passed while the guard was off; to enable the guard does not stop it."""
         self.ends = 0.0
@@ -181,6 +181,7 @@ class JointsWorld(World):
 
     def forgets(self) -> None:
         self.heard.clear()
+        self.unknown = 2  # the guard begins again with a stop, of which it does not know: the next one, too
 
     def counts(self, topic: str) -> bool:
         return self.third  # two nodes may report, and both have to
@@ -229,7 +230,7 @@ class JointsWorld(World):
                 names = ()
             case "cut":
                 self.heard[node] = NEVER
-                self.unknown = True  # the guard begins again, and with it a stop, as its page says
+                self.unknown = 2
                 self.say("state", states(stamp, names, places)[:20], node, whole=False)
                 return
             case "":
@@ -307,9 +308,8 @@ class JointsWorld(World):
     def cancel(self) -> None:
         """Stop the arm beside the guard, as a cancelled goal does."""
         self.trace("the goal is cancelled")
-        self.unknown = True
+        self.unknown = 2
         self._stop()
-        self.unknown = True
         self.ends = self.time
 
     def walk(self) -> list[Point]:
@@ -389,7 +389,7 @@ class JointsWorld(World):
                 way = fastest * (0.625 * self.stopping + 2 * self.controller.period) + _NEAR
                 self.rest[joint] = way if begun else max(way, self.rest[joint])
         self.begins = [math.inf] * len(JOINTS)
-        self.unknown = False
+        self.unknown = max(0, self.unknown - 1)
         self.loose = min(self.loose, self.time)
         self.controller.stop(self.time)
 
