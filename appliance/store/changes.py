@@ -4,9 +4,9 @@ Only `Tables` makes SQL, and it checks each change against the schema. So a chan
 appliance can only put or delete rows of known tables, with values of the columns' types.
 
 `WriteAhead` keeps changes in a file until the database has stored them, so that a killed process loses none. A commit
-of each change instead would make the thread that answers nodes wait for SQLite's one writer (`python -m
-benchmarks.state_writes` compares both). A power failure before `sync` may leave any part of the file. Reading ends at
-the first change that is torn, damaged, or follows a missing one; no caller has awaited such a change.
+of each change instead would make the thread that answers nodes wait for SQLite's one writer. A power failure before
+`sync` may leave any part of the file. Reading ends at the first change that is torn, damaged, or follows a missing one;
+no caller has awaited such a change.
 """
 
 import contextlib

@@ -181,7 +181,7 @@ class JointsWorld(World):
 
     def forgets(self) -> None:
         self.heard.clear()
-        self.unknown = 2  # the guard begins again with a stop, of which it does not know: the next one, too
+        self.unknown = 2  # a stop of which it does not know, so the next one may prolong it
 
     def counts(self, topic: str) -> bool:
         return self.third  # two nodes may report, and both have to
