@@ -6,6 +6,9 @@
    the policy would treat it as the machine's own. With kernels before Linux 5.7 the rule never matches.
 3. With `LocalCallers`, a connection from this machine to itself is refused at its SYN unless the connecting socket
    belongs to one of them. A packet without a socket has no owner, so it is refused.
+
+On a host with a tunnel, a table of its own drops every packet from or to the appliance's tunnel address that does not
+go through IPsec, even if no tunnel is open, and whatever `rosrv protect` does to the other table.
 """
 
 import ipaddress
@@ -22,9 +25,11 @@ from appliance.network.hang_detection import run_program
 from appliance.network.namespaces import NetworkError
 
 TABLE = "rosrv_protect"
+TUNNEL_TABLE = "rosrv_tunnel"
 RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
-# One match is for ESP in the kernel, the other for ESP in user space on strongSwan's TUN device. join.sh checks both.
-_THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
+# Not through IPsec, arriving and leaving. The first pair is for ESP in the kernel, the other for ESP in user space on
+# strongSwan's TUN device: join.sh deletes the pair that does not apply.
+_IN_CLEAR_TEXT = (("meta ipsec missing", 'iifname != "ipsec*"'), ("rt ipsec missing", 'oifname != "ipsec*"'))
 _SYN = "tcp flags & (syn | ack) == syn"
 _USER = re.compile(r"[a-z_][a-z0-9_-]{0,31}|[0-9]{1,10}")
 _GROUP_NAME = re.compile(r"[\w.@:-]{1,255}", re.ASCII)
@@ -111,12 +116,9 @@ def protection(
     ports: PortRange,
     services: Sequence[OpenService],
     *,
-    tunnelled: bool = False,
     strict: LocalCallers | None = None,
 ) -> str:
-    """Return the nftables file. `tunnelled`: the appliances' addresses are accepted only through IPsec. `strict`: only
-    these programs of the machine itself reach the ports.
-    """
+    """Return the nftables file. `strict`: only these programs of the machine itself reach the ports."""
     if not appliances:
         raise ValueError("give the address of at least one appliance")
     rules, leaving = ['iifname "lo" accept'], []
@@ -124,8 +126,7 @@ def protection(
         found = [text for text in appliances if ipaddress.ip_address(text).version == version]
         if found:
             addresses = f"{{ {', '.join(sorted(set(found)))} }}"
-            source = f"{keyword} saddr {addresses} accept"
-            rules += [f"{through}{source}" for through in (_THROUGH_IPSEC if tunnelled else ("",))]
+            rules.append(f"{keyword} saddr {addresses} accept")
             leaving.append(f"{keyword} daddr {addresses} {_SYN} iif != 0 fib saddr type local counter drop")
     opened = [f"{service.protocol} dport {service.ports} accept" for service in dict.fromkeys(services)]
     local = (
@@ -164,6 +165,33 @@ def protection(
         f"{_indent(leaving)}"
         "    }\n"
         f"{chain}"
+        "}\n"
+    )
+
+
+def through_tunnel_only(appliance: str) -> str:
+    """Return the nftables file of a host with a tunnel: what this address sends or gets in clear text is dropped.
+
+    The hooks are those that every packet passes, also one that this machine forwards, with its address on the wire.
+    """
+    keyword = "ip" if ipaddress.ip_address(appliance).version == 4 else "ip6"
+    arriving, leaving = (
+        _indent([f"{outside} {keyword} {end} {appliance} counter drop" for outside in either])
+        for either, end in zip(_IN_CLEAR_TEXT, ("saddr", "daddr"), strict=True)
+    )
+    return (
+        f"# Keeps {appliance}, the appliance's address in the tunnel, for the tunnel.\n"
+        f"table inet {TUNNEL_TABLE}\n"
+        f"delete table inet {TUNNEL_TABLE}\n"
+        f"table inet {TUNNEL_TABLE} {{\n"
+        "    chain arriving {\n"
+        "        type filter hook prerouting priority filter; policy accept;\n"
+        f"{arriving}"
+        "    }\n"
+        "    chain leaving {\n"
+        "        type filter hook postrouting priority 300; policy accept;\n"
+        f"{leaving}"
+        "    }\n"
         "}\n"
     )
 

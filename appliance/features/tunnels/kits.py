@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from appliance.features.tunnels.enrolment_kit import Kit
 from appliance.features.tunnels.tunnel_answers import KitParts
-from appliance.network.close_ports import parse_ports, parse_services, protection
+from appliance.network.close_ports import parse_ports, parse_services, protection, through_tunnel_only
 
 
 @dataclass(frozen=True)
@@ -27,4 +27,5 @@ class KitOptions:
 
 def kit_of(body: KitParts, wishes: KitOptions, key: str | None) -> Kit:
     ports, opened = parse_ports(wishes.ports), parse_services(wishes.opened)
-    return Kit(body, wishes.endpoint, protection([body.appliance], ports, opened, tunnelled=True), key)
+    protect = protection([body.appliance], ports, opened) + through_tunnel_only(body.appliance)
+    return Kit(body, wishes.endpoint, protect, key)

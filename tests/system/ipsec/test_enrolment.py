@@ -28,9 +28,10 @@ from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program, need_root
 from tests.support.script_host import ScriptHost
-from tests.support.tunnel_site import API, LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
+from tests.support.tunnel_site import API, ATTACKER, LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
 from tests.support.waiting import allowed, eventually
+from tests.support.wire import connect
 
 CONFIG = f"""\
 api: 0.0.0.0:{API}
@@ -137,7 +138,7 @@ def forged(site: TunnelSite, laptop: ScriptHost) -> None:
     try:
         with unknown.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind((OWN, 0))
-            sock.sendto(b"forged", (OCU, 40_000))
+            sock.sendto(b"forged", (OCU, 20_000))  # the ports of nodes or another: none
         deadline = time.monotonic() + LIMIT
         while dropped(laptop) == before:
             assert time.monotonic() < deadline, "the forged datagram passed the laptop's firewall"
@@ -146,8 +147,8 @@ def forged(site: TunnelSite, laptop: ScriptHost) -> None:
 
 
 def dropped(laptop: ScriptHost) -> int:
-    rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
-    return int(re.findall(r"udp dport .* counter packets (\d+) bytes \d+ drop", rules)[0])
+    rules = laptop.run("nft", "list", "table", "inet", "rosrv_tunnel").stdout
+    return int(re.findall(rf"ip saddr {OWN} counter packets (\d+) bytes \d+ drop", rules)[0])
 
 
 def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
@@ -263,6 +264,32 @@ def join_kit(laptop: ScriptHost, folder: Path, kit: bytes) -> None:
     (folder / "kit.tar.gz").write_bytes(kit)
     laptop.run("tar", "-xzf", str(folder / "kit.tar.gz"), "-C", str(folder))
     laptop.run("sh", str(folder / "rosrv-re.st_e-D/join.sh"))
+
+
+def test_without_its_tunnel_a_host_talks_to_no_false_appliance(
+    site: TunnelSite, laptop: ScriptHost, tmp_path: Path
+) -> None:
+    """A machine that answers at the appliance's tunnel address in the network gets nothing from the host."""
+    script = tmp_path / "join.sh"
+    laptop.run("sh", str(script), awaited(site, "other", script))
+    laptop.run("sh", "-c", "for what in keep charon; do kill -- -$(cat /run/rosrv/$what.pid); done")
+    false, inside = site.attacker.namespace, site.ocu.namespace
+    interfaces.add_address(false, "lo", f"{OWN}/32")
+    interfaces.add_route(inside, f"{OWN}/32", ATTACKER)
+    try:
+        with false.entered(), socket.create_server((OWN, 11311)):
+            eventually(
+                lambda: "ipsec0" not in laptop.run("ip", "-brief", "link").stdout, lambda: "charon has ended"
+            )
+            assert connect(site.ocu, OCU, OWN) == "nothing"
+            laptop.run("nft", "delete", "table", "inet", "rosrv_tunnel")
+            assert connect(site.ocu, OCU, OWN) == "connected", "only the rules kept it from there"
+        laptop.run("sh", "/etc/rosrv/other/rosrv-other/join.sh")  # the honest tunnel is back
+    finally:
+        interfaces.delete_address(false, "lo", f"{OWN}/32")
+        laptop.run("ip", "route", "del", f"{OWN}/32", check=False)
+    laptop.run("/etc/rosrv/leave.sh")
+    site.appliance.rosrv("host", "revoke", "other")
 
 
 def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:

@@ -30,12 +30,12 @@ plugin=/etc/strongswan.d/charon/kernel-libipsec.conf
 if ip xfrm state add $state reqid 1 mode tunnel aead 'rfc4106(gcm(aes))' "$key" 128 2>/dev/null; then
     ip xfrm state delete $state
     say "ESP runs in the kernel"
-    never='iifname "ipsec'
+    never='ifname != "ipsec'
     if [ -e "$plugin.rosrv-before" ]; then mv "$plugin.rosrv-before" "$plugin"; fi
 else
     [ -e /dev/net/tun ] || die "the kernel has no ESP, and there is no /dev/net/tun for ESP in user space"
     say "ESP runs in user space"
-    never="meta ipsec exists"
+    never="ipsec missing"
     [ -e "$plugin.rosrv-before" ] || cp "$plugin" "$plugin.rosrv-before"
     printf 'kernel-libipsec {\n  load = yes\n}\n' > "$plugin"
 fi
@@ -62,8 +62,10 @@ else
 fi
 install -m 0644 swanctl/swanctl.conf /etc/swanctl/conf.d/rosrv.conf
 install -m 0644 swanctl/x509ca/rosrv-ca.pem /etc/swanctl/x509ca/rosrv-ca.pem
-# Without the rule for the other place of ESP: no packet is ever like that here.
+# Without the rules for the other place of ESP: they would drop what comes through the tunnel, too.
 sed "/$never/d" protect.nft > /etc/rosrv/protect.nft.new
+nft -c -f /etc/rosrv/protect.nft.new \
+    || die "nftables here does not take the rules (above); they need nftables 0.9.1 and Linux 4.20, or newer"
 chmod 0644 /etc/rosrv/protect.nft.new
 mv /etc/rosrv/protect.nft.new /etc/rosrv/protect.nft
 install -m 0755 keep.sh renew.sh leave.sh /etc/rosrv/
@@ -91,7 +93,8 @@ Type=oneshot
 RemainAfterExit=yes
 ExecStart=/usr/sbin/nft -f /etc/rosrv/protect.nft
 ExecReload=/usr/sbin/nft -f /etc/rosrv/protect.nft
-ExecStop=/usr/sbin/nft delete table inet rosrv_protect
+ExecStop=-/usr/sbin/nft delete table inet rosrv_protect
+ExecStop=-/usr/sbin/nft delete table inet rosrv_tunnel
 
 [Install]
 WantedBy=multi-user.target

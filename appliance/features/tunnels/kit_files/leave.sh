@@ -36,9 +36,11 @@ else
     rm -f /run/charon.vici /run/charon.ctl /run/charon.dck /run/charon.lkp /run/charon.wlst /run/charon.enfy
     rm -rf /run/rosrv
 fi
-if command -v nft >/dev/null && nft list table inet rosrv_protect >/dev/null 2>&1; then
-    nft delete table inet rosrv_protect
-fi
+for table in rosrv_protect rosrv_tunnel; do
+    if command -v nft >/dev/null && nft list table inet "$table" >/dev/null 2>&1; then
+        nft delete table inet "$table"
+    fi
+done
 rm -rf /etc/rosrv/protect.nft /etc/rosrv/keep.sh /etc/rosrv/renew.sh /etc/rosrv/leave.sh "/etc/rosrv/@name@"
 rmdir /etc/rosrv 2>/dev/null || true
 echo "leave.sh: this machine (@name@) has left. On the appliance: rosrv host revoke @name@"

@@ -8,9 +8,8 @@ import pytest
 from msgspec import structs
 
 from appliance.features.tunnels.enrolment_kit import Kit, archive, swanctl_conf
+from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.tunnel_answers import KitParts
-from appliance.network.close_ports import protection
-from appliance.network.firewall.firewall_rules import PortRange
 
 HOST = KitParts(
     revision=1,
@@ -27,12 +26,7 @@ HOST = KitParts(
     certificate="CERTIFICATE\n",
     authority="AUTHORITY\n",
 )
-KIT = Kit(
-    HOST,
-    "192.168.1.20",
-    protection(["10.113.11.1"], PortRange(32768, 60999), (), tunnelled=True),
-    "KEY\n",
-)
+KIT = kit_of(HOST, KitOptions("192.168.1.20"), "KEY\n")
 
 
 def unpack(kit: Kit) -> dict[str, tuple[str, int]]:
@@ -88,25 +82,39 @@ def test_the_tunnel_leads_to_the_appliance_only() -> None:
             assert one.strip().endswith(("-x25519", "-ecp384"))
 
 
-def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
+CLEAR_TEXT = {
+    "in the kernel": ("meta ipsec missing ip saddr", "rt ipsec missing ip daddr"),
+    "in user space": ('iifname != "ipsec*" ip saddr', 'oifname != "ipsec*" ip daddr'),
+}
+
+
+def test_the_firewall_of_a_host_keeps_the_appliances_address_for_the_tunnel() -> None:
+    """In both directions, in a table that `rosrv protect` does not replace, without a rule before these."""
     text = unpack(KIT)["rosrv-ocu-1/protect.nft"][0]
-    named = [line.strip() for line in text.splitlines() if " saddr {" in line]
-    assert named == [
-        "meta ipsec exists ip saddr { 10.113.11.1 } accept",
-        'iifname "ipsec*" ip saddr { 10.113.11.1 } accept',
-    ]
+    assert "        ip saddr { 10.113.11.1 } accept\n" in text.partition("table inet rosrv_tunnel {")[0]
+    for hook, either in zip(
+        ("prerouting", "postrouting"), zip(*CLEAR_TEXT.values(), strict=True), strict=True
+    ):
+        (chain,) = re.findall(
+            rf"hook {hook} [^\n]*\n([^}}]*)}}", text.partition("table inet rosrv_tunnel {")[2]
+        )
+        assert [line.strip() for line in chain.strip().splitlines()] == [
+            f"{rule} 10.113.11.1 counter drop" for rule in either
+        ]
 
 
-def test_the_script_removes_the_rule_that_does_not_apply() -> None:
-    """The correct rule depends on where ESP runs, and a kernel without IPsec cannot even load the other rule."""
+def test_the_script_removes_the_rules_that_do_not_apply() -> None:
+    """The correct rules depend on where ESP runs, and a kernel without IPsec cannot even load the others."""
     files = unpack(KIT)
     script, text = files["rosrv-ocu-1/join.sh"][0], files["rosrv-ocu-1/protect.nft"][0]
-    patterns = re.findall(r"""^    never=(?:'(.*)'|"(.*)")$""", script, re.MULTILINE)
-    assert len(patterns) == 2
-    for single, double in patterns:
-        left = [line for line in text.splitlines() if (single or double) not in line]
-        assert len(left) == len(text.splitlines()) - 1
-        assert sum(" saddr {" in line for line in left) == 1
+    found = re.findall(r"""say "ESP runs (.*)"\n    never=(?:'(.*)'|"(.*)")$""", script, re.MULTILINE)
+    assert {where for where, *_ in found} == CLEAR_TEXT.keys()
+    for where, single, double in found:
+        left = [line.strip() for line in text.splitlines() if (single or double) not in line]
+        assert len(left) == len(text.splitlines()) - 2
+        assert [line for line in left if "ipsec" in line] == [
+            f"{rule} 10.113.11.1 counter drop" for rule in CLEAR_TEXT[where]
+        ]
 
 
 @pytest.mark.nightly

@@ -92,7 +92,7 @@ def test_a_machine_with_other_ports_than_the_kit_is_warned(
     begin, end = text.index("closed=$("), text.index("\nfi\n", text.index("closed=$(")) + 4
     say = "".join(line for line in text.splitlines(True) if line.startswith("say()"))
     ports = PortRange(first + closed[0], last + closed[1])
-    (tmp_path / "protect.nft").write_text(protection(["10.113.11.1"], ports, (), tunnelled=True))
+    (tmp_path / "protect.nft").write_text(protection(["10.113.11.1"], ports, ()))
     done = subprocess.run(
         ["dash", "-eu", "-c", say + text[begin:end]], cwd=tmp_path, capture_output=True, text=True, check=True
     )
