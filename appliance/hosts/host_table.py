@@ -3,8 +3,10 @@
 1. No other host gets the virtual address of a name, even after a revocation. An address promised with a token is
    also reserved, and an address declared in hosts.yaml goes to another host only on request.
 2. A replaced or revoked certificate is on the list of revoked certificates at once.
-3. `revision` grows with every change by an operator or a host, even across restarts.
-4. A process that dies has stored all of a change, or nothing: otherwise a host's only certificate could be revoked.
+3. After a change of `ipsec.pool`, a host whose address is outside it is not admitted: in clear text, that address is
+   anyone's. Its next certificate comes with another address.
+4. `revision` grows with every change by an operator or a host, even across restarts.
+5. A process that dies has stored all of a change, or nothing: otherwise a host's only certificate could be revoked.
 """
 
 import datetime
@@ -88,7 +90,15 @@ class HostTable:
         return [row for row in self.rows.values() if row.revoked is None]
 
     def admitted(self) -> list[HostRow]:
-        return [row for row in self.enrolled() if self.declared.wants(row.name)]
+        return [
+            row for row in self.enrolled() if self.declared.wants(row.name) and self.is_for_hosts(row.address)
+        ]
+
+    def is_for_hosts(self, address: str) -> bool:
+        """Return whether hosts can have this address in the pool as it is now configured."""
+        ends = (self.pool.network_address, self.pool.broadcast_address)
+        one = ipaddress.IPv4Address(address)
+        return one in self.pool and one not in ends and address != self.own_address
 
     def addresses(self) -> dict[str, Address]:
         """Return the addresses that the policy has for `host:NAME` while the tunnels are open."""
@@ -104,7 +114,8 @@ class HostTable:
         return row
 
     def at(self, address: str) -> HostRow | None:
-        return next((row for row in self.enrolled() if row.address == address), None)
+        found = next((row for row in self.enrolled() if row.address == address), None)
+        return found if found is not None and self.is_for_hosts(address) else None
 
     def listed_as_revoked(self) -> list[RevokedCertificateRow]:
         return self.revoked.listed(self._enrolled_names())
@@ -154,6 +165,8 @@ class HostTable:
         """
         declared = self.declared.hosts.get(name)
         before = self.rows.get(name)
+        if before is not None and not self.is_for_hosts(before.address):
+            before = None  # of another pool
         kept = before.address if before else declared.address if declared else None
         if wanted is None and kept is not None:
             wanted = kept
@@ -171,10 +184,10 @@ class HostTable:
             raise HostRefusedError(
                 f"address: {wanted[:80]!r} is not an IPv4 address of {self.pool}"
             ) from None
-        ends = (self.pool.network_address, self.pool.broadcast_address)
-        if address not in self.pool or address in ends or str(address) == self.own_address:
+        if not self.is_for_hosts(str(address)):
+            where = " in hosts.yaml" if wanted is kept else ""
             raise HostRefusedError(
-                f"{address} is not an address of a host in {self.pool}: leave it out, for the next free one"
+                f"{address} is not an address of a host in {self.pool}: leave it out{where}, for the next free one"
             )
         if str(address) in taken:
             raise HostRefusedError(f"{address} is the address of {taken[str(address)]}: choose another one")

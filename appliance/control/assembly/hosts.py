@@ -45,8 +45,9 @@ class SiteHosts:
         return self._enrolment() or self._nobody
 
     def names(self) -> dict[str, str]:
-        """Return the addresses of enrolled hosts by their names."""
-        return {row.name: row.address for row in self.table.enrolled()}
+        """Return the addresses in the tunnels of enrolled hosts, by their names."""
+        rows = self.table.enrolled()
+        return {row.name: row.address for row in rows if self.table.is_for_hosts(row.address)}
 
 
 def make_host_table(settings: Settings, store: StateStore) -> HostTable:

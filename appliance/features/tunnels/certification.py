@@ -17,7 +17,7 @@ from appliance.configuration.sections import is_loopback
 from appliance.configuration.settings import Settings
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
-from appliance.features.tunnels.host_view import soon
+from appliance.features.tunnels.host_view import outside_the_pool, soon
 from appliance.features.tunnels.tunnel_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
@@ -228,6 +228,8 @@ class Certification:
             raise HostRefusedError(
                 f"the certificate of {name} is not stored here: issue a new one (rosrv host kit {name})"
             )
+        if not self.table.is_for_hosts(row.address):
+            raise HostRefusedError(outside_the_pool(self.table, row))
         return KitParts(
             revision=self.table.revision,
             name=name,

@@ -74,6 +74,9 @@ class HostSelfService:
             name = awaited.name
             try:
                 await self._tunnels.open()
+                address = awaited.address
+                if not self._table.is_for_hosts(address):
+                    address = self._table.address_for(name, None, self._certification.awaited.addresses())
                 with self._certification.unless_revoked(name):
                     made = await self._certification.issue(name, request.request, awaited.days)
                 take_effect()
@@ -83,7 +86,7 @@ class HostSelfService:
                 self._certification.awaited.give_back(awaited)
                 raise
             self._certification.enrolled(
-                name, awaited.address, made, awaited.who, token=awaited.id, peer=request.peer
+                name, address, made, awaited.who, token=awaited.id, peer=request.peer
             )
             return await self._certification.finish(name, awaited.kit)
 
@@ -306,11 +309,12 @@ class HostEnrolment(TunnelHosts):
         async with self._certification.changing:
             self._table.require(request.expected)
             row = self._table.enrolled_row(name)
+            address = self._table.address_for(name, None, self._awaited.addresses())
             await self._tunnels.open()
             with self._certification.unless_revoked(name):
                 made = await self._certification.issue(name, request.request, request.days)
             take_effect()
-            self._certification.keep(name, row.address, made)
+            self._certification.keep(name, address, made)
             self._certification.renewed(name, row.serial, made.serial, made.expires, who)
             return await self._certification.finish(name)
 

@@ -26,6 +26,13 @@ def soon(table: HostTable, row: HostRow, now: float) -> bool:
     return row.expires - now < min(SOON_SECONDS, life / 3)
 
 
+def outside_the_pool(table: HostTable, row: HostRow) -> str:
+    return (
+        f"{row.name} has {row.address}, outside ipsec.pool ({table.pool}), and cannot connect:"
+        f" rosrv host kit {row.name} gives it another address"
+    )
+
+
 class HostView:
     """Shows the hosts; `machines` counts, by address, nodes that use no tunnel."""
 
@@ -82,7 +89,8 @@ class HostView:
             return "in hosts.yaml, not enrolled"
         if row.revoked is not None:
             return "in hosts.yaml, revoked"
-        if declared.address is not None and declared.address != row.address:
+        keeps = self._table.is_for_hosts(row.address)
+        if keeps and declared.address is not None and declared.address != row.address:
             return f"hosts.yaml declares {declared.address}; it keeps {row.address} permanently"
         return None
 
@@ -144,6 +152,8 @@ class HostView:
             found.append(f"enrolled hosts cannot connect: {self._tunnels.obstacle}")
         for row in self._table.enrolled():
             left = row.expires - now
+            if not self._table.is_for_hosts(row.address):
+                found.append(outside_the_pool(self._table, row))
             if left <= 0:
                 found.append(f"the certificate of {row.name} has expired: rosrv host kit {row.name}")
             elif soon(self._table, row, now):

@@ -33,6 +33,7 @@ from appliance.features.tunnels.requests import (
     AuthorityWanted,
     HostAdd,
     HostEnrol,
+    HostKit,
     HostList,
     HostPorts,
     HostRenew,
@@ -277,6 +278,40 @@ def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> Non
 
     run(tmp_path, enrol)
     run(tmp_path, again)
+
+
+def test_no_host_keeps_an_address_outside_the_pool(tmp_path: Path) -> None:
+    """It could be anyone's, in clear text: so the name matches no host, until the host has another address."""
+    tokens = []
+
+    async def enrol(bench: Bench) -> None:
+        for name in ("a", "gone"):
+            await bench.add(name)
+        tokens.append((await bench.token("late", seconds=3600)).token)
+        await bench.revoke("gone")
+
+    async def after(bench: Bench) -> None:
+        await bench.tunnels.start()
+        assert (bench.table.admitted(), bench.tunnels.addresses, bench.table.at("10.113.11.2")) == (
+            [],
+            {},
+            None,
+        )
+        why = "a has 10.113.11.2, outside ipsec.pool (10.113.12.0/29), and cannot connect"
+        assert why in bench.hosts.status().troubles[0]
+        with pytest.raises(HostRefusedError, match="rosrv host kit a gives it another address"):
+            await bench.hosts.kit(HostKit("a"))
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
+        kit = await bench.renew("a")
+        assert (kit.address, kit.appliance) == ("10.113.12.2", "10.113.12.1")
+        assert {name: str(one) for name, one in bench.tunnels.addresses.items()} == {"a": kit.address}
+        assert bench.hosts.status().troubles == []
+        assert (await bench.enrol(tokens[0], "late")).address == "10.113.12.3"
+        assert (await bench.add("gone")).address == "10.113.12.4"
+
+    run(tmp_path, enrol)
+    run(tmp_path, after, pool="10.113.12.0/29")
 
 
 def test_a_master_that_tunnels_cannot_reach_is_reported(tmp_path: Path) -> None:
