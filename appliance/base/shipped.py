@@ -16,7 +16,7 @@ _DAY = 86_400.0
 
 def before_program() -> float:
     """Return the seconds that the system clock is behind the program's files; 0 for less than a day."""
-    before = Path(__file__).stat().st_mtime - clock.wall()
+    before = _date_of_program() - clock.wall()
     return before if before > _DAY else 0.0
 
 
@@ -26,3 +26,15 @@ def earliest_now() -> float:
     A certificate that is made until the time service answers would otherwise have ended long ago once it does.
     """
     return clock.wall() + before_program()
+
+
+def certainly_past() -> float:
+    """Return the date of the program's files, or the system time if the clock is behind them.
+
+    A certificate that begins then is also valid once a clock that was ahead is set.
+    """
+    return min(clock.wall(), _date_of_program())
+
+
+def _date_of_program() -> float:
+    return Path(__file__).stat().st_mtime

@@ -4,7 +4,8 @@
    may read is an error; nothing is replaced.
 2. Only the public key of a request is used: this module sets the names, times and usages of a certificate.
 3. A certificate is never valid for longer than the authority's own. Its time counts from the date of the program's
-   files if the clock is behind them.
+   files if the clock is behind them. The certificates of the authority and of the appliance begin at that date, so a
+   clock that was ahead shuts no host out; a host's begins when it is made, because hosts renew by its length.
 4. charon ignores a revocation list with a lower number, so its number always grows, even if the clock is set back.
 """
 
@@ -25,7 +26,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
-from appliance.base.shipped import earliest_now
+from appliance.base.shipped import certainly_past, earliest_now
+from appliance.channel.messages import APPLIANCE_NAME
 from appliance.ipsec.authority_key import Kind, SignerKeyError, load_key, make_key, write_key
 
 # Verify that the holder of an earlier certificate made a signing request. No I/O.
@@ -154,7 +156,7 @@ class CertificateAuthority:
             .issuer_name(self._certificate.subject)
             .public_key(public_key)
             .serial_number(secrets.randbits(_SERIAL_BITS) | 1 << _SERIAL_BITS)
-            .not_valid_before(now - _CLOCKS_DIFFER)
+            .not_valid_before((_past() if name == APPLIANCE_NAME else now) - _CLOCKS_DIFFER)
             .not_valid_after(end)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_usage(authority=False), critical=True)
@@ -229,14 +231,13 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
     key = make_key(kind)
     serial = x509.random_serial_number()
     subject = _subject(f"ROSRV appliance authority {serial % 0x1000000:06x}")
-    now = clock.utc_now()
     certificate = (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(subject)
         .public_key(key.public_key())
         .serial_number(serial)
-        .not_valid_before(now - _CLOCKS_DIFFER)
+        .not_valid_before(_past() - _CLOCKS_DIFFER)
         .not_valid_after(_end_after(AUTHORITY_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(authority=True), critical=True)
@@ -250,6 +251,10 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
 
 def _end_after(days: float) -> datetime.datetime:
     return datetime.datetime.fromtimestamp(earliest_now(), datetime.UTC) + datetime.timedelta(days=days)
+
+
+def _past() -> datetime.datetime:
+    return datetime.datetime.fromtimestamp(certainly_past(), datetime.UTC)
 
 
 def _load_certificate(path: Path) -> x509.Certificate:

@@ -25,7 +25,9 @@ IMAGE = BUILT - 200 * 86_400.0
 
 def _of_the_authority(folder: Path) -> list[bytes]:
     authority = CertificateAuthority(folder)
-    return [authority.certificate, authority.issue(signing_request(make_key(), "a"), "a", 90).certificate]
+    names = ("a", "rosrv-appliance")
+    made = [authority.issue(signing_request(make_key(), name), name, 90).certificate for name in names]
+    return [authority.certificate, *made]
 
 
 def _of_rest(folder: Path) -> list[bytes]:
@@ -63,6 +65,28 @@ def test_a_certificate_of_the_time_before_is_valid_when_the_clock_is_set(
             machine.set_wall(at)
             now = datetime.datetime.fromtimestamp(at, datetime.UTC)
             assert all(one.not_valid_before_utc <= now < one.not_valid_after_utc for one in made)
+
+
+@pytest.mark.parametrize("days", [40, 4000])
+@pytest.mark.parametrize("maker", MADE)
+def test_a_certificate_of_a_clock_that_was_ahead_is_valid_when_it_is_set(
+    maker: str, days: float, tmp_path: Path
+) -> None:
+    """REST makes another one within a minute. `rosrv status` names a host whose certificate is not valid yet."""
+    with clock.using(machine := VirtualClock(wall=BUILT + days * 86_400.0)):
+        made = MADE[maker](tmp_path)
+        machine.set_wall(BUILT + 86_400.0)
+        now = clock.utc_now()
+        if maker == "appliance/api/front/certificate.py":
+            assert (
+                renew(tls_context(tmp_path, [], now), tmp_path, [], now) is False
+            )  # the context made it again
+            made = [(tmp_path / CERTIFICATE).read_bytes()]
+        read = [x509.load_pem_x509_certificate(one) for one in made]
+        late = [one for one in read if not one.not_valid_before_utc <= now < one.not_valid_after_utc]
+        assert [one.subject.rfc4514_string() for one in late] == (
+            ["CN=a,O=ROSRV"] if maker == "appliance/ipsec/certificate_authority.py" else []
+        )
 
 
 def test_the_certificate_of_rest_stays_when_the_clock_is_set(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from appliance.hosts.tunnel_state import Tunnels
 from appliance.policy.host_names import HostInWords
 from appliance.store.host_tables import EnrolmentTokenRow, HostRow
 
+_CLOCKS_DIFFER = 3600.0  # a certificate begins this long before it is made
 SOON_SECONDS = 14 * 86_400.0
 _NEVER = PortsSeen("unknown", None, [], "")
 
@@ -154,7 +155,13 @@ class HostView:
             left = row.expires - now
             if not self._table.is_for_hosts(row.address):
                 found.append(outside_the_pool(self._table, row))
-            if left <= 0:
+            certificate = self._table.certificates.get(row.name)
+            if certificate is not None and certificate.made > now + _CLOCKS_DIFFER:
+                found.append(
+                    f"the certificate of {row.name} was made while the clock was ahead, and is not valid yet:"
+                    f" rosrv host kit {row.name}"
+                )
+            elif left <= 0:
                 found.append(f"the certificate of {row.name} has expired: rosrv host kit {row.name}")
             elif soon(self._table, row, now):
                 found.append(

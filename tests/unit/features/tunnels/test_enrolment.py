@@ -795,6 +795,19 @@ async def test_charon_has_a_valid_certificate_and_list_soon_after_a_step_of_the_
         running.cancel()
 
 
+async def test_a_host_that_enrolled_while_the_clock_was_ahead_is_named(bench: Bench) -> None:
+    with using(machine := VirtualClock()):
+        now = clock.wall()
+        machine.set_wall(now + 7 * 86_400.0)
+        await bench.add("a")
+        assert bench.hosts.status().troubles == []
+        machine.set_wall(now)
+        (trouble,) = bench.hosts.status().troubles
+        assert trouble.startswith("the certificate of a was made while the clock was ahead")
+        await bench.renew("a")
+        assert bench.hosts.status().troubles == []
+
+
 async def test_a_host_that_enrolled_before_the_clock_was_set_can_renew(bench: Bench) -> None:
     first, second = make_key(), make_key()
     with using(machine := VirtualClock(wall=10.0)):
