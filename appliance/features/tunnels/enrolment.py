@@ -364,7 +364,7 @@ class HostEnrolment(TunnelHosts):
                 endpoint=found.endpoint,
                 endpoint_reason=found.reason,
                 **known,
-                script=filled("enrol.sh", {"name": name, **known}),
+                script=filled("enrol.sh", {"name": name, "id": row.id, **known}),
             )
 
     async def revoke(self, request: host_requests.HostRevoke, who: str) -> answers.Revoked:

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Enrols this machine (Debian or Ubuntu) as @name@ with the ROSRV appliance at @url@: makes its key here, has it
-# certified with a one-time token, and joins. Run again, it goes on where it ended.
+# certified with a one-time token, and joins. Run again, it goes on where it ended; a script with another token enrols
+# the machine again, with another key.
 #
 #   sudo sh rosrv-@name@-join.sh [TOKEN]       without TOKEN it is asked for, or taken from ROSRV_ENROL_TOKEN
 #
@@ -10,6 +11,7 @@ set -eu
 url="@url@"
 pin="@pin@"
 authority="@authority@"
+token_id="@id@"  # its public part
 
 die() { echo "join.sh: $*" >&2; exit 1; }
 [ "$(id -u)" = 0 ] || die "run it as root: sudo sh $0"
@@ -25,13 +27,14 @@ for program in curl openssl tar; do
 done
 
 fingerprint() { openssl x509 -in "$1" -noout -fingerprint -sha256 | cut -d= -f2 | tr -d ':' | tr 'A-F' 'a-f'; }
-public() { openssl pkey -in "$1" -pubout; }
-
-[ -s "$folder/rosrv.key" ] || openssl ecparam -name secp384r1 -genkey -noout -out "$folder/rosrv.key"
 kit="$folder/rosrv-@name@"
-if [ -s "$kit/swanctl/x509/rosrv.pem" ] && [ "$(fingerprint "$kit/swanctl/x509ca/rosrv-ca.pem")" = "$authority" ] \
-    && [ "$(openssl x509 -in "$kit/swanctl/x509/rosrv.pem" -noout -pubkey)" = "$(public "$folder/rosrv.key")" ] \
-    && [ -z "${1-}" ]; then
+new="$folder/new"
+# The kit of this script's token is complete in this folder, with its key.
+made() { [ "$(cat "$1/token" 2>/dev/null)" = "$token_id" ]; }
+take() { rm -rf "$kit"; mv "$new/rosrv-@name@" "$kit"; rm -rf "$new"; }
+
+if made "$new/rosrv-@name@"; then take; fi
+if [ -z "${1-}" ] && made "$kit" && [ "$(fingerprint "$kit/swanctl/x509ca/rosrv-ca.pem")" = "$authority" ]; then
     echo "join.sh: @name@ is already enrolled; with a new token it enrols again"
 else
     token=${1-${ROSRV_ENROL_TOKEN-}}
@@ -39,25 +42,30 @@ else
         printf 'one-time token: ' >&2
         read -r token
     fi
-    openssl req -new -key "$folder/rosrv.key" -subj "/CN=@name@" -out "$folder/rosrv.csr"
+    # All that is new is made beside what is there, and takes its place when it is complete.
+    rm -rf "$new"
+    mkdir "$new"
+    openssl ecparam -name secp384r1 -genkey -noout -out "$new/rosrv.key"
+    openssl req -new -key "$new/rosrv.key" -subj "/CN=@name@" -out "$new/rosrv.csr"
     # The token goes through a file: what stands in a command's arguments, others on this machine can read.
-    printf '{"token":"%s","request":"%s"}' "$token" "$(awk '{printf "%s\\n", $0}' "$folder/rosrv.csr")" > "$folder/body"
-    status=$(curl --silent --show-error --max-time 60 --insecure --pinnedpubkey "$pin" -o "$folder/answer" \
+    printf '{"token":"%s","request":"%s"}' "$token" "$(awk '{printf "%s\\n", $0}' "$new/rosrv.csr")" > "$new/body"
+    status=$(curl --silent --show-error --max-time 60 --insecure --pinnedpubkey "$pin" -o "$new/answer" \
         -w '%{http_code}' -H 'Content-Type: application/json' -H 'Accept: application/gzip' \
-        --data-binary @"$folder/body" "$url/v1/enrol") || {
-        rm -f "$folder/body"
+        --data-binary @"$new/body" "$url/v1/enrol") || {
+        rm -f "$new/body"
         die "no answer from the appliance at $url, or one with another key (curl says it above)"
     }
-    rm -f "$folder/body"
-    [ "$status" = 200 ] || die "the appliance refused ($status): $(cat "$folder/answer")"
-    rm -rf "$kit"
-    tar -xzf "$folder/answer" -C "$folder"
-    rm -f "$folder/answer"
-    if [ "$(fingerprint "$kit/swanctl/x509ca/rosrv-ca.pem")" != "$authority" ]; then
-        rm -rf "$kit"
+    rm -f "$new/body"
+    [ "$status" = 200 ] || die "the appliance refused ($status): $(cat "$new/answer")"
+    tar -xzf "$new/answer" -C "$new"
+    if [ "$(fingerprint "$new/rosrv-@name@/swanctl/x509ca/rosrv-ca.pem")" != "$authority" ]; then
+        rm -rf "$new"
         die "the certificate of the authority is another than the one this script was made for"
     fi
+    mkdir -p "$new/rosrv-@name@/swanctl/private"
+    mv "$new/rosrv.key" "$new/rosrv-@name@/swanctl/private/rosrv.key"
+    echo "$token_id" > "$new/rosrv-@name@/token"
+    take
+    rm -f "$folder/rosrv.key" "$folder/rosrv.csr"  # of an earlier script
 fi
-mkdir -p "$kit/swanctl/private"
-install -m 0600 "$folder/rosrv.key" "$kit/swanctl/private/rosrv.key"
 exec sh "$kit/join.sh"
