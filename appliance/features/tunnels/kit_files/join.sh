@@ -40,15 +40,17 @@ else
     printf 'kernel-libipsec {\n  load = yes\n}\n' > "$plugin"
 fi
 
-end() { date -u -d "$(openssl x509 -in "$1" -noout -enddate | cut -d= -f2)" +%s; }
+begin() { date -u -d "$(openssl x509 -in "$1" -noout -startdate | cut -d= -f2)" +%s; }
 # OpenSSL 3.2 and later print no spaces around the equals sign.
 name_in() { openssl x509 -in "$1" -noout -subject | sed -n 's/.*CN *= *\([^ ,]*\)$/\1/p'; }
-# A certificate that was renewed since this kit was made is not replaced by the kit's, which is revoked by now.
+# A certificate that was renewed since this kit was made is not replaced by the kit's, which is revoked by now. One that
+# is not valid yet was made while the appliance's clock was ahead.
 renewed() {
     [ -s /etc/swanctl/x509/rosrv.pem ] && [ -s /etc/swanctl/private/rosrv.key ] \
         && cmp -s swanctl/x509ca/rosrv-ca.pem /etc/swanctl/x509ca/rosrv-ca.pem \
         && [ "$(name_in /etc/swanctl/x509/rosrv.pem)" = "@name@" ] \
-        && [ "$(end /etc/swanctl/x509/rosrv.pem)" -gt "$(end swanctl/x509/rosrv.pem)" ]
+        && [ "$(begin /etc/swanctl/x509/rosrv.pem)" -gt "$(begin swanctl/x509/rosrv.pem)" ] \
+        && [ "$(begin /etc/swanctl/x509/rosrv.pem)" -le "$(date -u +%s)" ]
 }
 
 install -d -m 0755 /etc/swanctl/conf.d /etc/swanctl/x509 /etc/swanctl/x509ca /etc/swanctl/x509crl /etc/rosrv

@@ -6,16 +6,19 @@ The real `openssl` runs, with the spelling of the tested version.
 import os
 import shutil
 import subprocess
+import time
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
+from appliance.base import clock
 from appliance.features.tunnels.enrolment_kit import filled
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network.close_ports import RANGE_FILE, protection
 from appliance.network.firewall.firewall_rules import PortRange
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.nightly
 
@@ -38,14 +41,15 @@ class Machine:
         (programs / "openssl").chmod(0o755)
         self._path = f"{programs}:{os.environ['PATH']}"
 
-    def put(self, where: str, name: str, days: float) -> None:
-        made = self._authority.issue(signing_request(make_key(), name), name, days).certificate
+    def put(self, where: str, name: str, made_days_ago: float, days: float) -> None:
+        with clock.using(VirtualClock(wall=time.time() - made_days_ago * 86_400.0)):
+            made = self._authority.issue(signing_request(make_key(), name), name, days).certificate
         root = self._kit if where == "kit" else self._etc
         (root / "x509/rosrv.pem").write_bytes(made)
 
     def keeps_what_is_in_place(self) -> bool:
         text = filled("join.sh", defaultdict(str, name="laptop"))
-        begin, end = text.index("end() {"), text.index("\n}\n", text.index("renewed() {")) + 3
+        begin, end = text.index("begin() {"), text.index("\n}\n", text.index("renewed() {")) + 3
         script = text[begin:end].replace("/etc/swanctl", str(self._etc)) + "renewed\n"
         done = subprocess.run(
             ["sh", "-eu", "-c", script],
@@ -64,17 +68,22 @@ class Machine:
 def test_a_renewed_certificate_stays(tmp_path: Path, openssl: str) -> None:
     """When join.sh runs again, it must recognise the certificate however openssl writes a name."""
     machine = Machine(tmp_path, SPELLINGS[openssl])
-    machine.put("kit", "laptop", 10)
-    machine.put("etc", "laptop", 20)
+    machine.put("kit", "laptop", 3, 90)
+    machine.put("etc", "laptop", 1, 30)
     assert machine.keeps_what_is_in_place()
 
 
 @pytest.mark.parametrize("openssl", SPELLINGS)
-@pytest.mark.parametrize(("name", "days"), [("laptop-2", 20), ("my-laptop", 20), ("laptop", 5)])
-def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: str, days: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "made_days_ago"), [("laptop-2", 1), ("my-laptop", 1), ("laptop", 5), ("laptop", -1)]
+)
+def test_any_other_certificate_is_replaced(
+    tmp_path: Path, openssl: str, name: str, made_days_ago: float
+) -> None:
+    """The kit's counts even if it ends earlier, or if the clock was ahead before: the other one is revoked."""
     machine = Machine(tmp_path, SPELLINGS[openssl])
-    machine.put("kit", "laptop", 10)
-    machine.put("etc", name, days)
+    machine.put("kit", "laptop", 3, 30)
+    machine.put("etc", name, made_days_ago, 90)
     assert not machine.keeps_what_is_in_place()
 
 
