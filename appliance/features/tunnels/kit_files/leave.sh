@@ -18,6 +18,7 @@ fi
 rm -f /etc/strongswan.d/rosrv.conf /etc/swanctl/conf.d/rosrv.conf /etc/swanctl/x509/rosrv.pem /etc/swanctl/x509ca/rosrv-ca.pem
 rm -f /etc/swanctl/x509crl/rosrv.crl /etc/swanctl/x509crl/rosrv-crl.pem
 rm -f /etc/swanctl/private/rosrv.key /etc/swanctl/private/rosrv.key.unconfirmed
+rm -rf /etc/swanctl/rosrv.new
 for connection in @connections@; do swanctl --terminate --ike "$connection" >/dev/null 2>&1 || true; done
 swanctl --load-all --clear --noprompt >/dev/null 2>&1 || true
 plugin=/etc/strongswan.d/charon/kernel-libipsec.conf

@@ -7,6 +7,9 @@ set -eu
 rest="@rest@"
 pin="@pin@"
 swanctl=${SWANCTL_DIR:-/etc/swanctl}
+key="$swanctl/private/rosrv.key"
+certificate="$swanctl/x509/rosrv.pem"
+new="$swanctl/rosrv.new"  # beside both, so that each is replaced by a name only
 [ -n "$rest" ] || { echo "renew.sh: the appliance's REST cannot be reached through the tunnel: rosrv host kit @name@" >&2; exit 2; }
 
 die() { echo "renew.sh: $*" >&2; exit 1; }
@@ -25,45 +28,57 @@ ask() {
 }
 
 work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
+trap 'rm -rf "$work" "$new"' EXIT
 umask 077
+rm -rf "$new"
+mkdir "$new"
 
 # What openssl finds out about the signature of a list it says, and does not tell by its exit status.
 if ask "$rest/v1/revocations" && [ "$status" = 200 ] && LC_ALL=C openssl crl -in "$work/answer" -noout \
     -CAfile "$swanctl/x509ca/rosrv-ca.pem" 2>&1 | grep -qx "verify OK"; then
     # In DER: swanctl takes 64 KiB of a list at most, and PEM is a third longer.
     openssl crl -in "$work/answer" -outform DER -out "$work/crl.der"
-    install -D -m 0644 "$work/crl.der" "$swanctl/x509crl/rosrv.crl"
+    mkdir -p "$swanctl/x509crl"
+    install -m 0644 "$work/crl.der" "$new/crl"
+    mv "$new/crl" "$swanctl/x509crl/rosrv.crl"
     rm -f "$swanctl/x509crl/rosrv-crl.pem"
 fi
 
-# What was left in the middle: a certificate that is in place and was not confirmed.
+# Before the certificate is confirmed, which revokes the one before: both are in place, and charon has them.
 confirm() {
+    swanctl --load-creds --clear --noprompt ${VICI_URI:+--uri "$VICI_URI"} >/dev/null || die "strongSwan did not take the new certificate"
+    swanctl --load-conns ${VICI_URI:+--uri "$VICI_URI"} >/dev/null || die "strongSwan did not take the new certificate"
     ask -X POST "$rest/v1/hosts/@name@/renewed" || die "no answer from $rest ($status)"
     case $status in
-        204) rm -f "$swanctl/private/rosrv.key.unconfirmed"; echo "renew.sh: the new certificate is in force" ;;
-        422) rm -f "$swanctl/private/rosrv.key.unconfirmed" ;;
+        204) rm -f "$key.unconfirmed"; echo "renew.sh: the new certificate is in force" ;;
+        422) rm -f "$key.unconfirmed" ;;
         *) die "the appliance did not take the new certificate ($status): $(cat "$work/answer")" ;;
     esac
 }
-if [ -e "$swanctl/private/rosrv.key.unconfirmed" ]; then confirm; fi
+fits() { public=$(openssl x509 -in "$certificate" -noout -pubkey) && [ "$public" = "$(openssl pkey -in "$key" -pubout)" ]; }
+# What was left in the middle: a new certificate that is in place and was not confirmed, or less, which does not count.
+if [ -e "$key.unconfirmed" ]; then
+    if fits && ! cmp -s "$key" "$key.unconfirmed"; then confirm; else mv "$key.unconfirmed" "$key"; fi
+fi
 
-seconds() { date -u -d "$(openssl x509 -in "$swanctl/x509/rosrv.pem" -noout "$1" | cut -d= -f2)" +%s; }
-begin=$(seconds -startdate)
-end=$(seconds -enddate)
-left=$((end - $(date -u +%s)))
-if [ "${1-}" != --now ] && [ $((left * 3)) -gt $((end - begin)) ]; then
-    echo "renew.sh: nothing to do, the certificate is good for another $((left / 86400)) days"
-    exit 0
+seconds() { date -u -d "$(openssl x509 -in "$certificate" -noout "$1" | cut -d= -f2)" +%s; }
+if [ "${1-}" != --now ] && fits; then
+    begin=$(seconds -startdate)
+    end=$(seconds -enddate)
+    left=$((end - $(date -u +%s)))
+    if [ $((left * 3)) -gt $((end - begin)) ]; then
+        echo "renew.sh: nothing to do, the certificate is good for another $((left / 86400)) days"
+        exit 0
+    fi
 fi
 
 openssl ecparam -name secp384r1 -genkey -noout -out "$work/new.key"
 openssl req -new -key "$work/new.key" -subj "/CN=@name@" -out "$work/new.csr"
 # The two say the same, but OpenSSL 1.1.1 has the first only, and the first signs nothing with Ed25519.
-if openssl pkey -in "$swanctl/private/rosrv.key" -noout -text | head -1 | grep -qi ed25519; then
-    openssl pkeyutl -sign -rawin -inkey "$swanctl/private/rosrv.key" -in "$work/new.csr" -out "$work/proof"
+if openssl pkey -in "$key" -noout -text | head -1 | grep -qi ed25519; then
+    openssl pkeyutl -sign -rawin -inkey "$key" -in "$work/new.csr" -out "$work/proof"
 else
-    openssl dgst -sha384 -sign "$swanctl/private/rosrv.key" -out "$work/proof" "$work/new.csr"
+    openssl dgst -sha384 -sign "$key" -out "$work/proof" "$work/new.csr"
 fi
 printf '{"request":"%s","proof":"%s"}' "$(awk '{printf "%s\\n", $0}' "$work/new.csr")" \
     "$(openssl base64 -A -in "$work/proof")" > "$work/body"
@@ -75,9 +90,11 @@ openssl verify -CAfile "$swanctl/x509ca/rosrv-ca.pem" "$work/new.pem" >/dev/null
 [ "$(openssl x509 -in "$work/new.pem" -noout -pubkey)" = "$(openssl pkey -in "$work/new.key" -pubout)" ] \
     || die "what the appliance answered is a certificate for another key"
 
-install -m 0600 "$swanctl/private/rosrv.key" "$swanctl/private/rosrv.key.unconfirmed"
-install -m 0600 "$work/new.key" "$swanctl/private/rosrv.key"
-install -m 0644 "$work/new.pem" "$swanctl/x509/rosrv.pem"
-swanctl --load-creds --clear --noprompt ${VICI_URI:+--uri "$VICI_URI"} >/dev/null || die "strongSwan did not take the new certificate"
-swanctl --load-conns ${VICI_URI:+--uri "$VICI_URI"} >/dev/null || die "strongSwan did not take the new certificate"
+install -m 0600 "$key" "$new/before"
+install -m 0600 "$work/new.key" "$new/key"
+install -m 0644 "$work/new.pem" "$new/certificate"
+sync "$new/before" "$new/key" "$new/certificate"
+mv "$new/before" "$key.unconfirmed"
+mv "$new/key" "$key"
+mv "$new/certificate" "$certificate"
 confirm
