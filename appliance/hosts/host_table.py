@@ -226,10 +226,12 @@ class HostTable:
         if certificate is None or certificate.next is None:
             return None
         following = certificate.next
+        # It was made for the life of the one before. The present time is none of its life: a host may be late.
+        made = following.expires - (row.expires - certificate.made)
         with self._kept.together():
             self.revoked.add(name, row.serial, row.expires)
             taken = self._set(row._replace(serial=following.serial, expires=following.expires))
-            self._set_certificate(CertificateRow(name, earliest_now(), following.certificate))
+            self._set_certificate(CertificateRow(name, made, following.certificate))
             self.changed()
         return taken
 

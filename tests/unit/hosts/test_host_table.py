@@ -12,6 +12,7 @@ from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.store.changes import Change
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase, KilledError
+from tests.support.virtual_clock import VirtualClock
 
 DAY = 86_400.0
 
@@ -34,6 +35,22 @@ def die_after(store: StateStore, writes: int) -> None:
         keep(changes)
 
     store.database.keep = keep_some  # type: ignore[method-assign]  # only some writes reach the disk
+
+
+@pytest.mark.parametrize(
+    "late", [0.0, 25 * DAY, 60 * DAY, -400 * DAY], ids=lambda late: f"{late / DAY:.0f} days"
+)
+def test_a_late_confirmation_shortens_no_life(late: float, tmp_path: Path) -> None:
+    """The next certificate gets the life of the present one, whatever the clock does in between."""
+    store, table = opened(tmp_path)
+    with clock.using(machine := VirtualClock()):
+        table.keep("ocu", "10.113.0.2", made("a1"))
+        for serial in ("b2", "c3"):
+            table.keep_next("ocu", made(serial))
+            machine.set_wall(clock.wall() + late)
+            assert table.take_next("ocu") is not None
+            assert table.rows["ocu"].expires - table.certificates["ocu"].made == pytest.approx(30 * DAY)
+    store.close()
 
 
 @pytest.mark.parametrize(
