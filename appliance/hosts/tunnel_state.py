@@ -259,7 +259,7 @@ class Tunnels:
             case messages.TunnelRefused(remote, reason, packets) if packets:
                 self._trail.happened("packets refused", reason, decision="deny", host=remote, packets=packets)
             case messages.TunnelRefused(remote, reason):
-                self._trail.happened("tunnel refused", reason, decision="deny", host=remote)
+                self._trail.happened("tunnel refused", reason, decision="deny", host=remote or None)
             case messages.TunnelsReported(taken, rows):
                 self._on_report(rows)
                 # An unknown number is of an earlier process; if the clock was set back, it may be the greater one.

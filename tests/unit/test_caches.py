@@ -142,6 +142,7 @@ BY_HAND = {
     "appliance/features/standby/witness/request_gate.py::_last": OURS_ONLY,
     "appliance/features/topics/control_part.py::_shown": "if moment - since >= ONE_LOOK",
     "appliance/features/tunnels/refusals.py::_packets": OURS_ONLY,
+    "appliance/features/tunnels/refusals.py::_passed": "self._passed.total() < REFUSALS_PER_SECOND",
     "appliance/formats/interventions.py::_states": ANSWER,
     "appliance/hosts/hosts_file.py::found": TEXT,
     "appliance/master/endpoints/delivery.py::_lists": OPEN,
@@ -222,6 +223,7 @@ KEYED = {
     "appliance/features/recorder/recording_plan.py::_begun": HOST,
     "appliance/features/recorder/recording_plan.py::_open": HOST,
     "appliance/features/topics/control_part.py::_shown": COUNTED,
+    "appliance/features/tunnels/refusals.py::_passed": COUNTED,
     "appliance/master/endpoints/delivery.py::_used": WHOLE,  # the address that is called
     "appliance/master/endpoints/node_ports.py::_routes": HOST,
     "appliance/policy/policy.py::standings": HOST,

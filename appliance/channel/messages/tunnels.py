@@ -75,7 +75,7 @@ class TunnelChanged(Message):
 class TunnelRefused(Message):
     """A request for a tunnel was refused or, if `packets` is not 0, that number of packets in a tunnel.
 
-    The source address of a tunnel's packet is not verified.
+    The source address of a tunnel's packet is not verified. `remote` is empty for requests of many others.
     """
 
     remote: str

@@ -3,7 +3,8 @@
 1. The private key stays in this process's own directory (mode 0600) and in charon.
 2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
    ports 500 and 4500. Each dies with the other, and the supervisor starts both again.
-3. The only untrusted input parsed here is charon's log; at most `REFUSALS_PER_SECOND` of its refusals are passed on.
+3. The only untrusted input parsed here is charon's log; few of its refusals are passed on each second, the rest is
+   counted.
 4. Calls to charon are made one at a time: two calls on one session would read each other's answers.
 """
 
@@ -26,7 +27,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.tunnels.charon import CharonError, ViciClient
-from appliance.features.tunnels.refusals import Refusal, RefusalParser
+from appliance.features.tunnels.refusals import REFUSED_SOURCES, Refusal, RefusalParser, RefusalShares
 from appliance.ipsec.authority_key import SignerKeyError, require_private
 from appliance.ipsec.leftovers import clear_leftovers
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
@@ -34,8 +35,6 @@ from appliance.ipsec.strongswan import PROGRAM, configuration
 
 KEY_FILE = "appliance.key"
 TUN = Path("/dev/net/tun")
-REFUSALS_PER_SECOND = 20
-REFUSED_SOURCES = 20  # most sources of dropped packets in one report
 REPORT_SECONDS = 2.0
 RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
@@ -66,7 +65,7 @@ class TunnelProcess:
         self._version = ""
         self._refusals = RefusalParser()
         self._packets: Counter[Refusal] = Counter()  # packets that ESP dropped since the last report
-        self._second = (0, 0)  # the last second with refusals, and their number
+        self._shares = RefusalShares()
         self._tasks: set[asyncio.Future[Any]] = set()
         self._output: deque[str] = deque(maxlen=_OUTPUT_LINES)  # charon's last lines
         self.failed = False
@@ -178,7 +177,7 @@ class TunnelProcess:
             if refusal is not None and refusal.packet:
                 if refusal in self._packets or len(self._packets) < REFUSED_SOURCES:
                     self._packets[refusal] += 1
-            elif refusal is not None and self._may_tell():
+            elif refusal is not None and self._shares.passes(refusal, clock.now()):
                 self._tell(messages.TunnelRefused(refusal.remote, refusal.reason))
         status = await charon.wait()
         how = f"by {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
@@ -186,17 +185,14 @@ class TunnelProcess:
             f"charon exited {how}; its last output: {self._output[-1] if self._output else 'nothing'}"
         )
 
-    def _may_tell(self) -> bool:
-        second, count = int(clock.now()), self._second[1]
-        self._second = (second, count + 1 if second == self._second[0] else 1)
-        return self._second[1] <= REFUSALS_PER_SECOND
-
     async def _report(self) -> None:
         while True:
             await asyncio.sleep(REPORT_SECONDS)
             for refusal, count in self._packets.items():
                 self._tell(messages.TunnelRefused(refusal.remote, refusal.reason, count))
             self._packets.clear()
+            for refusal in self._shares.rest():
+                self._tell(messages.TunnelRefused(refusal.remote, refusal.reason))
             if self._vici is not None and not self._changed.is_set():
                 await self._say_how_it_stands(self._vici)
 

@@ -5,12 +5,13 @@ packet. If ESP runs in charon, the log also has packets that a tunnel dropped.
 """
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 
 _LINE = re.compile(r"(\d\d)\[[A-Z]{3}\] (.*+)")
 _ARRIVED = re.compile(r"received packet: from ([^\s\[]++)\[\d++\] to ")
 _REFUSED = re.compile(
-    r"generating IKE_\S++ response \d++ \[ (?:.{0,2000} )?N\((AUTH_FAILED|NO_PROP|FAIL_CP_REQ|TS_UNACCEPT)\)"
+    r"generating (IKE_\S++) response \d++ \[ (?:.{0,2000} )?N\((AUTH_FAILED|NO_PROP|FAIL_CP_REQ|TS_UNACCEPT)\)"
 )
 _SENT_AGAIN = re.compile(r"  src ([^\s,]++), dst [^\s,]++, SPI [0-9a-f]{8}")
 _UNDER_ANOTHERS = re.compile(
@@ -42,11 +43,15 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A refusal in charon's log. `packet`: a packet of a tunnel was dropped; otherwise a request was refused."""
+    """A refusal in charon's log. `packet`: a packet of a tunnel was dropped; otherwise a request was refused.
+
+    `answered`: the sender has answered charon at this address, so it is not forged.
+    """
 
     remote: str
     reason: str
     packet: bool = False
+    answered: bool = False
 
 
 @dataclass
@@ -81,8 +86,49 @@ class RefusalParser:
                 packet.reasons.append(text.strip())
             return None
         del self._packets[thread]
-        reasons = "; ".join([_WORDS[refused[1]], *packet.reasons])
-        return Refusal(packet.remote, reasons[:_LONGEST])
+        reasons = "; ".join([_WORDS[refused[2]], *packet.reasons])
+        return Refusal(packet.remote, reasons[:_LONGEST], answered=refused[1] != "IKE_SA_INIT")
+
+
+REFUSALS_PER_SECOND = 20
+UNANSWERED_PER_SECOND = 10  # of these, from addresses that may be forged
+REFUSALS_OF_A_SOURCE = 2  # per second
+REFUSED_SOURCES = 20  # most sources that one report names
+
+
+class RefusalShares:
+    """Chooses the refused requests to pass on, so that no unknown host hides those of others; counts the rest."""
+
+    def __init__(self) -> None:
+        self._second = 0
+        self._passed: Counter[str] = Counter()  # in this second, by source
+        self._unanswered = 0
+        self._rest: Counter[str] = Counter()
+
+    def passes(self, refusal: Refusal, now: float) -> bool:
+        if int(now) != self._second:
+            self._second, self._unanswered = int(now), 0
+            self._passed.clear()
+        if (
+            self._passed.total() < REFUSALS_PER_SECOND
+            and self._passed[refusal.remote] < REFUSALS_OF_A_SOURCE
+            and (refusal.answered or self._unanswered < UNANSWERED_PER_SECOND)
+        ):
+            self._passed[refusal.remote] += 1
+            self._unanswered += not refusal.answered
+            return True
+        named = refusal.remote in self._rest or len(self._rest) < REFUSED_SOURCES
+        self._rest[refusal.remote if named else ""] += 1
+        return False
+
+    def rest(self) -> list[Refusal]:
+        """Return what did not pass since the last call, a refusal for each source; the last may have none."""
+        found = [
+            Refusal(remote, f"{count} more {'request was' if count == 1 else 'requests were'} refused")
+            for remote, count in self._rest.items()
+        ]
+        self._rest.clear()
+        return found
 
 
 def _packet(text: str) -> Refusal | None:

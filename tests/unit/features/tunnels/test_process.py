@@ -18,6 +18,7 @@ from appliance.channel.messages import (
     Stop,
     TunnelChanged,
     TunnelLink,
+    TunnelRefused,
     TunnelSeen,
     TunnelsReported,
     TunnelsStated,
@@ -25,6 +26,7 @@ from appliance.channel.messages import (
 from appliance.features.tunnels import process
 from appliance.features.tunnels.charon import ViciClient
 from appliance.ipsec.requests import make_key
+from appliance.ipsec.strongswan import Proposals
 from tests.support.idle import idle
 
 pytestmark = pytest.mark.anyio
@@ -150,6 +152,50 @@ async def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: py
     said = await failure_of(tmp_path, "kernel")
     assert said.output == [*map(str, range(62, 101)), "x" * 500]
     assert said.reason.startswith("charon exited by SIGSEGV; its last output: xxx")
+
+
+@pytest.mark.nightly
+async def test_refusals_beyond_the_share_of_an_address_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, wanted = tmp_path / "charon", 50
+    program.write_text(
+        "#!/bin/sh\n"
+        f"for one in $(seq {wanted}); do\n"
+        "    echo '09[NET] received packet: from 10.88.0.66[500] to 10.88.0.2[500] (268 bytes)' >&2\n"
+        "    echo '09[ENC] generating IKE_AUTH response 1 [ N(AUTH_FAILED) ]' >&2\n"
+        "done\nexec sleep 60\n"
+    )
+    program.chmod(0o700)
+    counted, whole, heard = 0, asyncio.Event(), list[TunnelRefused]()
+
+    async def connect(_tunnels: process.TunnelProcess, _path: Path) -> ViciClient:
+        charon = charon_that(
+            load_key=lambda _key: None,
+            provision=lambda _one: None,
+            version=lambda: "6",
+            seen=list,
+            listen=list,
+        )
+        charon.proposals = Proposals()
+        return charon
+
+    def told(message: Any) -> None:
+        nonlocal counted
+        if isinstance(message, TunnelRefused):
+            heard.append(message)
+            counted += int(message.reason.split()[0]) if "more" in message.reason else 1
+            if counted == wanted:
+                whole.set()
+
+    monkeypatch.setattr(process, "PROGRAM", program)
+    monkeypatch.setattr(process, "clear_leftovers", lambda _address: None)
+    monkeypatch.setattr(process, "REPORT_SECONDS", 0.05)
+    monkeypatch.setattr(process.TunnelProcess, "_connect", connect)
+    async with running(tmp_path, told):
+        await asyncio.wait_for(whole.wait(), _LIMIT_SECONDS)
+    assert {one.remote for one in heard} == {"10.88.0.66"}
+    assert len(heard) < wanted
 
 
 @pytest.mark.nightly

@@ -1,4 +1,13 @@
-from appliance.features.tunnels.refusals import Refusal, RefusalParser
+import pytest
+
+from appliance.features.tunnels.refusals import (
+    REFUSALS_OF_A_SOURCE,
+    REFUSALS_PER_SECOND,
+    REFUSED_SOURCES,
+    Refusal,
+    RefusalParser,
+    RefusalShares,
+)
 
 REVOKED = """\
 09[NET] received packet: from 10.88.0.20[4500] to 10.88.0.2[4500] (1184 bytes)
@@ -59,3 +68,28 @@ def test_packets_that_esp_dropped() -> None:
     ]
     assert "replayed" in found[0].reason
     assert "another host's tunnel" in found[1].reason
+
+
+def test_a_refusal_at_the_first_packet_may_have_a_forged_address() -> None:
+    first = """\
+11[NET] received packet: from 10.88.0.66[500] to 10.88.0.2[500] (268 bytes)
+11[ENC] generating IKE_SA_INIT response 0 [ N(NO_PROP) ]
+"""
+    assert [one.answered for one in refusals(first + REVOKED)] == [False, True]
+
+
+@pytest.mark.parametrize("forged", [False, True], ids=["one host", "forged addresses"])
+def test_no_unknown_host_hides_the_refusals_of_others(forged: bool) -> None:
+    """Whatever comes first in a second; and each refusal is passed on or counted."""
+    shares, honest = RefusalShares(), Refusal("10.0.0.5", "authentication failed", answered=True)
+    for second in range(3):
+        passed, flood = 0, 5_000
+        for number in range(flood):
+            remote = f"10.9.{number // 200}.{number % 200}" if forged else "10.9.0.1"
+            passed += shares.passes(Refusal(remote, "no acceptable proposal", answered=not forged), second)
+        assert passed < REFUSALS_PER_SECOND
+        assert [shares.passes(honest, second) for _ in range(3)] == [True] * REFUSALS_OF_A_SOURCE + [False]
+        rest = shares.rest()
+        assert len(rest) <= REFUSED_SOURCES + 1
+        assert sum(int(one.reason.split()[0]) for one in rest) == flood - passed + 1
+        assert shares.rest() == []
