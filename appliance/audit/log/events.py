@@ -43,7 +43,7 @@ EVENTS: dict[str, str] = {
     "alarm silenced": "An operator made an alarm a notice for a time.",
     "alarm sounds again": "An operator ended the silence or the acknowledgement of an alarm.",
     "host awaited": "A one-time token was made; the host that presents it is enrolled under this name.",
-    "host awaited no longer": "A one-time token for enrolment was revoked before it was used.",
+    "host awaited no longer": "A one-time token was revoked before it was used, or while its host was being enrolled.",
     "hosts reloaded": "The file of declared hosts was read again; `diff` has its changed lines, `opened` and `closed`"
     " are tunnels.",
     "enrolment refused": "An enrolment was rejected; `host` is the real address.",

@@ -6,7 +6,6 @@ is recorded.
 
 import asyncio
 import contextlib
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -129,7 +128,8 @@ class Certification:
         self._authority = authority
         self._appliances = appliances
         self._master_port = master_port
-        self._revocations: Counter[str] = Counter()  # revocations by name, since this process started
+        # The name that gets a certificate, and its address, until it is revoked; at most one, by `changing`.
+        self._begun = ("", "")
         self._warned: set[str] = set()  # serial numbers of certificates whose end was announced
         self.served = ServedRest()
 
@@ -137,18 +137,26 @@ class Certification:
         self._appliances.is_served(pin)
         self.served.begin(pin)
 
-    def revoked(self, name: str) -> None:
-        self._revocations[name] += 1
+    def revoked(self, name: str) -> str:
+        """End the enrolment or renewal that is in progress for this name; return its address, empty without one."""
+        begun, address = self._begun
+        if begun != name:
+            return ""
+        self._begun = ("", "")
+        return address
 
     @contextlib.contextmanager
-    def unless_revoked(self, name: str) -> Iterator[None]:
+    def unless_revoked(self, name: str, address: str) -> Iterator[None]:
         """Raise `HostForbiddenError` at the end if the name was revoked in the block."""
-        before = self._revocations[name]
-        yield
-        if self._revocations[name] != before:
-            raise HostForbiddenError(
-                f"{name} was revoked in the meantime: enrol it again (rosrv host add {name})"
-            )
+        self._begun = (name, address)
+        try:
+            yield
+            if self._begun[0] != name:
+                raise HostForbiddenError(
+                    f"{name} was revoked in the meantime: enrol it again (rosrv host add {name})"
+                )
+        finally:
+            self._begun = ("", "")
 
     async def require_authority(self) -> None:
         try:

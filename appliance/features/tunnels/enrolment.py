@@ -73,14 +73,17 @@ class HostSelfService:
                 raise HostForbiddenError(str(error)) from error
             name = awaited.name
             try:
-                await self._tunnels.open()
                 address = awaited.address
                 if not self._table.is_for_hosts(address):
                     address = self._table.address_for(name, None, self._certification.awaited.addresses())
-                with self._certification.unless_revoked(name):
+                with self._certification.unless_revoked(name, address):
+                    await self._tunnels.open()
                     made = await self._certification.issue(name, request.request, awaited.days)
                 take_effect()
-            except HostForbiddenError:
+            except HostForbiddenError as error:
+                self._trail.happened(
+                    "enrolment refused", str(error), decision="deny", host=request.peer, id=awaited.id
+                )
                 raise
             except (HostRefusedError, WithdrawnError):
                 self._certification.awaited.give_back(awaited)
@@ -101,7 +104,7 @@ class HostSelfService:
                 )
             life = row.expires - certificate.made
             self._require_patience(name, life)
-            with self._certification.unless_revoked(name):
+            with self._certification.unless_revoked(name, row.address):
                 made = await self._certification.issue(
                     name,
                     request.request,
@@ -297,8 +300,8 @@ class HostEnrolment(TunnelHosts):
             self._require_not_enrolled(name)
             self._table.require_name(name)
             wanted = self._table.address_for(name, request.address, self._awaited.addresses())
-            await self._tunnels.open()
-            with self._certification.unless_revoked(name):
+            with self._certification.unless_revoked(name, wanted):
+                await self._tunnels.open()
                 made = await self._certification.issue(name, request.request, request.days)
             take_effect()
             self._certification.enrolled(name, wanted, made, who)
@@ -310,8 +313,8 @@ class HostEnrolment(TunnelHosts):
             self._table.require(request.expected)
             row = self._table.enrolled_row(name)
             address = self._table.address_for(name, None, self._awaited.addresses())
-            await self._tunnels.open()
-            with self._certification.unless_revoked(name):
+            with self._certification.unless_revoked(name, address):
+                await self._tunnels.open()
                 made = await self._certification.issue(name, request.request, request.days)
             take_effect()
             self._certification.keep(name, address, made)
@@ -370,13 +373,13 @@ class HostEnrolment(TunnelHosts):
     async def revoke(self, request: host_requests.HostRevoke, who: str) -> answers.Revoked:
         name = request.name
         self._table.require(request.expected)
-        self._certification.revoked(name)
+        begun = self._certification.revoked(name)
         awaited = self._awaited.rows().get(name)
         self._awaited.forget(name)
-        if awaited is not None and (
+        if (begun or awaited is not None) and (
             name not in self._table.rows or self._table.rows[name].revoked is not None
         ):
-            return await self._await_no_longer(awaited, who)
+            return await self._await_no_longer(name, awaited.address if awaited else begun, awaited, who)
         row = self._table.revoke(name)
         self._tunnels.state_anew()
         taken = self._certification.changed()
@@ -480,19 +483,23 @@ class HostEnrolment(TunnelHosts):
         if len(self._awaited.rows()) >= MAX:
             raise HostRefusedError(f"{MAX} hosts are already awaited: revoke some")
 
-    async def _await_no_longer(self, awaited: EnrolmentTokenRow, who: str) -> answers.Revoked:
+    async def _await_no_longer(
+        self, name: str, address: str, awaited: EnrolmentTokenRow | None, who: str
+    ) -> answers.Revoked:
+        """Without `awaited`, its enrolment had begun: that fails, and says so to the host."""
         self._table.changed()
         self._trail.happened(
             "host awaited no longer",
-            f"the one-time token {awaited.id} of {awaited.name} was revoked",
-            name=awaited.name,
-            address=awaited.address,
-            id=awaited.id,
-            expires=awaited.expires,
+            f"the one-time token {awaited.id} of {name} was revoked"
+            if awaited
+            else f"{name} was revoked while it was being enrolled",
+            name=name,
+            address=address,
+            more={"id": awaited.id, "expires": awaited.expires} if awaited else None,
             who=who,
         )
         await self._store.settled()
-        return answers.Revoked(self._table.revision, awaited.name, awaited.address, "", 0)
+        return answers.Revoked(self._table.revision, name, address, "", 0)
 
 
 def _fingerprint(certificate: bytes) -> str:

@@ -442,6 +442,38 @@ async def test_revoked_while_a_certificate_is_made(bench: Bench, how: str) -> No
     assert bench.tunnels.addresses == {}
 
 
+@pytest.mark.parametrize("how", ["kit", "token"])
+@pytest.mark.parametrize("when", ["before the tunnels are open", "while its certificate is made"])
+async def test_revoked_before_the_first_enrolment_ends(bench: Bench, how: str, when: str) -> None:
+    """The operator is not told that there is no such host, and the log has who ended it, and that it ended."""
+    text = (await bench.token("a")).token if how == "token" else ""
+    revoked: list[asyncio.Task[Revoked]] = []
+
+    def revoke() -> None:
+        bench.authority.meanwhile = lambda: None
+        revoked.append(asyncio.get_running_loop().create_task(bench.revoke("a")))
+
+    opening = bench.tunnels.open
+
+    async def open_late() -> None:
+        if when == "before the tunnels are open":
+            revoke()
+            await asyncio.sleep(1)
+        await opening()
+
+    bench.tunnels.open = open_late  # type: ignore[method-assign]  # the supervisor may take 20 seconds
+    if when == "while its certificate is made":
+        bench.authority.meanwhile = revoke
+    with pytest.raises(HostForbiddenError, match="revoked in the meantime"):
+        await (bench.enrol(text, "a") if how == "token" else bench.add("a"))
+    (task,) = revoked
+    said = await task
+    assert (said.name, said.address, said.serial) == ("a", "10.113.11.2", "")
+    assert "a was revoked while it was being enrolled" in bench.recorded("host awaited no longer")
+    assert len(bench.recorded("enrolment refused")) == (how == "token")
+    assert (bench.table.rows, bench.hosts.rows()) == ({}, [])
+
+
 async def test_a_host_renews_itself(bench: Bench) -> None:
     key = make_key()
     first = await bench.add("a", key=key)
