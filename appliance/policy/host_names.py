@@ -41,7 +41,7 @@ class HostNames:
         rows = {
             entry.key.text: [word.text for word in entry.values]
             for section in read(text, Findings("policy"))
-            if section.name.text.casefold() == GROUPS.casefold()
+            if section.is_named(GROUPS)
             for entry in section.entries
         }
         groups = {ROBOT: tuple(robot)}

@@ -38,6 +38,10 @@ class SectionText:
     name: Word
     entries: list[Entry] = field(default_factory=list)
 
+    def is_named(self, name: str) -> bool:
+        """Return whether it is this section. Names of sections ignore case."""
+        return self.name.text.casefold() == name.casefold()
+
 
 def is_key(text: str) -> bool:
     """Return whether a line can have this text as its key; parameters may have names that none can."""

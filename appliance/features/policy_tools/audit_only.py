@@ -34,7 +34,7 @@ def enforced(text: str, sections: Collection[str] = ()) -> EnforcedText:
         (
             entry
             for section in read(text, Findings(""))
-            if section.name.text == OPTIONS
+            if section.is_named(OPTIONS)
             for entry in section.entries
             if entry.key.text == "audit-only"
         ),

@@ -118,7 +118,7 @@ def _word(text: str, known: PolicyContext, policy: Policy, host: Address) -> str
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return word_of(enrolled)
-    groups = next((section for section in _sections(text) if section.name.text == GROUPS), None)
+    groups = next((section for section in _sections(text) if section.is_named(GROUPS)), None)
     for entry in groups.entries if groups is not None else ():
         if [word.text for word in entry.values] == [str(host)]:
             return entry.key.text
@@ -150,7 +150,7 @@ def _changed(policy: Policy, text: str, right: Right, word: str, wide: str = "")
     request = right.request
     rule, key = decide_right(policy, right).rule, wide or _key(request)
     name = BY_CATEGORY[request.category].name
-    section = next((section for section in _sections(text) if section.name.text == name), None)
+    section = next((section for section in _sections(text) if section.is_named(name)), None)
     itself = policy.decide(request)
     if itself.allowed and not itself.would_deny:
         key = _below(request.resource, rule)  # a rule for something below the parameter denies the request
@@ -225,7 +225,7 @@ def _text(word: Word) -> str:
 
 def _with_takeover(text: str) -> tuple[str, str]:
     option = f"takeover = {TAKEOVERS[-1]}"
-    section = next((candidate for candidate in _sections(text) if candidate.name.text == OPTIONS), None)
+    section = next((section for section in _sections(text) if section.is_named(OPTIONS)), None)
     entry = None if section is None else _entry(section, "takeover")
     if entry is None:
         return _with_line(text, section, OPTIONS, option)

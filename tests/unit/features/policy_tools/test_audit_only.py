@@ -16,11 +16,13 @@ def lenient(text: str) -> set[str]:
 
 @pytest.mark.parametrize("section", SECTIONS)
 @pytest.mark.parametrize("line", ["audit-only = all  # for now", "audit-only = " + ", ".join(SECTIONS)])
-def test_each_section_is_enforced_alone_and_the_others_stay(line: str, section: str) -> None:
-    change = enforced(f"{HEAD}{line}{TAIL}", [section.lower()])
+@pytest.mark.parametrize("head", [HEAD, HEAD.lower(), HEAD.upper()], ids=["plain", "lower", "upper"])
+def test_each_section_is_enforced_alone_and_the_others_stay(head: str, line: str, section: str) -> None:
+    head = head.replace("TELL = RULE", "tell = rule")
+    change = enforced(f"{head}{line}{TAIL}", [section.lower()])
     assert change.sections == (section,)
     assert lenient(change.text) == {*SECTIONS} - {section}
-    assert change.text.startswith(HEAD) and change.text.endswith(TAIL)
+    assert change.text.startswith(head) and change.text.endswith(TAIL)
     assert ("# for now" in change.text) == ("#" in line)
 
 

@@ -1,4 +1,6 @@
 import ipaddress
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -13,6 +15,7 @@ from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import Right, decide, decide_right, rights_of, rights_of_call
+from appliance.policy.sections import DECIDERS
 from roswire.parameter_tree import Tree
 from roswire.xmlrpc import Value
 from tests.unit.policy.test_asking import AGENT
@@ -87,6 +90,20 @@ def test_a_host_is_named_by_its_group_or_certificate() -> None:
     assert changed(grouped, "subscribe", "/z") == ["/z = ocu"]
     assert changed(BASE, "subscribe", "/z", "10.0.0.77") == ["/z = host:laptop"]
     assert changed(BASE, "subscribe", "/z", "10.84.0.2") == ["/z = robot"]
+
+
+@pytest.mark.parametrize("category", Category)
+@pytest.mark.parametrize("case", [str.lower, str.upper])
+def test_names_of_sections_ignore_case(category: Category, case: Callable[[str], str]) -> None:
+    """Each section is found: that of the host's group, of the rules and of the options."""
+    one = request(category, "setParam" if category is Category.COMMAND else "/x")
+    asked_for = DecidedRequest(one, rights_of(one), takeover=True)
+    text = "[Groups]\nocu = 10.0.0.9\n[Options]\ntakeover = same-host\n"
+    text += "".join(f"[{decider.name}]\n" for decider in DECIDERS)
+    other = re.sub(r"\[\w+\]", lambda name: case(name[0]), text)
+    found, changed = (grant(some, "p.ini", KNOWN, asked_for) for some in (text, other))
+    assert changed.added == found.added and changed.text.lower() == found.text.lower()
+    compiled(changed.text)
 
 
 def test_an_address_of_the_machine_is_granted_as_the_robot_unless_the_policy_names_it() -> None:
