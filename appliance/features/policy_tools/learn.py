@@ -3,7 +3,8 @@
 Each used right is granted to the hosts that used it. Four keys are wider than observed, because the next run
 needs them:
 
-1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
+1. A name of one run becomes a pattern: `/rostopic_*` for the anonymous node `/rostopic_4711_1700000000000`, and
+   `/roslaunch/uris/**` for the port of a `roslaunch`. A parameter below such a name becomes its namespace.
 2. `searchParam` needs the right to find every parameter that it tries: the next run may have it, and a search
    without that right is denied.
 3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`), because a call on a
@@ -20,7 +21,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from appliance.features.policy_tools.stock_tools import key_of
+from appliance.features.policy_tools.stock_tools import key_of, name_for
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.commands import ALIASES
 from appliance.policy.host_sets import Network, canonical_address
@@ -195,18 +196,18 @@ def needed_rights(observation: Observation) -> Iterator[Request]:
 
 
 def lasting_name(request: Request) -> str:
-    """Return the resource, with a pattern for an anonymous name."""
-    return (
-        request.resource if request.category in {Category.COMMAND, *PARAMETERS} else key_of(request.resource)
-    )
+    """Return the resource, with a pattern for a name of one run."""
+    return request.resource if request.category is Category.COMMAND else key_of(request.resource)
 
 
 def _key(request: Request) -> str:
     if request.category is Category.COMMAND:
         return ALIASES.get(request.resource, request.resource)
-    if request.category in PARAMETERS:
-        return request.resource.rstrip("/") + "/**"
-    return key_of(request.resource)
+    name = lasting_name(request)
+    if request.category not in PARAMETERS:
+        return name
+    before, star, _ = name.partition("*")  # two keys below a star can tie
+    return f"{before}{star}".removesuffix("/*").rstrip("/") + "/**"
 
 
 def _hand_down(rights: _Rights) -> None:
@@ -307,7 +308,7 @@ def _tests(rights: _Rights, words: Mapping[Address, str]) -> Iterator[str]:
                         node = min((node for its, node in right.callers if its == host), default="/visitor")
                         actions.setdefault(node, []).append(_action(category, key))
             for node, its in sorted(actions.items()):
-                yield f'  - host: "{host}"\n    node: {node.replace("*", "1")}\n    {verdict}:\n'
+                yield f'  - host: "{host}"\n    node: {name_for(node)}\n    {verdict}:\n'
                 yield from (f"      - {action}\n" for action in its)
     yield f'  - host: "{_UNKNOWN}"\n    node: /visitor\n    deny:\n      - use-node /visitor\n'
     firsts = dict(sorted(rights, reverse=True))
@@ -327,7 +328,7 @@ def _action(category: Category, key: str) -> str:
     """Return the action on a name that the key matches."""
     verb = "use-node" if category is Category.NODE else category.value
     name = key.removesuffix("/**") or "/" if category in PARAMETERS else key
-    action = f"{verb} {name.replace('*', '1')}"
+    action = f"{verb} {name_for(name)}"
     return json.dumps(action) if ":" in action else action  # YAML would read a mapping
 
 

@@ -42,6 +42,7 @@ from appliance.features.policy_tools.policy_input import (
     running_robot,
     usage_error,
 )
+from appliance.features.policy_tools.stock_tools import name_for
 from appliance.policy.actions import VERBS, BadWordError
 from appliance.policy.cases import run_cases
 from appliance.policy.host_sets import Network
@@ -74,7 +75,7 @@ class RightKind(NamedTuple):
 
     @property
     def action(self) -> str:
-        return f"{_VERBS[self.category]} {self.name.replace('*', '1')}"
+        return f"{_VERBS[self.category]} {name_for(self.name)}"
 
     @property
     def wider(self) -> str:
@@ -128,7 +129,7 @@ class AskedPolicy:
                 yield kind, nodes[kind], totals[kind]
 
     def _denies(self, kind: RightKind) -> bool:
-        name = kind.name.replace("*", "1")
+        name = name_for(kind.name)
         if (kind.category, name, kind.host) in self._denied:
             return False
         policy = self._enforced()
@@ -149,7 +150,7 @@ class AskedPolicy:
 
     def allow(self, kind: RightKind, node: str, wide: str = "") -> tuple[str, ...]:
         """Add the rule, and return its lines. Raises `UngrantableError`."""
-        request = Request(kind.host, node, kind.category, kind.name.replace("*", "1"))
+        request = Request(kind.host, node, kind.category, name_for(kind.name))
         key = wide or (kind.name if "*" in kind.name else "")
         change = grant(self.text, self.file, self.known, DecidedRequest(request, [Right(request)], wide=key))
         self.text = change.text
@@ -162,7 +163,7 @@ class AskedPolicy:
             host = ROBOT
         case = {"host": host, "node": node or "/visitor", "deny": [kind.action]}
         self.cases.append(case)
-        self._denied.add((kind.category, kind.name.replace("*", "1"), kind.host))
+        self._denied.add((kind.category, name_for(kind.name), kind.host))
 
     def judged(self) -> None:
         """Raise `PolicyError` if the text or one of its cases is wrong."""

@@ -10,16 +10,26 @@ from dataclasses import dataclass
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import Right, rights_of
 
-# The suffixes of rospy (process id and milliseconds) and of roscpp (nanoseconds).
-_ANONYMOUS = re.compile(r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$")
+# The suffixes of rospy and `$(anon)` (process id and milliseconds or a random number), roscpp (nanoseconds), and rqt.
+_ANONYMOUS = re.compile(
+    r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$|(?<=^rqt_gui_py_node)_[0-9]++$|(?<=^rqt_gui_cpp_node)_[0-9]++$"
+)
+_LAUNCH_PORT = re.compile(
+    r"(?<=^/roslaunch/uris/)[^/]++"
+)  # `roslaunch` sets /roslaunch/uris/host_robot__42311
 _READ = ("/use_sim_time", "/tcp_keepalive")
 _LONGEST = 256  # characters of a tool's own name
 _LOG_LEVEL = ("get_loggers", "set_logger_level")
 
 
 def key_of(name: str) -> str:
-    """Return the key for a tool's name: `/rostopic_*` for `/rostopic_4711_1700000000000`."""
-    return "/".join(_ANONYMOUS.sub("_*", level) for level in name.split("/"))
+    """Return the key for a name of one run: `/rostopic_*` for `/rostopic_4711_1700000000000`."""
+    return "/".join(_ANONYMOUS.sub("_*", level) for level in _LAUNCH_PORT.sub("*", name).split("/"))
+
+
+def name_for(key: str) -> str:
+    """Return a name that the key matches, and no key of a name that lasts."""
+    return key.replace("*", "1_1000000000")
 
 
 @dataclass(frozen=True, slots=True)

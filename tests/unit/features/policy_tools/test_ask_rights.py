@@ -5,12 +5,15 @@ from ipaddress import ip_address
 
 import pytest
 
+from appliance.features.policy_tools.learn import lasting_name, needed_rights
 from appliance.features.policy_tools.learn_verb import Answer, AskedPolicy, RightKind, carry_out
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
+from appliance.policy.rights import Right, decide_right
+from tests.unit.features.policy_tools.test_learn import ONE_RUN, a_launch
 
 ROBOT, PAD = ip_address("192.0.2.1"), ip_address("10.0.0.5")
 KNOWN = PolicyContext(robot=[ROBOT])
@@ -91,6 +94,17 @@ def test_an_allowed_right_is_that_hosts_alone() -> None:
     assert may(policy, MOVE) and may(policy, TOOL) and not may(policy, LIGHT)
     assert not may(policy, RightKind(Category.PUBLISH, "/base/cmd_vel", ip_address("10.0.0.6")))
     policy.judged()
+
+
+@pytest.mark.parametrize("names", ONE_RUN.values(), ids=ONE_RUN)
+def test_what_was_allowed_for_one_run_is_allowed_for_the_next(names: tuple[str, str]) -> None:
+    first, second = (a_launch(name, port) for name, port in zip(names, (42311, 50001), strict=True))
+    needed = [request for observation in first for request in needed_rights(observation)]
+    kinds = [RightKind(request.category, lasting_name(request), request.host) for request in needed]
+    policy = asked(TEXT.replace("audit-only = all\n", ""))
+    carry_out(policy, counts(*kinds), lambda *_: "allow", lambda: None)
+    for request in (request for observation in second for request in needed_rights(observation)):
+        assert decide_right(compiled(policy), Right(request)).allowed, request
 
 
 def test_a_wider_answer_covers_the_next_question() -> None:

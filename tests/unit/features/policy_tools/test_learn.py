@@ -1,4 +1,5 @@
 import ipaddress
+import re
 import string
 from dataclasses import replace
 from typing import Any
@@ -7,7 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
+from appliance.features.policy_tools.learn import (
+    LearnedPolicy,
+    Observation,
+    covered,
+    learn,
+    needed_rights,
+)
 from appliance.master.calls.call import RosCall
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
@@ -15,14 +22,27 @@ from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.policy.rights import decide, rights_of, rights_of_call
-from appliance.policy.sections import DECIDERS
+from appliance.policy.rights import Right, decide, decide_right, rights_of, rights_of_call
+from appliance.policy.sections import DECIDERS, PARAMETERS
 from roswire.xmlrpc import Value
 from tests.unit.features.policy_tools.test_rights import KEY_GIVEN, NAME, ROWS, deeds, gate_says
 
 ROBOT = ipaddress.ip_address("192.0.2.10")
 HOSTS = [ipaddress.ip_address(text) for text in ("10.0.0.1", "10.0.0.2", "fd00::5", "192.0.2.10")]
-NAMES = ["/a", "/a/b", "/a/b/c", "/cmd_vel", "/a_1", "/tool_4711_1700000000000", "/tool_99_1700000000001/x"]
+NAMES = [
+    "/a",
+    "/a/b",
+    "/a/b/c",
+    "/cmd_vel",
+    "/a_1",
+    "/tool_4711_1700000000000",
+    "/tool_99_1700000000001/x",
+    "/tool_1",
+    "/tool_99_1700000000001/x/y",
+    "/tool_1/x_4_1700000000001/b",
+    "/tool_1/x_a",
+    "/roslaunch/uris/host_a__1",
+]
 
 
 def seen(
@@ -96,6 +116,65 @@ def test_anonymous_names_become_patterns() -> None:
     ).allowed
     assert not policy.decide(Request(host, "", Category.NODE, "/rostopic")).allowed
     assert "/a_1 " in learn([seen("10.0.0.1", Category.PUBLISH, "/a_1")]).text
+
+
+ONE_RUN = {
+    "rospy": ("/pose_4711_1700000000000", "/pose_12_1800000000001"),
+    "roscpp": ("/rviz_1700000000123456789", "/rviz_1800000000123456789"),
+    "anon": ("/listener_robot_4711_8329475019283746501", "/listener_robot_12_1029384756102938475"),
+    "rqt": ("/rqt_gui_py_node_4711", "/rqt_gui_py_node_12"),
+    "rqt in C++": ("/rqt_gui_cpp_node_4711", "/rqt_gui_cpp_node_12"),
+}
+
+
+def a_launch(node: str, port: int) -> list[Observation]:
+    """Return what a `roslaunch` and its node do."""
+    uri = f"/roslaunch/uris/host_robot__{port}"
+    sets = [
+        seen("10.0.0.1", Category.COMMAND, call, node="/roslaunch", call=call, key=key)
+        for call, key in (("setParam", uri), ("deleteParam", node), ("setParam", f"{node}/rate/max"))
+    ]
+    gets = [
+        seen("10.0.0.1", Category.COMMAND, call, node=node, call=call, key=key)
+        for call, key in (("getParam", node), ("getParam", f"{node}/rate"), ("searchParam", "tf_prefix"))
+    ]
+    return [
+        *sets,
+        *gets,
+        seen("10.0.0.1", Category.NODE, node, node=node),
+        seen("10.0.0.1", Category.PUBLISH, f"{node}/out", node=node),
+        seen("10.0.0.1", Category.SUBSCRIBE, f"{node}/in", node=node),
+        seen("10.0.0.1", Category.OFFER, f"{node}/get_loggers", node=node),
+        seen("10.0.0.1", Category.CALL, f"{node}/get_loggers", node="/rqt_gui_py_node_7"),
+    ]
+
+
+@pytest.mark.parametrize("namespace", ["", "/arm"])
+@pytest.mark.parametrize("names", ONE_RUN.values(), ids=ONE_RUN)
+def test_the_next_run_passes_with_its_own_names(names: tuple[str, str], namespace: str) -> None:
+    first, second = (
+        a_launch(namespace + name, port) for name, port in zip(names, (42311, 50001), strict=True)
+    )
+    learned = learn(first)
+    policy = compiled(learned)
+    for right in (request for observation in second for request in needed_rights(observation)):
+        assert decide_right(policy, Right(right, namespace=right.category in PARAMETERS)).allowed, right
+        other = replace(right, host=HOSTS[1])
+        assert not policy.decide(other).allowed, right
+    assert not re.search("4711|1700000000|42311", learned.text)
+    assert all(result.passed for result in run_cases(policy, learned.tests, "tests"))
+
+
+@pytest.mark.parametrize(
+    "name", ["/arm_2", "/camera_20240101", "/rqt_gui_py_node", "/my_rqt_gui_py_node_2", "/a_1_2"]
+)
+def test_a_name_that_lasts_is_its_own_key(name: str) -> None:
+    learned = learn([*a_launch(name, 42311), *a_launch(ONE_RUN["rospy"][0], 42311)])
+    policy = compiled(learned)
+    other = f"{name}3"
+    for category in (Category.NODE, Category.PUBLISH, Category.READ, Category.WRITE):
+        below = f"{other}/out" if category is Category.PUBLISH else other
+        assert not policy.decide(Request(HOSTS[0], other, category, below)).allowed
 
 
 def test_a_parameter_call_needs_the_call_and_the_key() -> None:
