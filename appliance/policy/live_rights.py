@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 from appliance.policy.commands import CALLS
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
-from appliance.policy.rights import decide, request_of, rights_to_keep
+from appliance.policy.rights import Right, decide, request_of, rights_to_keep
 from roswire.parameter_tree import Tree, holds_others, standing_at
 
 
@@ -28,10 +28,11 @@ class LiveRight(NamedTuple):
     def fields(self) -> dict[str, Any]:
         return {**self._asdict(), "host": str(self.host)}
 
-    def requests(self) -> list[Request]:
-        asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
-        touch = CALLS[self.call].touches
-        return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
+    def requests(self) -> list[Request | Right]:
+        asked: list[Request | Right] = [request_of(self.call, self.host, self.caller_id, self.resource)]
+        if (touch := CALLS[self.call].touches) is not None:
+            asked.insert(0, Right(Request(self.host, self.caller_id, touch, self.resource)))
+        return asked
 
 
 @dataclass(frozen=True, slots=True)

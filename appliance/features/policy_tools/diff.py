@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from appliance.policy.model import Decision, Request
 from appliance.policy.policy import Policy
-from appliance.policy.rights import decide, rights_of
+from appliance.policy.rights import Right, decide, rights_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +33,12 @@ class Difference:
         return "granted" if self.granted else "denied"
 
 
-def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:
-    """Return the requests in order of first occurrence.
+def diff(old: Policy, new: Policy, requests: Iterable[Request | Right]) -> list[Difference]:
+    """Return the requests in order of first occurrence; a `Right` is decided alone, a request with all its rights.
 
     A request that passes only because of audit-only mode is not the same as a granted request.
     """
-    counts: dict[Request, int] = {}
+    counts: dict[Request | Right, int] = {}
     for request in requests:
         counts[request] = counts.get(request, 0) + 1
     differences = (_difference(old, new, request, count) for request, count in counts.items())
@@ -49,8 +49,9 @@ def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Differen
     ]
 
 
-def _difference(old: Policy, new: Policy, request: Request, count: int) -> Difference:
-    before, after = decide(old, rights_of(request)), decide(new, rights_of(request))
+def _difference(old: Policy, new: Policy, asked: Request | Right, count: int) -> Difference:
+    request, rights = (asked.request, [asked]) if isinstance(asked, Right) else (asked, rights_of(asked))
+    before, after = decide(old, rights), decide(new, rights)
     was, now = old.limit_on(request), new.limit_on(request)
     if was == now or not (before.allowed and after.allowed):
         return Difference(request, before, after, count)

@@ -32,6 +32,7 @@ from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
+from appliance.policy.rights import Right
 from rosmop.tool.terminal import refused, say
 
 _MAX_CALLERS = 4  # names in one line
@@ -157,7 +158,7 @@ def _say_decisions(appliance: Appliance, old: Policy, new: Policy, requests: Pat
     return bool(differences)
 
 
-def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
+def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request | Right]:
     if file is not None:
         yield from requests_of_file(file)
     else:

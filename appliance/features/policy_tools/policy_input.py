@@ -1,5 +1,6 @@
 """Read the input of the policy verbs: policies, addresses of hosts, and requests."""
 
+import contextlib
 import functools
 import ipaddress
 import json
@@ -27,13 +28,15 @@ from appliance.cli.connection.admin_client import NotRunningError, RestProblemEr
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import time_given
-from appliance.features.policy_tools.learn import Observation
+from appliance.features.policy_tools.learn import Observation, needed_rights
+from appliance.policy import sections
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
 from appliance.policy.judgement import PolicyContext, approvals_of, ends_of
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
+from appliance.policy.rights import Right
 
 # Read the requests of a period that passed, and say which of them the log no longer names.
 
@@ -256,14 +259,20 @@ def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
     return period_since(read, asked, clock.wall_ns())
 
 
-def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Yield the decided requests, except those of folded records, which do not name their requests."""
+def requests_of_audit_log(appliance: Appliance) -> Iterator[Request | Right]:
+    """Yield the decided requests with their rights to parameters, except of records that do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny", "ask"))
     try:
         for entry in audit_of(appliance.way).export(decided):
             record = entry.record
             if record.host is None or record.category not in set(Category) or record.resource is None:
                 continue
-            yield request_of(record.host, record.caller_id or "", record.category, record.resource)
+            request = request_of(record.host, record.caller_id or "", record.category, record.resource)
+            yield request
+            call, key = str(record.detail.get("call", "")), record.detail.get("key")
+            for name in record.detail.get(PARAMETERS, [] if key is None else [key]):
+                with contextlib.suppress(BadWordError):
+                    needed = needed_rights(Observation(request, call, str(name)))
+                    yield from (Right(right) for right in needed if right.category in sections.PARAMETERS)
     except (LogUnreadableError, NotRunningError, FilterError) as error:
         raise usage_error(str(error)) from error

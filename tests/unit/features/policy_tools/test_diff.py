@@ -1,10 +1,14 @@
 import ipaddress
+from typing import Any
 
 import pytest
 
 from appliance.features.policy_tools.diff import diff
+from appliance.master.calls.call import RosCall
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.rights import Right
+from tests.unit.features.policy_tools.test_rights import ROWS
 from tests.unit.policy.test_asking import AGENT
 from tests.unit.policy.test_asking import TEXT as ASKS
 from tests.unit.policy.test_asking import policy as policy_that_asks
@@ -64,3 +68,19 @@ def test_a_right_that_then_needs_an_approval_is_a_difference() -> None:
     wanted = Request(AGENT, "/it", Category.PUBLISH, "/cmd_vel")
     assert [one.word for one in diff(plain, asks, [wanted])] == ["needs approval"]
     assert not diff(asks, asks, [wanted])
+
+
+@pytest.mark.parametrize(
+    "row", [row for row in ROWS if row.row.touches is not None], ids=lambda one: one.name
+)
+def test_a_recorded_right_to_a_parameter_is_compared_alone(row: RosCall[Any]) -> None:
+    """`hasParam` needs no right to `getParam`."""
+    assert row.row.touches is not None
+    right = Right(Request(GUEST, "/it", row.row.touches, "/arm/max"))
+    old = compile_policy("[Nodes]\n[Commands]\ndefault = *\n", file="old.ini")
+    new = compile_policy("[Nodes]\n[Commands]\n[Parameters]\nread /x = *\n", file="new.ini")
+    fewer = compile_policy("[Nodes]\n[Commands]\n", file="fewer.ini")
+    assert [(one.request, one.word, one.count) for one in diff(old, new, [right, right])] == [
+        (right.request, "denied", 2)
+    ]
+    assert diff(old, fewer, [right]) == []
