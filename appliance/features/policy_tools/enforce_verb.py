@@ -135,11 +135,11 @@ def enforce(
 def _compare(policy: Policy, period: RecordedPeriod, live: list[LiveRight]) -> _Comparison:
     counts: Counter[tuple[Request, str]] = Counter()
     number = 0
-    for recorded in period.requests():
-        number += recorded.count
-        reason = denial(policy, recorded.observation)
+    for observation in period.requests():
+        number += observation.count
+        reason = denial(policy, observation)
         if reason:
-            counts[recorded.observation.request, reason] += recorded.count
+            counts[observation.request, reason] += observation.count
     denied = [
         WouldDeny(**request.fields(), count=count, reason=reason)
         for (request, reason), count in counts.most_common()
@@ -186,11 +186,8 @@ def _show(appliance: Appliance, found: _Comparison, period: RecordedPeriod, chan
         say(f"  and {len(ended) - _MAX_SHOWN} more: --json lists all", "yellow")
     compared = f"{counted(found.requests, 'recorded request')}, {counted(found.rights, 'right')} of nodes that run now"
     say(f"compared: {compared}", "" if found.requests else "yellow")
-    if period.removed:
-        say("earlier records of that time are removed from the log", "yellow")
-    for host, count in sorted(period.unnamed.items()):
-        who = "several hosts" if host == "*" else appliance.host_in_words(host)
-        say(f"not compared: {counted(count, 'request')} of {who}, which the log only counts", "yellow")
+    for note in period.notes(appliance, "compared"):
+        say(note, "yellow")
 
 
 def _load(

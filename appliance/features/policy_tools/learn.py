@@ -46,7 +46,7 @@ _UNKNOWN = "192.0.2.99"  # an address of TEST-NET-1, which no host has
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A recorded request that passed."""
+    """Equal requests of one record, that passed."""
 
     request: Request
     call: str = ""
@@ -56,6 +56,8 @@ class Observation:
     """Whether it passed with an approval."""
     adopted: bool = False
     """Whether it was taken over from a ROS master, and the node did not make the call itself."""
+    count: int = 1
+    """The number of such requests."""
 
 
 @dataclass(slots=True)
@@ -108,15 +110,15 @@ def learn(
         except BadWordError:
             needed = []
         if not needed or not all(is_key(request.resource) for request in needed):
-            left_out += 1
+            left_out += observation.count
             continue
-        requests += 1
+        requests += observation.count
         host, node = canonical_address(observation.request.host), key_of(observation.request.caller_id)
         if observation.call in _REGISTRATIONS:
             its = starts.setdefault(node, {})
             its[host] = its.get(host, False) or not observation.adopted
         for request in needed:
-            _add(rights, request, asked=observation.asked)
+            _add(rights, request, asked=observation.asked, used=observation.count)
     unstarted = {node: hosts for node, hosts in starts.items() if not all(hosts.values())}
     if with_start:
         for node, hosts in unstarted.items():

@@ -24,7 +24,6 @@ from appliance.features.policy_tools.grant import DecidedRequest, UngrantableErr
 from appliance.features.policy_tools.learn import (
     ROBOT,
     LearnedPolicy,
-    Observation,
     covered,
     lasting_name,
     learn,
@@ -177,14 +176,14 @@ class AskedPolicy:
 def kinds_of(period: RecordedPeriod) -> Counter[tuple[RightKind, str]]:
     """Count the recorded requests by the rights that they needed, and by the node."""
     counts: Counter[tuple[RightKind, str]] = Counter()
-    for recorded in period.requests():
+    for observation in period.requests():
         try:
-            requests = list(needed_rights(recorded.observation))
+            requests = list(needed_rights(observation))
         except BadWordError:  # no rule can grant it
             continue
         for request in requests:
             name = lasting_name(request)
-            counts[RightKind(request.category, name, request.host), request.caller_id] += recorded.count
+            counts[RightKind(request.category, name, request.host), request.caller_id] += observation.count
     return counts
 
 
@@ -222,7 +221,10 @@ def ask_rights(appliance: Appliance, period: RecordedPeriod, output: Path) -> in
             if reply is not None and (reply != "wider" or kind.wider):
                 return reply
 
-    answers = carry_out(asked, kinds_of(period), answer, keep)
+    kinds = kinds_of(period)
+    for note in period.notes(appliance, "asked"):
+        say(note, "yellow")
+    answers = carry_out(asked, kinds, answer, keep)
     try:
         asked.judged()
     except PolicyError as error:
@@ -317,7 +319,10 @@ def learn_policy(
             raise usage_error("--ask needs --output FILE, and has none of --tests, --with-start and --robot")
         raise typer.Exit(ask_rights(appliance, recorded_period(appliance, since), output))
     members = _members(appliance, networks_of(robot))
-    learned = learn(_observations(appliance, since), members, names_of_hosts(), with_start=with_start)
+    period = recorded_period(appliance, since)
+    learned = learn(period.requests(), members, names_of_hosts(), with_start=with_start)
+    for note in period.notes(appliance, "learned"):
+        typer.echo(f"rosrv: {note}", err=True)
     if not learned.requests:
         start = f" since {since}" if since is not None else ""
         hint = "run the robot with `audit-only = all` below [Options] first"
@@ -331,7 +336,14 @@ def learn_policy(
     if appliance.as_json:
         counts = {"requests": learned.requests, "left_out": learned.left_out}
         say_json(
-            {**counts, "text": learned.text, "tests": learned.tests, "unstarted": list(learned.unstarted)}
+            {
+                **counts,
+                "text": learned.text,
+                "tests": learned.tests,
+                "unstarted": list(learned.unstarted),
+                "removed": period.removed,
+                "unnamed": period.unnamed,
+            }
         )
         return
     if output is None:
@@ -340,12 +352,6 @@ def learn_policy(
     if learned.left_out:
         summary += f"; left out {counted(learned.left_out, 'request')} that no rule can grant"
     typer.echo(summary, err=True)
-
-
-def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
-    for request in recorded_period(appliance, since).requests():
-        if not request.repeated:
-            yield request.observation
 
 
 def _not_started(learned: LearnedPolicy) -> str:

@@ -20,6 +20,7 @@ from appliance.audit.log.record_format import LogEntry
 from appliance.audit.log.repetition import KIND, PARAMETERS, repetitions
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.base.input_files import read_given_text
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import PolicyInForce
@@ -51,15 +52,6 @@ _OWN_TOOLS = "/rosrv_"
 """The names of the nodes of our own tools begin so."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedRequest:
-    """A request that passed. `repeated`: further ones like a request that has a record of its own."""
-
-    observation: Observation
-    count: int
-    repeated: bool
-
-
 @dataclass(frozen=True)
 class RecordedPeriod:
     """The requests of the log since a time, or all of them. Times are nanoseconds since the epoch.
@@ -75,7 +67,7 @@ class RecordedPeriod:
     removed: bool
     unnamed: dict[str, int] = field(default_factory=dict)
 
-    def requests(self) -> Iterator[RecordedRequest]:
+    def requests(self) -> Iterator[Observation]:
         """Yield the requests by the kinds of their records, and fill `unnamed`. Raises what `read` raises."""
         self.unnamed.clear()
         for event in _EVENTS:
@@ -83,7 +75,16 @@ class RecordedPeriod:
             for entry in self.read(passed):
                 yield from self._of(entry.record)
 
-    def _of(self, record: AuditRecord) -> Iterator[RecordedRequest]:
+    def notes(self, appliance: Appliance, what: str) -> Iterator[str]:
+        """Yield a line for each part of the period without names. `what` is for requests, such as "compared"."""
+        if self.removed:
+            when = "" if self.since is None else " of that time"
+            yield f"earlier records{when} are removed from the log"
+        for host, count in sorted(self.unnamed.items()):
+            who = "several hosts" if host == "*" else appliance.host_in_words(host)
+            yield f"not {what}: {counted(count, 'request')} of {who}, which the log only counts"
+
+    def _of(self, record: AuditRecord) -> Iterator[Observation]:
         detail, caller = record.detail, record.caller_id or ""
         if record.reason == _OWN_NODE or caller.startswith(_OWN_TOOLS):
             return
@@ -96,16 +97,9 @@ class RecordedPeriod:
             return
         request = request_of(record.host, caller, str(record.category), record.resource or "")
         call, approval, adopted = str(detail.get("call", "")), "approval" in detail, record.event == ADOPTED
-        names = detail.get(PARAMETERS)
-        if names is not None:  # reads that this record only counts
-            for name, count in names.items():
-                yield RecordedRequest(
-                    Observation(request, call, str(name), approval, adopted), count, repeated=False
-                )
-            return
-        repeated = record.event not in ("decision", ADOPTED)
-        observation = Observation(request, call, str(detail.get("key", "")), approval, adopted)
-        yield RecordedRequest(observation, repetitions(detail) if repeated else 1, repeated)
+        number = 1 if record.event in ("decision", ADOPTED) else repetitions(detail)
+        for name, count in detail.get(PARAMETERS, {detail.get("key", ""): number}).items():
+            yield Observation(request, call, str(name), approval, adopted, count)
 
 
 def period_since(read: ReadRecords, since: int | None, now: int) -> RecordedPeriod:

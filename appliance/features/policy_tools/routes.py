@@ -68,8 +68,8 @@ def policy_uses(
     records = _NewestRecords(path, most)
     period: RecordedPeriod = replace(period_since(partial(export, path), since, since), read=records)
     uses = RuleUses(policy)
-    for request in period.requests():
-        uses.add(request.observation, request.count)
+    for observation in period.requests():
+        uses.add(observation)
     uses.add_live(LiveRight.of(msgspec.structs.asdict(row)) for row in registrations)
     removed = period.removed or records.cut
     return PolicyUses(

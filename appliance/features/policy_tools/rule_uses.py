@@ -52,12 +52,12 @@ class RuleUses:
         self._ended = {word for word, closed in self.policy.closed.items() if closed.for_good}
         self.policy = self.policy.at_any_time()  # as the recorded requests were decided, each in its time
 
-    def add(self, observation: Observation, count: int) -> None:
+    def add(self, observation: Observation) -> None:
         try:
             rights = [Right(request) for request in needed_rights(observation)]
         except BadWordError:  # an unknown call, or a name that is none: no rule grants it
             return
-        self._use(rights, count)
+        self._use(rights, observation.count)
 
     def add_live(self, live: Iterable[LiveRight]) -> None:
         for thing in live:

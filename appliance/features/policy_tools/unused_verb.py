@@ -33,8 +33,8 @@ def list_unused(
     """
     period = recorded_period(appliance, since)
     uses = RuleUses(compiled(appliance, None, None, None))
-    for request in period.requests():
-        uses.add(request.observation, request.count)
+    for observation in period.requests():
+        uses.add(observation)
     uses.add_live(live_now(appliance))
     rows = list(uses.rules(period.unnamed, removed=period.removed))
     for row in rows:

@@ -1,9 +1,14 @@
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from appliance.audit.search.search import export
 from appliance.channel.answers.graph_answers import Registration
 from appliance.channel.answers.policy_answers import PolicyKnown
+from appliance.features.policy_tools.policy_input import period_since
 from appliance.features.policy_tools.routes import policy_uses
 from tests.support.answers import example
 from tests.support.audit import decision, settle
@@ -42,3 +47,17 @@ def test_with_more_records_than_are_read_the_newest_count_and_the_unseen_is_unkn
     whole, found = states(log, most=1)
     assert not whole
     assert (found["/cmd_0"], found["/cmd_1"], found["/cmd_2"]) == ("unknown", "used", "unknown")
+
+
+def test_a_period_notes_its_removed_records(log: Path) -> None:
+    def from_five(wanted: Any) -> Any:
+        return (entry._replace(sequence=entry.sequence + 4) for entry in export(log, wanted))
+
+    appliance: Any = SimpleNamespace(host_in_words=str)
+    for read, since, noted in (
+        (partial(export, log), None, []),
+        (from_five, None, ["earlier records are removed from the log"]),
+        (from_five, 1, ["earlier records of that time are removed from the log"]),
+        (from_five, 2**62, []),
+    ):
+        assert list(period_since(read, since, 0).notes(appliance, "learned")) == noted

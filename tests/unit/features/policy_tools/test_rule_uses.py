@@ -38,7 +38,7 @@ def rows(uses: RuleUses, unnamed: str = "", *, removed: bool = False) -> dict[st
 def used(*observations: tuple[str, Category, str, str, str]) -> RuleUses:
     uses = RuleUses(POLICY)
     for host, category, name, call, key in observations:
-        uses.add(Observation(Request(ip_address(host), "/it", category, name), call, key), 3)
+        uses.add(Observation(Request(ip_address(host), "/it", category, name), call, key, count=3))
     return uses
 
 
@@ -87,7 +87,7 @@ def test_a_right_that_has_ended_is_named_used_or_not() -> None:
     """Its use counts: the request was decided in its time."""
     text = "[Nodes]\ndefault = *\n[Publishers]\n/a = 10.0.0.5 until 2026-12-05, 10.0.0.6 until 2026-12-05\n"
     uses = RuleUses(compile_policy(text, file="p.ini", now=1_797_040_000.0))
-    uses.add(Observation(Request(JOYSTICK, "/it", Category.PUBLISH, "/a"), "registerPublisher", ""), 3)
+    uses.add(Observation(Request(JOYSTICK, "/it", Category.PUBLISH, "/a"), "registerPublisher", count=3))
     row = rows(uses)["Publishers /a"]
     assert (row.used, row.unused) == (3, ("10.0.0.6 until 2026-12-05",))
     assert row.ended == ("10.0.0.5 until 2026-12-05", "10.0.0.6 until 2026-12-05")
