@@ -421,8 +421,8 @@ class Policies(Revisions[RevisionRow]):
         self._passed &= known
         self.ends.forget(self.changes, *known.difference(wanted))
         for name, change in wanted.items():
-            if name not in known and change > now:
-                self.ends.set(self.changes, name, change - now)
+            if name not in known:  # a date that passed before the load has passed for good, too
+                self.ends.set(self.changes, name, max(0.0, change - now))
             elif name in known - self._passed and self.ends.passed(self.changes, name):
                 self._passed.add(name)
                 self.ends.forget(self.changes, name)

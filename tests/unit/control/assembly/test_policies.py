@@ -495,6 +495,43 @@ def test_a_policy_keeps_what_was_known_when_it_came_into_force() -> None:
     assert policy.decide(Request(host, "/n", Category.PUBLISH, "/x")).allowed
 
 
+@pytest.mark.parametrize("way", ["start", "reload", "reload of other text", "load", "same load", "rollback"])
+async def test_a_right_that_ended_before_a_load_stays_ended_when_the_clock_is_set_back(
+    tmp_path: Path, way: str
+) -> None:
+    appliance, host = Appliance(tmp_path), ipaddress.ip_address("10.0.0.7")
+    text = OPEN.replace(
+        "[Publishers]", "[Publishers]\n/y = 10.0.0.7 until 2026-12-01\n/z = 10.0.0.7 until 2026-12-03"
+    )
+    appliance.file.write_text(text)
+
+    def granted(policies: Policies) -> str:
+        asked = (Request(host, "/n", Category.PUBLISH, name) for name in ("/y", "/z"))
+        return "".join(one.resource[1] for one in asked if policies.current.decide(one).allowed)
+
+    set_wall(datetime(2026, 12, 2, 12, tzinfo=UTC).timestamp())
+    with appliance.started() as policies:
+        match way:
+            case "reload":
+                await policies.reload(PolicyReload(), "operator")
+            case "reload of other text":
+                appliance.file.write_text(f"{text}# more\n")
+                await policies.reload(PolicyReload(), "operator")
+            case "load" | "same load" | "rollback":
+                for _ in range(1 + (way == "same load")):
+                    await policies.load(PolicyLoad(f"{text}# more\n"), "ann")
+                if way == "rollback":
+                    await policies.rollback(1, who="ann")
+        assert granted(policies) == "z"
+        set_wall(datetime(2026, 11, 30, tzinfo=UTC).timestamp())
+        policies.time_passed()
+        assert granted(policies) == "z"
+    with appliance.started(restarted=True) as policies:
+        assert granted(policies) == "z"
+        await policies.reload(PolicyReload(), "operator")
+        assert granted(policies) == "yz"
+
+
 async def test_rights_end_and_begin_with_a_record_each_and_a_reload_begins_an_ended_one(
     tmp_path: Path,
 ) -> None:
