@@ -4,6 +4,7 @@ from dataclasses import replace
 from ipaddress import ip_address
 
 import pytest
+import yaml
 
 from appliance.features.policy_tools.learn import lasting_name, needed_rights
 from appliance.features.policy_tools.learn_verb import Answer, AskedPolicy, RightKind, carry_out
@@ -123,6 +124,19 @@ def test_a_denied_right_is_a_test_case_and_is_not_asked_again() -> None:
     again.text = again.text.replace("[Publishers]\n", "[Publishers]\n/base/cmd_vel = robot 10.0.0.5\n")
     with pytest.raises(PolicyError, match="expected deny"):
         again.judged()
+
+
+@pytest.mark.parametrize("node", ["", "/pad", "/rosparam-4711", "not a name", "/a:b #c"])
+@pytest.mark.parametrize("category", Category)
+def test_each_denied_right_is_a_case_that_the_next_run_reads(category: Category, node: str) -> None:
+    names = {Category.COMMAND: "setParam", Category.WRITE: "/arm/a: b", Category.READ: "/arm/a - 'b"}
+    kind = RightKind(category, names.get(category, "/x_*"), PAD)
+    policy = asked()
+    policy.deny(kind, node)
+    policy.judged()
+    again = asked(policy.text, yaml.load(policy.cases_text, yaml.BaseLoader)["cases"])  # noqa: S506
+    assert list(again.missing(Counter({(kind, node): 1}))) == []
+    again.judged()
 
 
 def test_a_right_for_later_is_asked_again_and_quit_asks_no_more() -> None:
