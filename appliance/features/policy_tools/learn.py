@@ -79,7 +79,8 @@ _Rights = dict[tuple[Category, str], _Right]
 class LearnedPolicy:
     """The policy and its tests. `left_out` is the number of requests that no rule can grant.
 
-    `unstarted` has the nodes that were taken over while they ran, and were not seen to start.
+    `unstarted` has the nodes that were taken over while they ran, and were not seen to start. `keys` are the keys of
+    the text, each with its hosts.
     """
 
     text: str
@@ -87,6 +88,7 @@ class LearnedPolicy:
     requests: int
     left_out: int
     unstarted: tuple[str, ...]
+    keys: tuple[tuple[str, frozenset[Address]], ...]
 
 
 def learn(
@@ -136,6 +138,7 @@ def learn(
         requests,
         left_out,
         tuple(sorted(unstarted)),
+        tuple((key, frozenset(right.hosts | right.asked)) for (_, key), right in needful.items()),
     )
 
 

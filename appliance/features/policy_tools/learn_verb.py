@@ -43,7 +43,7 @@ from appliance.features.policy_tools.policy_input import (
 )
 from appliance.features.policy_tools.stock_tools import name_for
 from appliance.policy.actions import VERBS, BadWordError
-from appliance.policy.cases import run_cases
+from appliance.policy.cases import MAXIMUM_CHARACTERS, run_cases
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.model import Address, Category, Request
@@ -51,6 +51,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import Right, decide_right
+from appliance.policy.rules import MAXIMUM_INNER_STARS
 from appliance.policy.sections import PARAMETERS
 from rosmop.tool.terminal import printable, refused, say
 from roswire.names import is_global_name
@@ -281,6 +282,12 @@ def learn_policy(
     appliance: Appliance,
     *,
     since: Since = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--host", metavar="ADDRESS", help="Only the requests of this address or network (repeatable)"
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -319,19 +326,19 @@ def learn_policy(
     if ask:
         if tests is not None or with_start or robot or output is None:
             raise usage_error("--ask needs --output FILE, and has none of --tests, --with-start and --robot")
-        raise typer.Exit(ask_rights(appliance, recorded_period(appliance, since), output))
+        raise typer.Exit(ask_rights(appliance, recorded_period(appliance, since, host), output))
     members = _members(appliance, networks_of(robot))
-    period = recorded_period(appliance, since)
+    period = recorded_period(appliance, since, host)
     learned = learn(period.requests(), members, names_of_hosts(), with_start=with_start)
     for note in period.notes(appliance, "learned"):
         typer.echo(f"rosrv: {note}", err=True)
     if not learned.requests:
-        start = f" since {since}" if since is not None else ""
+        start = " of these hosts" * bool(host) + (f" since {since}" if since is not None else "")
         hint = "run the robot with `audit-only = all` below [Options] first"
         raise refused([f"rosrv: the audit log has no allowed requests{start}: {hint}"])
     if learned.unstarted and not with_start:
         raise refused([_not_started(learned)])
-    _check(learned, members)
+    _check(learned, members, tests_wanted=tests is not None or appliance.as_json)
     for file, text in ((output, learned.text), (tests, learned.tests)):
         if file is not None:
             _write(file, text)
@@ -384,16 +391,28 @@ def _shown(place: Network) -> str:
     return str(place.network_address) if place.num_addresses == 1 else str(place)
 
 
-def _check(learned: LearnedPolicy, robot: list[Network]) -> None:
+def _check(learned: LearnedPolicy, robot: list[Network], *, tests_wanted: bool) -> None:
     try:
         policy = compile_policy(learned.text, file="learned", robot=robot)
-        results = run_cases(policy, learned.tests, "learned.tests.yaml")
+        testable = tests_wanted or len(learned.tests) <= MAXIMUM_CHARACTERS
+        results = run_cases(policy, learned.tests, "learned.tests.yaml") if testable else []
     except PolicyError as error:
-        what = "rosrv: the learned policy is invalid (see above): write rules for these names by hand"
+        what = f"rosrv: the learned policy is invalid (see above): {_busiest(learned)}"
         raise refused([*error.findings, what]) from error
     failed = [result for result in results if not result.passed]
     if failed:
         raise refused([*failed, "rosrv: the learned policy does not grant what was used (see above)"])
+
+
+def _busiest(learned: LearnedPolicy) -> str:
+    """Return what to do about too many names, of which one host has most."""
+    stars = [hosts for key, hosts in learned.keys if "*/" in key]
+    crowd = stars if len(stars) > MAXIMUM_INNER_STARS else [hosts for _, hosts in learned.keys]
+    host, count = Counter(host for hosts in crowd for host in hosts).most_common(1)[0]
+    return (
+        f"{host} needs {count} of the {counted(len(crowd), 'key')}; learn from the other hosts"
+        " (--host ADDRESS for each), or write rules for these names by hand"
+    )
 
 
 def _write(output: Path, text: str) -> None:

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import ipaddress
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -29,7 +29,7 @@ from appliance.cli.connection.admin_client import NotRunningError, RestProblemEr
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import time_given
-from appliance.features.policy_tools.learn import Observation, needed_rights
+from appliance.features.policy_tools.learn import Observation, covered, needed_rights
 from appliance.policy import sections
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
@@ -57,14 +57,15 @@ class RecordedPeriod:
     """The requests of the log since a time, or all of them. Times are nanoseconds since the epoch.
 
     `start` is when the log's part of the period begins. `removed`: earlier records of the period are removed.
-    `unnamed` has, for each host, the number of requests that passed and that the log only counts together with others
-    of other names; `*` stands for several hosts.
+    `hosts`: only the requests of these; empty: of all. `unnamed` has, for each host, the number of requests that passed
+    and that the log only counts together with others of other names; `*` stands for several hosts.
     """
 
     read: ReadRecords
     since: int | None
     start: int
     removed: bool
+    hosts: Collection[Network] = ()
     unnamed: dict[str, int] = field(default_factory=dict)
 
     def requests(self) -> Iterator[Observation]:
@@ -73,7 +74,9 @@ class RecordedPeriod:
         for event in _EVENTS:
             passed = Filter(decision=("allow", "would deny"), event=event, since=self.since)
             for entry in self.read(passed):
-                yield from self._of(entry.record)
+                host = entry.record.host
+                if not self.hosts or host is None or covered(_network_of(host), self.hosts):
+                    yield from self._of(entry.record)
 
     def notes(self, appliance: Appliance, what: str) -> Iterator[str]:
         """Yield a line for each part of the period without names. `what` is for requests, such as "compared"."""
@@ -112,6 +115,10 @@ def period_since(read: ReadRecords, since: int | None, now: int) -> RecordedPeri
     return RecordedPeriod(read, since, start, removed)
 
 
+def _network_of(host: str) -> Network:
+    return canonical_network(ipaddress.ip_network(host))
+
+
 def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
     address = canonical_address(ipaddress.ip_address(host))
     return Request(address, str(caller_id or ""), Category(category), str(resource))
@@ -148,15 +155,11 @@ def known_of(
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
-def networks_of(robot: list[str] | None) -> list[Network]:
-    return [_network(text) for text in robot or ()]
-
-
-def _network(text: str) -> Network:
+def networks_of(given: list[str] | None, option: str = "--robot") -> list[Network]:
     try:
-        return canonical_network(ipaddress.ip_network(text))
+        return [_network_of(text) for text in given or ()]
     except ValueError as error:
-        raise usage_error(f"--robot: {error}; write 192.168.1.20 or 192.168.1.0/24") from error
+        raise usage_error(f"{option}: {error}; write 192.168.1.20 or 192.168.1.0/24") from error
 
 
 def _enrolled(text: str) -> tuple[str, Address]:
@@ -240,8 +243,11 @@ def live_now(appliance: Appliance) -> list[LiveRight]:
     return [LiveRight.of(asdict(row)) for row in found]
 
 
-def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
-    """Return the period since a time, or all of the log. Exits with usage errors, and if the log is unreadable."""
+def recorded_period(appliance: Appliance, since: str | None, host: list[str] | None = None) -> RecordedPeriod:
+    """Return the period since a time, or all of the log; without `host`, of all hosts.
+
+    Exits with usage errors, and if the log is unreadable.
+    """
 
     def read(wanted: Filter) -> Iterator[LogEntry]:
         try:
@@ -250,7 +256,7 @@ def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
             raise usage_error(str(error)) from error
 
     asked = None if since is None else time_given("--since", since, "rosrv policy")
-    return period_since(read, asked, clock.wall_ns())
+    return replace(period_since(read, asked, clock.wall_ns()), hosts=networks_of(host, "--host"))
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request | Right]:
