@@ -16,7 +16,7 @@ FIELDS: dict[str, tuple[dict[str, Any], str]] = {
     "host": (_TEXT_OR_NULL, "address of the peer"),
     "caller_id": (_TEXT_OR_NULL, "the name the peer gave: a claim"),
     "category": (_TEXT_OR_NULL, "what kind of request"),
-    "resource": (_TEXT_OR_NULL, "topic, service, parameter, node or call"),
+    "resource": (_TEXT_OR_NULL, "topic, service, node or call; the parameter of a call is `key` in `detail`"),
     "rule": (
         {
             "type": ["object", "null"],

@@ -35,7 +35,9 @@ def filter_given(
     topic: Annotated[
         str | None,
         typer.Option(
-            "--topic", "--resource", help="Topic, service, parameter or call; a glob such as '/cmd_*'"
+            "--topic",
+            "--resource",
+            help="Topic, service, node or call; a glob such as '/cmd_*' (--text finds the parameter of a call)",
         ),
     ] = None,
     host: Annotated[

@@ -51,6 +51,7 @@ from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.unrecorded import unrecorded
 from appliance.features.views import pair_verification
 from appliance.policy.host_names import HostInWords
+from appliance.policy.model import Category
 from rosmop.tool.batch_session import progress
 
 # Print audit records as text: a table on a terminal, lines in a pipe. Text from the network is escaped.
@@ -88,6 +89,7 @@ def line(entry: LogEntry, host_in_words: HostInWords) -> str:
         record.caller_id,
         requested(record),
         record.resource,
+        _parameter(record),
         _by(record),
     ]
     shown = " ".join(printable(part) for part in parts if part)
@@ -151,7 +153,7 @@ def _cells(row: EqualRecords, host_in_words: HostInWords) -> tuple[Text, ...]:
         Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
         Text(printable(record.event), style="bold red" if alarming else ""),
         Text(_join(_host(record, host_in_words), record.caller_id, _by(record))),
-        Text(_join(requested(record), _monitor(record), record.resource)),
+        Text(_join(requested(record), _monitor(record), record.resource, _parameter(record))),
         Text(_why(record) if row.records == 1 else _why_of_several(row)),
     )
 
@@ -176,6 +178,12 @@ def _host(record: AuditRecord, host_in_words: HostInWords) -> str | None:
 def _monitor(record: AuditRecord) -> str | None:
     name = record.detail.get("monitor")
     return str(name) if name else None
+
+
+def _parameter(record: AuditRecord) -> str | None:
+    """Return the parameter of a call."""
+    key = record.detail.get("key")
+    return str(key) if key is not None and record.category == Category.COMMAND else None
 
 
 def _by(record: AuditRecord) -> str | None:
@@ -239,15 +247,19 @@ def search(
     else:
         print_entries(page.entries, appliance.host_in_words, each=each)
         if not page.entries:
-            note(f"no record matches{_slash_missing(wanted)}")
+            note(f"no record matches{_hint(wanted)}")
     if page.cursor is not None:
         note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
-def _slash_missing(wanted: Filter) -> str:
+def _hint(wanted: Filter) -> str:
     given = (("--topic", wanted.resource), ("--caller", wanted.caller_id))
     bare = [f"{option} /{name}" for option, name in given if name and name[0] not in "/*?["]
-    return f"; names in ROS begin with a slash: {' '.join(bare)}" if bare else ""
+    if bare:
+        return f"; names in ROS begin with a slash: {' '.join(bare)}"
+    name = wanted.resource or ""
+    parameter = name.startswith("/") and wanted.text is None and not any(sign in name for sign in "*?[")
+    return f"; for calls on this parameter use --text {name} instead of --topic" if parameter else ""
 
 
 @speaks_with(_JSON_HELP, FILTER)
