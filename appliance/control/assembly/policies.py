@@ -421,7 +421,7 @@ class Policies(Revisions[RevisionRow]):
         self._passed &= known
         self.ends.forget(self.changes, *known.difference(wanted))
         for name, change in wanted.items():
-            if name not in known:  # a date that passed before the load has passed for good, too
+            if name not in known:  # also a date that passed before the load has passed for good
                 self.ends.set(self.changes, name, max(0.0, change - now))
             elif name in known - self._passed and self.ends.passed(self.changes, name):
                 self._passed.add(name)

@@ -285,7 +285,7 @@ def learn_policy(
     host: Annotated[
         list[str] | None,
         typer.Option(
-            "--host", metavar="ADDRESS", help="Only the requests of this address or network (repeatable)"
+            "--host", metavar="HOST", help="Only the requests of this address or network (repeatable)"
         ),
     ] = None,
     output: Annotated[
@@ -411,7 +411,7 @@ def _busiest(learned: LearnedPolicy) -> str:
     host, count = Counter(host for hosts in crowd for host in hosts).most_common(1)[0]
     return (
         f"{host} needs {count} of the {counted(len(crowd), 'key')}; learn from the other hosts"
-        " (--host ADDRESS for each), or write rules for these names by hand"
+        " (--host HOST for each), or write rules for these names by hand"
     )
 
 

@@ -57,8 +57,8 @@ class RecordedPeriod:
     """The requests of the log since a time, or all of them. Times are nanoseconds since the epoch.
 
     `start` is when the log's part of the period begins. `removed`: earlier records of the period are removed.
-    `hosts`: only the requests of these; empty: of all. `unnamed` has, for each host, the number of requests that passed
-    and that the log only counts together with others of other names; `*` stands for several hosts.
+    `hosts` limits it to their requests, unless it is empty. `unnamed` has, for each host, the number of requests that
+    passed and that the log only counts together with others of other names; `*` stands for several hosts.
     """
 
     read: ReadRecords

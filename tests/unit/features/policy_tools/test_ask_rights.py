@@ -98,7 +98,7 @@ def test_an_allowed_right_is_that_hosts_alone() -> None:
 
 
 @pytest.mark.parametrize("names", ONE_RUN.values(), ids=ONE_RUN)
-def test_what_was_allowed_for_one_run_is_allowed_for_the_next(names: tuple[str, str]) -> None:
+def test_a_name_that_was_allowed_for_one_run_is_allowed_for_the_next(names: tuple[str, str]) -> None:
     first, second = (a_launch(name, port) for name, port in zip(names, (42311, 50001), strict=True))
     needed = [request for observation in first for request in needed_rights(observation)]
     kinds = [RightKind(request.category, lasting_name(request), request.host) for request in needed]

@@ -35,7 +35,7 @@ def test_explain_has_an_option_for_every_action(tmp_path: Path, verb: str) -> No
 
 @pytest.mark.real
 def test_one_host_with_too_many_names_prevents_no_learning_from_the_others(tmp_path: Path) -> None:
-    """The error names that host and the option, and the size of tests that nobody wants is no error."""
+    """The error names that host and the option, and test cases that are not written have no limit."""
     file = tmp_path / "control" / "audit.db"
     file.parent.mkdir()
     log = open_log(file)
@@ -53,7 +53,7 @@ def test_one_host_with_too_many_names_prevents_no_learning_from_the_others(tmp_p
     assert (
         f"10.0.0.66 needs {MAXIMUM_INNER_STARS + 1} of the {MAXIMUM_INNER_STARS + 2} keys" in refused.stderr
     )
-    assert "--host ADDRESS" in refused.stderr
+    assert "--host HOST" in refused.stderr
     learned = rosrv(*learn, "--host", "10.0.0.5", "--host", "10.0.1.0/24")
     assert "hosts-1 = 10.0.0.5 10.0.1.6\n" in learned.stdout and "/pad_*/state = hosts-1" in learned.stdout
     assert "10.0.0.66" not in learned.stdout and "/a1_" not in learned.stdout
