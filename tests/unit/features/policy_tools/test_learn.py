@@ -177,6 +177,21 @@ def test_a_name_that_lasts_is_its_own_key(name: str) -> None:
         assert not policy.decide(Request(HOSTS[0], other, category, below)).allowed
 
 
+def test_a_name_of_one_run_may_be_beside_names_that_look_alike() -> None:
+    anonymous = "/talker_4711_1700000000000"
+    topics = (("10.0.0.1", "/talker_1"), ("10.0.0.2", anonymous))
+    keys = (
+        ("10.0.0.1", f"{anonymous}/rate"),
+        ("10.0.0.2", f"{anonymous}/rate/max"),
+        ("10.0.0.1", "/talker_1/rate"),
+    )
+    learned = learn([
+        *(seen(host, Category.PUBLISH, topic) for host, topic in topics),
+        *(seen(host, Category.COMMAND, "getParam", call="getParam", key=key) for host, key in keys),
+    ])  # fmt: skip
+    assert all(result.passed for result in run_cases(compiled(learned), learned.tests, "tests"))
+
+
 def test_a_parameter_call_needs_the_call_and_the_key() -> None:
     policy = compiled(learn([
         seen("10.0.0.1", Category.COMMAND, "getParam", call="getParam", key="/arm"),
