@@ -37,7 +37,7 @@ _CORE_KINDS = {
     "policy-refused": AlarmKind("alarm", "correct the file: the next start may need it"),
     "policy-differs": AlarmKind("notice", "an operator changed one of them on purpose"),
     "monitor-held": AlarmKind("alarm", "resume it: its topics wait for a person"),
-    "monitor-left-out": AlarmKind("alarm", "load it: nothing guards its topics"),
+    "monitor-left-out": AlarmKind("alarm", "correct it and load it: nothing of it runs"),
     "monitor-failing": AlarmKind("alarm", "correct it: its messages are dropped"),
     "monitors-refused": AlarmKind("alarm", "load others: without earlier ones, all topics are blocked"),
     "monitors-unconfirmed": AlarmKind("warning", "confirm them, or let them roll back"),
@@ -174,10 +174,11 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     monitors = status.monitors
     for name in monitors.held:
         why = monitors.why_held.get(name, "a relay was restarted")
-        text = f"topics are held ({name}: {why}): rosrv monitor resume {name}"
+        fix = f"load {monitors.unbuilt[name]}" if name in monitors.unbuilt else f"resume {name}"
+        text = f"topics are held ({name}: {why}): rosrv monitor {fix}"
         yield f"monitor-held:{name}", "monitors", text
     for file, error in monitors.left_out.items():
-        text = f"{file} is left out, so nothing guards its topics: {error}: rosrv monitor load {file}"
+        text = f"{file} has an error, so nothing of it runs: {error}: rosrv monitor load {file}"
         yield f"monitor-left-out:{file}", "monitors", text
     for name in monitors.failing:
         text = f"monitors fail: {name}; its messages are dropped"

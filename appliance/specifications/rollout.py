@@ -404,11 +404,15 @@ class Rollout:
 
     def _say_held(self, relay: int, taken: messages.SpecificationsTaken) -> None:
         before = self._held.get(relay, {})
+        checked = self._now.checked
         for name, why in taken.because.items():
             if before.get(name) != why:
+                fix = f"when it is safe: rosrv monitor resume {name}"
+                if name in checked.unbuilt:
+                    fix = f"rosrv monitor load {checked.monitors[name]}"
                 self.trail.happened(
                     "topics held",
-                    f"{name} holds its topics: {why}; when it is safe: rosrv monitor resume {name}",
+                    f"{name} holds its topics: {why}; {fix}",
                     severity=Severity.ALARM,
                     category="monitor",
                     resource="",

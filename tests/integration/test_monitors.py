@@ -248,7 +248,7 @@ def test_a_file_with_an_error_does_not_keep_the_robot_without_a_master(tmp_path:
             why = eventually(lambda: monitor(running, "broken")["why_held"], running.story)
             assert "unknown variable `lost`" in str(why)
             assert monitor(running, "words")["held"] is False
-            assert "rosrv monitor resume broken" in running.rosrv("status", check=False).stdout
+            assert "rosrv monitor load broken.rv" in running.rosrv("status", check=False).stdout
             assert running.recorded(event="monitor not built")[-1]["resource"] == "broken"
             assert running.stop() == 0
             running.start()

@@ -110,6 +110,7 @@ class MonitorState(msgspec.Struct, frozen=True):
     lasting: Annotated[
         Literal["on", "shadow", "off"], doc("its state without a switch that ends automatically")
     ] = "on"
+    error: Annotated[str, doc("the error of its file, because of which it does nothing; else empty")] = ""
 
 
 class Monitors(msgspec.Struct, frozen=True):

@@ -131,7 +131,10 @@ class MonitorsState(msgspec.Struct, frozen=True):
     ] = {}
     left_out: Annotated[
         dict[str, str],
-        doc("files that the start left out, because their topics are not known, with the error"),
+        doc("files that have an error since the start, so that nothing of them runs, with the error"),
+    ] = {}
+    unbuilt: Annotated[
+        dict[str, str], doc("loaded monitors that do nothing, because their file has an error, with the file")
     ] = {}
     unconfirmed: Annotated[
         dict[str, float], doc("monitors that return to shadow mode unless confirmed, with the time")

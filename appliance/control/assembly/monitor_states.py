@@ -7,6 +7,7 @@ from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import MonitorRow
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Kind, Registry
+from appliance.specifications.judgement import broken
 from appliance.specifications.live_topics import LiveType, Published
 from appliance.specifications.specification_manager import SpecificationManager
 
@@ -45,7 +46,8 @@ def monitors_status(monitors: SpecificationManager) -> MonitorsState:
         confirm_by=monitors.confirm_by,
         shadow=[row.name for row in rows if row.shadow],
         why_held={row.name: row.why_held for row in rows if row.why_held},
-        left_out=monitors.checked.left_out,
+        left_out=broken(monitors.now),
+        unbuilt={name: monitors.checked.monitors[name] for name in monitors.checked.unbuilt},
         unconfirmed={row.name: row.confirm_by for row in rows if row.confirm_by is not None},
     )
 
@@ -82,6 +84,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         given=monitors.givens.states(checked, name),
         confirm_by=monitors.until(name, of=True),
         lasting=monitors.lasting(name),
+        error=checked.unbuilt.get(name, ""),
     )
 
 

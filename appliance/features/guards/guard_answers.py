@@ -155,7 +155,7 @@ class GuardRow(msgspec.Struct, frozen=True):
         doc(
             "`free`: it changed nothing in the last 2 seconds; `stopping`: it did; `withholding`: it withholds its"
             " topic from hosts; `holding`: it cannot judge, and waits for an operator; `shadow`: it only records;"
-            " `off`: it is disabled"
+            " `off`: it is disabled; `broken`: its file has an error, so it does nothing"
         ),
     ]
     topics: Annotated[dict[str, str], doc("the topics that are given to it, by name")]
@@ -204,6 +204,7 @@ class GuardRow(msgspec.Struct, frozen=True):
         None
     )
     tested: Annotated[ProofTest | None, doc("its last proof test, or null if there was none")] = None
+    error: Annotated[str, doc("the error of its file, because of which it does nothing; else empty")] = ""
 
 
 class GuardList(msgspec.Struct, frozen=True):

@@ -509,6 +509,8 @@ class GuardOrders:
             return "shadow"
         if not monitors.switches.enabled(name):
             return "off"
+        if name in monitors.checked.unbuilt:
+            return "broken"
         row = monitors.rollout.rows.get(name)
         if row is not None and row.withholds:
             return "withholding"
@@ -544,4 +546,5 @@ class GuardOrders:
             awaits=row.awaits if (row := monitors.rollout.rows.get(name)) is not None else "",
             times=self._fitness.times.get(name),
             tested=self._tests.get(name),
+            error=monitors.checked.unbuilt.get(name, ""),
         )

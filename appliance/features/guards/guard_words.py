@@ -17,6 +17,9 @@ def origin_in_words(row: GuardRow) -> str:
 
 
 def state_in_words(row: GuardRow) -> str:
+    if row.error:
+        held = "holds its topics" if row.state == "holding" else "does nothing"
+        return f"{held}, because its file has an error: {row.error}: rosrv monitor load {row.file}"
     acts = counted(row.stops, "stop")
     match row.state:
         case "holding":

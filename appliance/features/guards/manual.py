@@ -36,6 +36,7 @@ _IDLE = {
     "off": "disabled",
     "shadow": "in shadow mode",
     "holding": "it cannot judge, and waits for an operator",
+    "broken": "its file has an error, so it does nothing",
 }
 
 

@@ -88,7 +88,7 @@ class ProofTests:
 
     async def _test(self, row: GuardRow, who: str) -> ProofTest:
         text = self._monitors.sources.files[row.file]
-        if row.state in ("off", "shadow", "holding"):
+        if row.state in ("off", "shadow", "holding", "broken"):
             raise SenselessError(f"{row.name} is not in force ({row.state}): only guards in force are tested")
         topics, types = topics_in(text) | row.topics, _WITHOUT_ROLE | types_in(text)
         try:

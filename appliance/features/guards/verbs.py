@@ -110,7 +110,7 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
                       "origin": row.origin, "afresh": row.afresh, "below": row.below,
-                       "digest": row.digest, "last_stop": msgspec.to_builtins(row.last_stop),
+                       "digest": row.digest, "error": row.error, "last_stop": msgspec.to_builtins(row.last_stop),
                        "times": row.times, "tested": row.tested})  # fmt: skip
         else:
             about = f"guard {row.name}: {origin_in_words(row)} on {', '.join(row.topics.values())},"

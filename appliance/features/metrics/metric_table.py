@@ -52,7 +52,11 @@ METRICS = (
     ),
     gauge("rosrv_monitor_slices", "slices of a parametric specification", "monitor"),
     gauge("rosrv_monitor_slice_limit", "the most slices that a specification may have at a time", "monitor"),
-    gauge("rosrv_monitors", "monitors: enabled, shadow (mode), disabled, holding, failing", "state"),
+    gauge(
+        "rosrv_monitors",
+        "monitors: enabled, shadow (mode), disabled, holding, failing, broken (files)",
+        "state",
+    ),
     gauge(
         "rosrv_switched_off",
         "monitors disabled or in shadow mode by an order, and audit-only sections of the policy: forgotten, or not yet",

@@ -143,6 +143,7 @@ def _samples(body: Measures) -> dict[str, _Samples]:
             (("disabled",), monitors.loaded - monitors.enabled - len(monitors.shadow)),
             (("holding",), len(monitors.held)),
             (("failing",), len(monitors.failing)),
+            (("broken",), len(monitors.left_out)),
         ],
         "rosrv_nodes": [((state,), count) for state, count in body.nodes.items()],
         "rosrv_registrations": [((kind,), count) for kind, count in body.registrations.items()],

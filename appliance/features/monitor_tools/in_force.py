@@ -79,7 +79,12 @@ def list_monitors(appliance: Appliance) -> None:
         say("no monitors; load some: rosrv monitor load FILE…")
     if any(row.shadow for row in body.monitors):
         say("(in brackets: messages that a monitor in shadow mode would have dropped or changed)", "dim")
-    say_held({row.name: row.why_held for row in body.monitors if row.held})
+    say_held({row.name: row.why_held for row in body.monitors if row.held and not row.error})
+    for row in body.monitors:
+        if row.error:
+            held = ", and holds its topics" if row.held else ""
+            fix = f"rosrv monitor load {row.file}"
+            say(f"{row.name} does nothing{held}: its file has an error: {row.error}: {fix}", "red")
     source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; differs from the folder (load the folder's, removing no others: rosrv monitor reload)"
@@ -338,6 +343,8 @@ def _say_switched(body: Switched, word: str) -> None:
 
 
 def _state(row: MonitorState) -> str:
+    if row.error:
+        return "broken"
     if row.shadow:
         return f"shadow mode, {row.missed} missed" if row.missed else _SHADOW
     if row.held:

@@ -11,6 +11,9 @@ import pytest
 
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import admin, messages
+from appliance.channel.alarms import open_alarms
+from appliance.channel.answers.status import Status
+from appliance.control.assembly.monitor_states import monitors_status, states_of
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     MonitorsChangedError,
@@ -22,6 +25,7 @@ from appliance.specifications.specification_manager import (
     SpecificationManager,
 )
 from appliance.specifications.specification_revisions import text_of
+from tests.support.answers import example
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, SlowCompiler
 from tests.unit.transcripts import played, transcripts
@@ -349,6 +353,36 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) 
     (desk.folder / "a.rv").write_text(A)
     await monitors.reload(admin.MonitorReload(), "adam")
     assert (monitors.checked.left_out, monitors.names()) == ({}, ["a"])
+
+
+async def test_each_file_that_does_nothing_is_an_alarm_until_it_is_corrected(desk: Desk) -> None:
+    event = "event e() /x std_msgs/String '{}' { missing = 1; }"
+    broken = {"begins": f"begin b() {{ {event} }}", "holds": f"h() {{ {event} }}", "text": "nonsense"}
+    for name, text in broken.items():
+        (desk.folder / f"{name}.rv").write_text(text)
+    (desk.folder / "bytes.rv").write_bytes(b"\xff")
+    for restarted in (False, True):
+        monitors = await desk.monitors(restarted=restarted)
+        monitors.received(
+            messages.SpecificationsTaken(monitors.revision, [], ["h"], 0, {"h": "its file has an error"})
+        )
+        found = {
+            alarm.kind: alarm.text
+            for alarm in open_alarms(example(Status, monitors=monitors_status(monitors)))
+        }
+        fixes = {
+            kind: text.rpartition(": ")[2] for kind, text in found.items() if kind.startswith("monitor-")
+        }
+        assert fixes == {"monitor-held:h": "rosrv monitor load holds.rv"} | {
+            f"monitor-left-out:{file}.rv": f"rosrv monitor load {file}.rv" for file in (*broken, "bytes")
+        }
+        for row in states_of(monitors):
+            assert bool(row.error) == (row.name in ("b", "h"))
+    held = [fields["reason"] for event, fields in desk.trail.heard if event == "topics held"]
+    assert held and not any("resume" in str(text) for text in held)
+    fixed = {f"{name}.rv": C.replace("c()", f"{name}()") for name in (*broken, "bytes")}
+    await monitors.load(admin.MonitorLoad(fixed), "eve")
+    assert not monitors_status(monitors).left_out
 
 
 async def test_a_load_or_removal_of_others_leaves_a_broken_file_as_the_start_left_it(desk: Desk) -> None:

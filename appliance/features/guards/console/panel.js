@@ -25,7 +25,7 @@ import { useGuards } from "./state.js";
 import { Suggest } from "./suggest.js";
 import { SetValues } from "./values.js";
 
-const TONES = { free: "allow", stopping: "deny", withholding: "", holding: "deny", shadow: "note", off: "" };
+const TONES = { free: "allow", stopping: "deny", withholding: "", holding: "deny", shadow: "note", off: "", broken: "deny" };
 const WITHIN = /** @type {[string, string][]} */ ([["60", "unless confirmed within 1 minute"], ["300", "unless confirmed within 5 minutes"], ["3600", "unless confirmed within an hour"], ["", "never"]]);
 const WATCHED = 6; // topics that are watched at once: control answers eight queries at a time
 
@@ -62,14 +62,14 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
   return html`<tr data-guard=${guard.name}>
     <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(guard.name)}`}><strong><${Given} value=${guard.name} most=${60} /></strong></${Link}><div class="muted small">${guard.preset === guard.name ? "" : `${guard.preset}: `}${preset?.what}</div>
       ${guard.origin !== "current" && html`<div class="small"><${Badge} word=${guard.origin} tone="warn" /> ${guard.origin === "older" ? `the text of ${guard.preset} ${guard.version}; the present version is ${preset?.version}` : "not the text of the preset"}</div>`}</td>
-    <td data-label="State"><span>${guard.state === "stopping" && guard.last_stop && !begins(guard, now) ? html`<${Held} guard=${guard} />` : html`<${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />`}${guard.why_held && html`<div class="small muted"><${Given} value=${guard.why_held} most=${200} /></div>`}
+    <td data-label="State"><span>${guard.state === "stopping" && guard.last_stop && !begins(guard, now) ? html`<${Held} guard=${guard} />` : html`<${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />`}${(guard.why_held || guard.error) && html`<div class="small muted"><${Given} value=${guard.why_held || guard.error} most=${200} /></div>`}
       ${guard.off_until && html`<div class="small muted">until <${Moment} at=${guard.off_until} /></div>`}${guard.confirm_by && html`<div class="small muted">returns to shadow mode at <${Moment} at=${guard.confirm_by} />, unless confirmed</div>`}
       <div><${Button} small tone="plain" role="operator" title="The guard's variables, such as the position that it has; the audit log records it" onClick=${() => setOpen("values")}>Values…</${Button}></div></span></td>
     <td data-label="Guards"><span><${Given} value=${guard.topics.command} mono most=${60} />${guard.topics.by && html`<div class="small muted">by <${Given} value=${guard.topics.by} mono most=${60} /></div>`}</span></td>
     <td data-label="Margins">${found.length ? html`<${Margins} margins=${found} />` : html`<span class="muted small">${"–"}</span>`}</td>
     <td class="number" data-label=${guard.state === "shadow" ? "Would stop" : "Stopped"}>${guard.state === "shadow" ? html`<span class="muted" title="would have stopped">(${guard.stops})</span>` : guard.stops}</td>
     <td><div class="row row-end guard-verbs">
-      ${guard.state === "holding" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is resumed", "Its topics are released.", { held: false })}>Resume</${Button}>`}
+      ${guard.state === "holding" && !guard.error && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is resumed", "Its topics are released.", { held: false })}>Resume</${Button}>`}
       ${guard.state === "shadow" && html`<${Button} small role="operator" tone="primary" onClick=${() => setOpen("enforce")}>Enforce</${Button}>`}
       ${guard.confirm_by && html`<${Button} small role="operator" tone="primary" onClick=${() => guards.order(`${guard.name} stays in force`, "It is confirmed.", "POST", "/v1/monitors/confirm")}>Confirm</${Button}>`}
       ${guard.state === "off" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is in force", "It acts from now on.", { enabled: true })}>Turn on</${Button}>`}

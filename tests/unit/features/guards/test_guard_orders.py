@@ -23,7 +23,7 @@ from appliance.features.guards.fitness import GuardFitness
 from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_facts import values_of
 from appliance.features.guards.guard_orders import GuardOrders
-from appliance.features.guards.guard_words import times_in_words
+from appliance.features.guards.guard_words import state_in_words, times_in_words
 from appliance.features.guards.presets import PRESETS, Guard, former_guard, text_of
 from appliance.features.guards.released import released
 from appliance.features.guards.robot_graph import GOAL
@@ -37,6 +37,7 @@ from tests.support.core import FakeTrail
 from tests.support.virtual_clock import let_time_pass
 from tests.unit.features.guards.guard_desk import FENCE, TYPES, monitors_of
 from tests.unit.features.guards.test_placement import Connections
+from tests.unit.specifications.monitor_desk import Desk
 
 pytestmark = pytest.mark.anyio
 FORMER = r"""// preset sane 1: command=/cmd_vel geometry_msgs/Twist
@@ -161,6 +162,28 @@ async def test_a_guard_is_stopping_while_it_acts(monitors: SpecificationManager,
     assert ((await row(orders)).state, (await row(orders)).stops) == ("shadow", 0)
     monitors.received(SpecificationsTaken(monitors.revision, [], ["fence"]))
     assert (await row(orders)).state == "holding"
+
+
+async def test_a_guard_whose_file_has_an_error_says_so_in_each_state(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    (desk.folder / "a.rv").unlink()
+    (desk.folder / "fence.rv").write_text(text_of(FENCE).replace("<= silent", "<= missing", 1))
+    monitors = await desk.monitors()
+    orders = orders_of(monitors)
+    for state in ("broken", "shadow", "off", "holding"):
+        if state == "shadow":
+            await set_shadow(monitors)
+        elif state == "off":
+            await monitors.switch(admin.MonitorSwitch(["fence"], False), "eve")
+        elif state == "holding":
+            monitors.received(SpecificationsTaken(monitors.revision, [], ["fence"]))
+        found = await row(orders)
+        words = state_in_words(found)
+        assert (found.state, "unknown variable `missing`" in words, words.rpartition(": ")[2]) == (
+            state, True, "rosrv monitor load fence.rv"
+        )  # fmt: skip
+    desk.kill()
+    desk.close()
 
 
 async def test_a_guard_has_its_last_stop(monitors: SpecificationManager, orders: GuardOrders) -> None:

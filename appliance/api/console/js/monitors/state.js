@@ -49,7 +49,7 @@ export function useMonitors() {
 
 /** A monitor's state in one word. @param {any} row */
 export function stateOf(row) {
-  return row.shadow ? "shadow mode" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
+  return row.error ? "broken" : row.shadow ? "shadow mode" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
 }
 
 /** The growth of a monitor's counter over the samples. @param {any[]} samples @param {string} name @param {number} place */

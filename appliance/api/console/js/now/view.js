@@ -53,11 +53,12 @@ function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) 
   const first = alarms.find((one) => one.severity !== "notice");
   const isolation = status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`;
   const { policy, monitors, ipsec, audit } = status;
+  const broken = Object.keys(monitors.left_out).length;
   return html`<section class="cards" aria-label="Health">
     <${Card} name="Appliance" to=${first ? placeOf(first) : "/console/now"} tone=${state[0]} figure=${state[1]} words>${first ? html`<${Given} value=${inOwnZone(first.text)} most=${120} />` : isolation}</${Card}>
     <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "rolls back unless confirmed" : html`<${By} who=${policy.who} most=${30} />${policy.differs_from_file ? ", differs from the file" : ""}`}</${Card}>
     <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
-    <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
+    <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${broken || monitors.held.length || monitors.failing.length ? "deny" : ""}>${broken ? `${counted(broken, "file")} with an error` : monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
     <${Card} name="Tunnels up" to="/console/hosts" figure=${`${ipsec.up} of ${ipsec.enrolled}`}>${ipsec.enrolled ? "enrolled hosts" : "no host is enrolled"}</${Card}>
     <${Card} name="Audit log" to="/console/audit" words tone=${audit.failed ? "deny" : audit.degraded || audit.forwarding?.trouble ? "warn" : ""} figure=${audit.failed ? "Not written" : audit.degraded ? "Degraded" : audit.forwarding?.trouble ? "Not forwarded" : "Written"}>${audit.lag_records ? `${counted(audit.lag_records, "record")} waiting, ${audit.lag_seconds.toFixed(1)} s` : "nothing waiting"}</${Card}>
   </section>`;

@@ -6,7 +6,7 @@ import { Given } from "./given.js";
 const TONES = {
   allow: "allow", deny: "deny", "would deny": "warn", ask: "warn",
   alarm: "deny", warning: "warn", notice: "note", info: "", debug: "",
-  up: "allow", live: "allow", enabled: "allow", down: "warn", lost: "warn", revoked: "", failing: "deny", held: "deny", "shadow mode": "note", disabled: "",
+  up: "allow", live: "allow", enabled: "allow", down: "warn", lost: "warn", revoked: "", failing: "deny", held: "deny", broken: "deny", "shadow mode": "note", disabled: "",
 };
 
 /** @param {{word: string, tone?: string, title?: string}} given */
