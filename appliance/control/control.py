@@ -621,6 +621,7 @@ class Control:
             in_force=lambda: (self.policies.revision, self.monitors.revision),
             durable=self._durable,
             require_room=self.store.database.require_room,
+            obstacle=lambda: self.trail.obstacle,
         )
         blocks = self.hosts.blocks
         uses = RestUses(lambda: blocks.reasons)

@@ -9,4 +9,6 @@ async def _durable() -> None: ...
 
 def administration_of(*methods: RequestMethod[Any]) -> Administration:
     """Return control's administration with these methods, for which the disk has room."""
-    return Administration(methods, in_force=lambda: (1, 1), durable=_durable, require_room=lambda: None)
+    return Administration(
+        methods, in_force=lambda: (1, 1), durable=_durable, require_room=lambda: None, obstacle=lambda: None
+    )

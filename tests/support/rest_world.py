@@ -124,7 +124,7 @@ class RestWorld:
             monitors=idle(SpecificationManager),
             tokens=idle(TokenOrders),
         )
-        administration = Administration(
+        self.administration = Administration(
             [
                 *(replace(method, answer=self.carried.out) for method in methods),
                 *(
@@ -135,9 +135,10 @@ class RestWorld:
             in_force=lambda: (7, 3),
             durable=self.trail.durable,
             require_room=lambda: None,
+            obstacle=lambda: self.trail.obstacle,
         )
         rest = RestLink(
-            administration, self.tokens, self.trail,
+            self.administration, self.tokens, self.trail,
             served=lambda _pin: None, certified=lambda _sha256: None, require_proof=False, uses=RestUses(),
         )  # fmt: skip
         rest.attach(self._ends[0])

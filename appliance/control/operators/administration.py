@@ -49,16 +49,17 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     StoreError: "failed",
     ChannelFullError: "failed",
 }
-# Requests that are rejected if the store cannot be written, except rows with `full_disk`: a block or revocation takes
-# effect at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a
-# reason to switch over.
+# Requests that are rejected if the store or the audit log cannot be written, except rows with `full_disk`: a block or
+# revocation takes effect at once, and its answer reports if it was not stored. The recorder checks its own disk space.
+# A full disk is a reason to switch over.
 KEPT = ORDERS | {admin.TokenAdd, admin.TokenRotate}
 
 
 class Administration:
-    """Carries out requests. `require_room()` guards requests in `KEPT` without `full_disk`.
+    """Carries out requests. `require_room()` guards requests in `KEPT` without `full_disk`, and so does the trail.
 
-    `in_force` returns the revisions of the policy and of the specifications.
+    `obstacle()` returns why nothing can be recorded, and so granted, now, or None. `in_force` returns the revisions of
+    the policy and of the specifications.
     """
 
     def __init__(
@@ -68,10 +69,12 @@ class Administration:
         in_force: Callable[[], tuple[int, int]],
         durable: Callable[[], Awaitable[object]],
         require_room: Callable[[], None],
+        obstacle: Callable[[], str | None],
     ) -> None:
         self._revisions = in_force
         self._durable = durable
         self._require_room = require_room
+        self._obstacle = obstacle
         self._methods = {method.request: method for method in methods}
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
@@ -95,6 +98,8 @@ class Administration:
             require_awaited()
             if method.request in KEPT and not method.full_disk:
                 self._require_room()
+                if (obstacle := self._obstacle()) is not None:
+                    raise UnavailableError(obstacle)
             return admin.AdminAnswer(True, await method.answer(request, *([who] if method.who else [])))
         except (PolicyRefusedError, SpecificationsRefusedError) as error:
             text = self._in_force(error)

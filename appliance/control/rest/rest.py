@@ -223,8 +223,6 @@ class RestLink:
             self._send_answer(made.number, answer)
 
     async def _answer(self, made: RequestMade) -> AdminAnswer[object]:
-        if type(made.request) in ORDERS and self._trail.obstacle is not None:
-            return AdminAnswer(False, error=self._trail.obstacle, trouble="failed")
         try:
             who = await self._askers.asker(made)
             if isinstance(made.request, ChallengeWanted):

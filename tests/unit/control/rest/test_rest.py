@@ -245,16 +245,6 @@ async def test_a_defect_costs_one_answer(api: Api) -> None:
     assert answer_of(served).ok
 
 
-async def test_nothing_is_changed_while_the_log_cannot_be_written(world: Everything, api: Api) -> None:
-    world.trail.log.failure = "disk full"
-    api.channel.send(loading(1, "[Nodes]"))
-    api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
-    _tokens, refused, served = await api.until(3)
-    assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.trail.obstacle)
-    assert answer_of(served).ok
-    assert [request for request, _who in world.asked] == [StatusWanted()]
-
-
 async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api) -> None:
     for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
         api.channel.send(loading(number, "[Nodes]", shown))
