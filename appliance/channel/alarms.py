@@ -40,6 +40,7 @@ _CORE_KINDS = {
     "monitor-left-out": AlarmKind("alarm", "correct it and load it: nothing of it runs"),
     "monitor-failing": AlarmKind("alarm", "correct it: its messages are dropped"),
     "monitors-refused": AlarmKind("alarm", "load others: without earlier ones, all topics are blocked"),
+    "monitors-folder-refused": AlarmKind("alarm", "correct the file: the next start may need it"),
     "monitors-unconfirmed": AlarmKind("warning", "confirm them, or let them roll back"),
     "monitor-unconfirmed": AlarmKind("warning", "confirm it, or let it return to shadow mode"),
     "monitors-differ": AlarmKind("notice", "an operator changed one of them on purpose"),
@@ -191,7 +192,13 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     for name, deadline in monitors.unconfirmed.items():
         text = f"{name} returns to shadow mode at {_moment(deadline)} unless confirmed: rosrv monitor confirm"
         yield f"monitor-unconfirmed:{name}", "monitors", text
-    if monitors.differs_from_folder:
+    if monitors.folder_refused:
+        text = (
+            f"revision {monitors.revision} of the specifications stays in force, their folder is rejected:"
+            f" {monitors.folder_refused}"
+        )
+        yield "monitors-folder-refused", "monitors", text
+    elif monitors.differs_from_folder:
         text = f"revision {monitors.revision} of the specifications differs from their folder"
         yield "monitors-differ", "monitors", text
 

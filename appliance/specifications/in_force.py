@@ -39,6 +39,7 @@ class InForce:
     `number` is that of the revision; `acts` counts all switches and resumptions so far. `returns` are of switches for a
     time. Unless it is confirmed in time, the revision gives way to the revision `back_to`. `since` names what operators
     have ordered since that one was in force: `deadman` for a switch, `deadman.vMax` for a constant.
+    `folder_refused` is why the last start rejected the folder; empty if it did not, and in the next revision.
     """
 
     number: int = 0
@@ -50,6 +51,7 @@ class InForce:
     returns: Mapping[str, Return] = field(default_factory=dict)
     back_to: int | None = None
     since: frozenset[str] = frozenset()
+    folder_refused: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "switches", self.switches.of(self.checked))

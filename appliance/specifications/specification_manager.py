@@ -78,6 +78,7 @@ _ACTS = "monitor acts"
 _GIVEN = "monitor given"
 _RETURNS = "monitor returns"
 _SINCE = "monitor orders since"
+_REFUSED = "monitor folder refused"
 ALLOCATION = "relays"
 TIMED = EndKind("timed switch")
 _LONGEST = 30 * 86_400.0  # seconds of a timed switch
@@ -170,6 +171,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             returns=msgspec.json.decode(settings.get(_RETURNS, "{}"), type=dict[str, Return]),
             back_to=int(unconfirmed[0]) if unconfirmed else None,
             since=frozenset(json.loads(settings.get(_SINCE, "[]"))),
+            folder_refused=settings.get(_REFUSED, ""),
         )
         sources, checked, refused = await specifications_at_start(
             last,
@@ -181,6 +183,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
         before, row = self.now, self.in_force
         coming = in_force.cleared(replace(before, sources=sources, checked=checked))
+        if last is None:  # the folder was read
+            why = refused[0] if refused else ""
+            coming = coming._replace(now=replace(coming.now, folder_refused=why))
         fresh = last is None and sources_of(row) != sources
         if fresh:
             coming = coming._replace(now=replace(coming.now, number=self.revision + 1, back_to=None))
@@ -784,6 +789,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.store.save_setting(_GIVEN, json.dumps(dict(now.givens.said)))
         self.store.save_setting(_RETURNS, msgspec.json.encode(now.returns).decode())
         self.store.save_setting(_SINCE, json.dumps(sorted(now.since)))
+        self.store.save_setting(_REFUSED, now.folder_refused)
 
     def _stays(self, problem: str) -> str:
         waits = self.confirm_by is not None or self.now.promoted

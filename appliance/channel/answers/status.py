@@ -133,6 +133,12 @@ class MonitorsState(msgspec.Struct, frozen=True):
         dict[str, str],
         doc("files that have an error since the start, so that nothing of them runs, with the error"),
     ] = {}
+    folder_refused: Annotated[
+        str,
+        doc(
+            "why the folder was rejected at the last start, or empty if it was not, or another revision came"
+        ),
+    ] = ""
     unbuilt: Annotated[
         dict[str, str], doc("loaded monitors that do nothing, because their file has an error, with the file")
     ] = {}

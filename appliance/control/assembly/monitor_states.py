@@ -32,7 +32,7 @@ def monitors_of(monitors: SpecificationManager, rv_state: list[object], *, texts
 
 
 def monitors_status(monitors: SpecificationManager) -> MonitorsState:
-    rows = states_of(monitors)
+    rows, differs = states_of(monitors), monitors.differs_from_folder
     return MonitorsState(
         revision=monitors.revision,
         tag=monitors.tag,
@@ -42,11 +42,12 @@ def monitors_status(monitors: SpecificationManager) -> MonitorsState:
         failing=[row.name for row in rows if row.failing and not row.shadow],
         refused=monitors.rollout.refused,
         who=monitors.in_force.who,
-        differs_from_folder=monitors.differs_from_folder,
+        differs_from_folder=differs,
         confirm_by=monitors.confirm_by,
         shadow=[row.name for row in rows if row.shadow],
         why_held={row.name: row.why_held for row in rows if row.why_held},
         left_out=broken(monitors.now),
+        folder_refused=monitors.now.folder_refused if differs else "",
         unbuilt={name: monitors.checked.monitors[name] for name in monitors.checked.unbuilt},
         unconfirmed={row.name: row.confirm_by for row in rows if row.confirm_by is not None},
     )

@@ -49,6 +49,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("monitors.failing", ["logging"], "monitor-failing:logging", "alarm", "monitors"),
         ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "alarm", "monitors"),
         ("monitors.left_out", {"a.rv": "a.rv:1:1: no"}, "monitor-left-out:a.rv", "alarm", "monitors"),
+        ("monitors.folder_refused", "a.rv:1:1: no", "monitors-folder-refused", "alarm", "monitors"),
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
         ("blocks.hosts", 1, "hosts-blocked", "notice", "hosts"),

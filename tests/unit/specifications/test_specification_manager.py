@@ -313,7 +313,10 @@ async def test_interventions_in_shadow_mode_do_not_count_as_drops(desk: Desk) ->
 
 
 @pytest.mark.parametrize("broken", ["a() { event e() /x std_msgs/String '{}' { missing = 1; } }", "nonsense"])
-async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(desk: Desk, broken: str) -> None:
+@pytest.mark.parametrize("reloads", [False, True])
+async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(
+    desk: Desk, broken: str, reloads: bool
+) -> None:
     monitors = await desk.monitors()
     (desk.folder / "a.rv").write_text(broken)
     with pytest.raises(SpecificationsRefusedError):
@@ -321,10 +324,20 @@ async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(desk: Desk, 
     for restarted in (False, True, False):
         monitors = await desk.monitors(restarted=restarted)
         assert (monitors.revision, monitors.sources.files, monitors.checked.unbuilt) == (1, {"a.rv": A}, {})
+        status = example(Status, monitors=monitors_status(monitors))
+        [text] = [alarm.text for alarm in open_alarms(status) if alarm.kind == "monitors-folder-refused"]
+        assert "a.rv:1:" in text, "even after a crash of control"
     refused = [fields for event, fields in desk.trail.heard if event == "specifications refused"]
     assert [fields["who"] for fields in refused] == ["adam", "disk", "disk"]
+    (desk.folder / "a.rv").write_text(A)
+    assert monitors_status(monitors).folder_refused == ""
     (desk.folder / "a.rv").write_text(A + " ")
-    assert (await desk.monitors()).revision == 2
+    monitors = monitors if reloads else await desk.monitors()
+    if reloads:
+        await monitors.reload(admin.MonitorReload(), "adam")
+    assert (monitors.revision, monitors_status(monitors).folder_refused) == (2, "")
+    for restarted in (True, False):
+        assert not monitors_status(await desk.monitors(restarted=restarted)).folder_refused
 
 
 async def test_a_start_without_monitors_makes_no_revision(desk: Desk) -> None:
