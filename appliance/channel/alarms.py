@@ -18,6 +18,7 @@ Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]
 SWITCHED_OFF = "monitor-off:"
 """Begins the kinds of alarms for monitors that an order or a file disabled, or put into shadow mode."""
+FAULTED = "dropped, or pass with on_fault: pass and on observed topics"
 _Condition = tuple[str, About, str]
 _CORE_KINDS = {
     "starting": AlarmKind("warning", "wait: RVMaster started a few seconds ago; what stays is then named"),
@@ -38,7 +39,7 @@ _CORE_KINDS = {
     "policy-differs": AlarmKind("notice", "an operator changed one of them on purpose"),
     "monitor-held": AlarmKind("alarm", "resume it: its topics wait for a person"),
     "monitor-left-out": AlarmKind("alarm", "correct it and load it: nothing of it runs"),
-    "monitor-failing": AlarmKind("alarm", "correct it: its messages are dropped"),
+    "monitor-failing": AlarmKind("alarm", f"correct it: messages at which it faults are {FAULTED}"),
     "monitors-refused": AlarmKind("alarm", "load others: without earlier ones, all topics are blocked"),
     "monitors-folder-refused": AlarmKind("alarm", "correct the file: the next start may need it"),
     "monitors-unconfirmed": AlarmKind("warning", "confirm them, or let them roll back"),
@@ -182,7 +183,7 @@ def _monitors(status: Status) -> Iterator[_Condition]:
         text = f"{file} has an error, so nothing of it runs: {error}: rosrv monitor load {file}"
         yield f"monitor-left-out:{file}", "monitors", text
     for name in monitors.failing:
-        text = f"monitors fail: {name}; its messages are dropped"
+        text = f"monitors fail: {name}; messages at which it faults are {FAULTED}"
         yield f"monitor-failing:{name}", "monitors", text
     for line in monitors.refused:
         yield "monitors-refused", "monitors", f"the relay rejected the specifications: {line}"

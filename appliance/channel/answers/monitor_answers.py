@@ -76,7 +76,7 @@ class MonitorState(msgspec.Struct, frozen=True):
     file: Annotated[str, doc("the specification file that defines it; a file may have several monitors")]
     enabled: Annotated[bool, doc("its actions take effect; false while it is in shadow mode")]
     held: Annotated[bool, doc("blocks its topics until it is resumed")]
-    failing: Annotated[bool, doc("whether its actions fault; its messages are then dropped")]
+    failing: Annotated[bool, doc("whether its actions fault; such messages are dropped or pass (`on_fault`)")]
     topics: Annotated[list[str], doc("topics of its events")]
     services: Annotated[list[str], doc("services of its events")]
     events: Annotated[int, doc("number of events that it received")]

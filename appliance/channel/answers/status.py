@@ -118,7 +118,9 @@ class MonitorsState(msgspec.Struct, frozen=True):
     loaded: Annotated[int, doc("number of monitors")]
     enabled: Annotated[int, doc("number of enabled monitors")]
     held: Annotated[list[str], doc("monitors that hold their topics until they are resumed")]
-    failing: Annotated[list[str], doc("monitors whose actions fault; their messages are then dropped")]
+    failing: Annotated[
+        list[str], doc("monitors whose actions fault; such messages are dropped or pass (`on_fault`)")
+    ]
     refused: Annotated[
         list[str], doc("why the relay rejects the specifications: all topics are blocked then")
     ]
