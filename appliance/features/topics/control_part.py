@@ -3,7 +3,7 @@
 from appliance.base.clock import now
 from appliance.base.validation_messages import meant
 from appliance.control.core import ControlPart, Core, GraphFacts, RelayOrders
-from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.topics.requests import TopicLook, TopicMessage, TopicMessages
 from appliance.telemetry.audit_trail import AuditTrail
@@ -34,6 +34,9 @@ class TopicLooks:
                 f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
             )
         self._record_look(topic.name, who)
+        failure = await self._trail.durable()
+        if failure is not None:
+            raise UnavailableError(f"no message is shown while the look cannot be recorded: {failure}")
         seen = await self._relay.look(topic.name, request.messages, request.seconds, latched=request.latched)
         rows = [
             TopicMessage(

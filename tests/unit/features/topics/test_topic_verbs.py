@@ -1,9 +1,17 @@
+from typing import Any
+
 import pytest
 import typer
 
+from appliance.channel.answers.graph_answers import Graph, Topic
+from appliance.control.errors import UnavailableError
+from appliance.features.topics.control_part import TopicLooks
+from appliance.features.topics.requests import TopicLook
 from appliance.features.topics.verbs import part_of
 from roswire.definitions import Definitions
 from roswire.message_view import CUT, read_fields
+from tests.support.answers import example
+from tests.support.core import FakeTrail
 
 DEFINITIONS = Definitions.from_files(
     {"a/Scan.msg": "float32[] ranges\nuint8[] data\nPose pose\nuint8 last\n", "a/Pose.msg": "float32 x\n"}
@@ -31,3 +39,32 @@ def test_omitted_parts_are_marked() -> None:
 def test_a_missing_field_is_an_error(path: str) -> None:
     with pytest.raises(typer.Exit):
         part_of(scan(1_000_000), path)
+
+
+class Robot:
+    """A robot with the topic /odom, and the number of looks that its relay got."""
+
+    looks = 0
+
+    def present(self) -> Graph:
+        return Graph([], [example(Topic, name="/odom", type="nav_msgs/Odometry", mediated=True)], [])
+
+    async def look(self, *_asked: object, **_named: object) -> list[object]:
+        self.looks += 1
+        return []
+
+
+@pytest.mark.anyio
+async def test_no_message_is_shown_before_the_record_of_the_look_is_on_disk() -> None:
+    robot: Any = Robot()
+    waits: list[int] = []
+    trail = FakeTrail(on_disk=lambda: waits.append(robot.looks))
+    looks = TopicLooks(robot, robot, trail)
+    for asked in range(2):  # the record covers the second one too
+        await looks.messages(TopicLook("/odom"), "ann")
+        assert (waits, robot.looks) == ([*range(asked + 1)], asked + 1)
+    for who in ("ann", "eve"):
+        trail.log.failure = "the disk is full"
+        with pytest.raises(UnavailableError, match="cannot be recorded: the disk is full"):
+            await looks.messages(TopicLook("/odom"), who)
+    assert (robot.looks, trail.events) == (2, ["topic looked into"] * 2)
