@@ -239,6 +239,7 @@ class Policies(Revisions[RevisionRow]):
         async with self.changing(request.expected):
             waited = self.confirm_by is not None
             if waited:
+                take_effect()
                 self.end_limit()
                 self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
             return answers.PolicyConfirmed(waited, self.revision)

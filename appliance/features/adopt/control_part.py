@@ -9,6 +9,7 @@ import msgspec
 import structlog
 
 from appliance.base import clock
+from appliance.base.withdrawal import take_effect
 from appliance.control.core import ControlPart, Core
 from appliance.control.errors import SenselessError, UnavailableError
 from appliance.control.links.supervisor_link import MachineWorkFailedError
@@ -209,6 +210,7 @@ class AdoptPart:
     async def adopt(self, _request: AdoptOrder) -> TakeOverReport:
         self._core.store.database.require_room()  # without a record nothing is granted
         async with self._one:
+            take_effect()
             try:
                 report = await self._operation.adopt()
             except AdoptError as error:
@@ -219,6 +221,7 @@ class AdoptPart:
 
     async def release(self, _request: ReleaseOrder) -> GiveBackReport:
         async with self._one:
+            take_effect()
             try:
                 report = await self._operation.release()
                 self._given()

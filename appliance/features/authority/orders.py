@@ -333,6 +333,7 @@ class DriveOrders:
         holding = self._groups.holder(group.name)
         if not self._groups.may_take(group, host):
             raise SenselessError(self._refusal(group, host, holding, who))
+        take_effect()  # it waited for its turn
         if self._holds(group, host):
             self._groups.hold(group.name, host, clock.now())
             return
@@ -342,6 +343,7 @@ class DriveOrders:
     async def _asked(self, group: AuthorityGroup, host: Address, who: str) -> None:
         if self._claim(group, host) is None:
             raise SenselessError(self._refusal(group, host, None, who))
+        take_effect()
         if self._holds(group, host):  # else the end of its own holding would give it the group again
             self._groups.hold(group.name, host, clock.now())
             return

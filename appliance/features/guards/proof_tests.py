@@ -14,6 +14,7 @@ from contextlib import suppress
 import msgspec
 
 from appliance.base import clock
+from appliance.base.withdrawal import take_effect
 from appliance.channel.messages import GuardTested, GuardTestWanted, MessageSeen
 from appliance.control.core import GraphFacts, RelayOrders
 from appliance.control.errors import SenselessError, UnavailableError
@@ -98,6 +99,7 @@ class ProofTests:
         command = topics["command"]
         why_not = await self._why_not_sent(row.preset, command, types["command"])
         wanted = GuardTestWanted(0, row.name, command, made.messages, made.fault, deliver=not why_not)
+        take_effect()  # the robot was watched for seconds
         found = await self._relay.test(wanted)
         if found is None or found.why:
             raise UnavailableError(

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 from appliance.base import clock
+from appliance.base.withdrawal import take_effect
 from appliance.channel import messages
 from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
@@ -161,6 +162,7 @@ class SsoOrders:
             )
             if self._trail.obstacle is not None:
                 raise UnavailableError(self._trail.obstacle)
+            take_effect()
             session, ended = self.sessions.open(found.identity, found.keys)
         except (TokenRefusedError, UnavailableError) as error:
             self._trail.happened(

@@ -6,6 +6,7 @@ from typing import Any, Never, Protocol
 
 import structlog
 
+from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import UnknownThingError
@@ -59,6 +60,7 @@ class ActiveAppliance:
 
     async def hand_over(self) -> None:
         await self._replication.require_ready(self._rehearsing)
+        take_effect()
         try:
             await self._leaving()
             await self._replication.hand_over()
@@ -86,7 +88,7 @@ class StandbyOrders:
         await self._trail.durable()
         try:
             await self._source.hand_over()
-        except HandOverError as error:
+        except (HandOverError, WithdrawnError) as error:
             self._trail.happened("switchover failed", str(error), who=who)
             await self._trail.durable()
             raise

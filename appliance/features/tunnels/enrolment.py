@@ -126,6 +126,7 @@ class HostSelfService:
         before = self._in_its_tunnel(name, request.peer).serial
         # Without the authority's key the previous certificate could not be put on the list of revoked certificates.
         await self._certification.require_authority()
+        take_effect()
         row = self._table.take_next(name)
         if row is None:
             raise HostRefusedError(f"{name} has no renewed certificate waiting: renew first")

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.withdrawal import WITHDRAWN, WithdrawnError, awaited
 from appliance.channel.answers.graph_answers import Graph, Topic
 from appliance.channel.messages import GuardTested, GuardTestWanted, MessageSeen, SubscriberReached
 from appliance.control.errors import SenselessError
@@ -213,6 +214,7 @@ def odometry(twist: dict[str, Any]) -> dict[str, Any]:
         ({"/cmd_vel": [NAN]}, "/teleop drives on /cmd_vel"),
         ({"/cmd_vel": [{}]}, "/teleop drives on /cmd_vel"),
         ({"/cmd_vel": [ZERO], "/odom": [odometry(ZERO), odometry(MOVES)]}, "/odom says that the base moves"),
+        ({"/cmd_vel": [ZERO]}, WITHDRAWN),
     ],
 )
 async def test_only_a_robot_that_is_known_to_stand_is_tested(
@@ -245,7 +247,9 @@ async def test_only_a_robot_that_is_known_to_stand_is_tested(
             monitors, orders, {}, graph=graph, relay=relay, trail=trail, store=cast(Any, store)
         )
         if refusal:
-            with pytest.raises(SenselessError, match=re.escape(refusal)):
+            gone = refusal == WITHDRAWN  # its client left while the robot was watched
+            refused = pytest.raises((SenselessError, WithdrawnError), match=re.escape(refusal))
+            with awaited(lambda: gone), refused:
                 await proofs.test(GuardTest("fence"), "eve")
             assert not tested
             return

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from appliance.base import clock
+from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.orders import ActiveAppliance
@@ -106,6 +107,12 @@ async def test_a_slow_link_refuses_the_order_before_anything_is_paused(active: A
     )
     assert active.steps() == ["rehearse"]
     assert active.replication.sender.alone is False
+
+
+async def test_an_order_whose_client_left_during_the_check_pauses_nothing(active: Active) -> None:
+    with awaited(lambda: True), pytest.raises(WithdrawnError):
+        await active.order.hand_over()
+    assert active.steps() == ["rehearse"]
 
 
 async def test_a_silent_witness_refuses_the_order_before_anything_is_paused(active: Active) -> None:
