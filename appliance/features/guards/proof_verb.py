@@ -30,15 +30,15 @@ def test(
     The guard in force, and its state, stay as they are, and no motion is sent. If the copy acts, one stop is written to
     the connection of the base driver. It is printed when its socket has accepted the bytes, and when the TCP of its
     host has acknowledged them; not whether the driver obeys. Rejected while a node drives. Exit status: 0 each copy
-    acted and each stop arrived, 1 not.
+    acted and each stop arrived, 1 not, or no guard is in force.
 
     Example: rosrv guard test estop
     """
     rows = appliance.ask_or_exit(GuardsWanted(presets=False)).guards
-    wanted = names or [row.name for row in rows if row.state not in ("off", "shadow")]
-    if not wanted and not appliance.as_json:
-        say("no guard is in force")
-    proved = True
+    wanted = names or [row.name for row in rows if row.state not in ("off", "shadow", "broken")]
+    if not wanted:
+        typer.echo("no guard is in force, so none was tested: rosrv guard list", err=True)
+    proved = bool(wanted)
     for name in wanted:
         try:
             found = appliance.ask_or_exit(GuardTest(name))
