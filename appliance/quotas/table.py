@@ -548,6 +548,19 @@ NODE_PORTS = QuotaRow(
         "unit/master/endpoints/test_node_ports.py::test_no_host_takes_all_ports",
     ),
 )
+NODES = QuotaRow(
+    thing="nodes: each has one of the ports of `[Ports]`",
+    bounds=Bounds(whole=NODE_PORTS.bounds.whole, host=500, unknown=0, kept=0),
+    at_limit="the registration of one more node is rejected with the reason",
+    between="a node of the host that has ended, was replaced, or was lost longest makes room",
+    alarm="`decision`: the record of the rejected call",
+    setting="limits.nodes_per_host (for a host)",
+    margin=HonestUse(
+        "200 nodes of one machine",
+        200,
+    ),
+    shown_by=("unit/master/graph/test_registry.py::test_the_node_that_was_lost_first_makes_room",),
+)
 NAMES = QuotaRow(
     thing="registrations (topics, services and parameters of nodes)",
     bounds=Bounds(whole=50_000, host=12_500, unknown=0, kept=0),
@@ -605,7 +618,7 @@ QUOTA_ROWS = (
     PARAMETER_BYTES, LARGE_WRITES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
     RELAY_QUEUES, RELAY_LATCHED, RELAY_CONNECTIONS, RELAY_HEADERS, RELAY_TURN, LIMITED_TOPIC, RELAY_MESSAGE,
     DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS,
-    REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,
-    IKE_HANDSHAKES, DESCRIPTORS,
+    REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NODES, NAMES,
+    GRANTS, IKE_HANDSHAKES, DESCRIPTORS,
 )  # fmt: skip
 """Every row of the core, in the order of the page. A test checks that none is missing. Features add rows."""

@@ -11,6 +11,7 @@ from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
+from appliance.quotas.table import NODES, QUOTA_ROWS
 from tests.support.core import FakeTrail
 from tests.support.incarnations import incarnation
 
@@ -48,6 +49,14 @@ def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> Non
     assert (fullest.used, fullest.allowed) == (9, 512 << 20)
     records = rows["bytes of audit records"]
     assert (records.used, records.allowed) == (1024, 4 << 20)
+
+
+def test_the_page_of_quotas_has_each_limit_that_is_shown(tmp_path: Path) -> None:
+    (tmp_path / "control").mkdir()
+    rows = used(tmp_path, {})
+    assert rows["nodes"].host_allowed == NODES.bounds.host
+    on_page = [row.setting.partition(" (")[0] for row in QUOTA_ROWS]
+    assert {row.setting for row in rows.values()} - {*on_page} == {"audit.retention_bytes, or the disk"}
 
 
 def test_a_log_file_that_ends_while_it_is_measured_has_no_size(
