@@ -8,6 +8,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -325,6 +326,14 @@ def project(directory: Path) -> Path:
     for name in ("policies", "monitors"):
         shutil.copytree(ROOT / name, directory / name)
     (directory / "ipsec").mkdir()
+    return directory
+
+
+def project_beside(directory: Path) -> Path:
+    """Make the project of a robot whose nodes run on the machine itself, as docs/install.md says."""
+    page = (ROOT / "docs/install.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^    echo (COMPOSE_FILE=\S+) >> \.env$", page, re.MULTILINE)
+    (project(directory) / ".env").write_text(f"{line}\n")
     return directory
 
 

@@ -10,6 +10,7 @@ from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution.site import BESIDE, pack
+from tests.support.docker import project_beside
 
 ROOT = Path(__file__).parents[2]
 TRUE = Path("/bin/true")
@@ -106,3 +107,14 @@ def test_the_container_closes_the_ports_of_its_machine() -> None:
     options = [found for text in texts for found in re.findall(command, text, re.DOTALL)]
     assert len(options) >= 2
     assert all('--ports "$(' in found and f"< {RANGE_FILE})" in found for found in options), options
+
+
+def test_a_later_command_of_the_pages_keeps_the_files_of_the_robot(tmp_path: Path) -> None:
+    """`-f` would hold for one command only, so the next `up` would start the appliance with another policy."""
+    files = re.search(r"COMPOSE_FILE=(\S+)", (project_beside(tmp_path) / ".env").read_text())
+    assert files is not None
+    assert all((ROOT / file).is_file() for file in files[1].split(":"))
+    texts = {path: path.read_text() for path in (*ROOT.glob("compose*.yaml"), *(ROOT / "docs").rglob("*.md"))}
+    for path, text in texts.items():
+        for options in re.findall(r"docker[ -]compose ((?:-f|--file) .*)", text):
+            assert re.match(r"(-f compose\.standby|--file fleet/compose)\.yaml ", options), (path, options)

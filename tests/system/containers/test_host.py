@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network.scan import scan
-from tests.support.docker import Compose, MachineInside, project
+from tests.support.docker import Compose, MachineInside, project_beside
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
@@ -19,7 +19,7 @@ LOCAL_PORTS = range(32768, 61000)
 
 @pytest.fixture
 def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    compose = site.engine.compose(project(tmp_path), "host", "compose.yaml", "compose.host.yaml")
+    compose = site.engine.compose(project_beside(tmp_path), "host")
     try:
         compose("up", "--detach", "--no-build")
         compose.wait_healthy()
