@@ -176,8 +176,9 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     monitors = status.monitors
     for name in monitors.held:
         why = monitors.why_held.get(name, "a relay was restarted")
-        fix = f"load {monitors.unbuilt[name]}" if name in monitors.unbuilt else f"resume {name}"
-        text = f"topics are held ({name}: {why}): rosrv monitor {fix}"
+        file = monitors.unbuilt.get(name)
+        fix = f"rosrv monitor resume {name}" if file is None else f"rosrv monitor load {file}"
+        text = f"topics are held ({name}: {why}): {fix}"
         yield f"monitor-held:{name}", "monitors", text
     for file, error in monitors.left_out.items():
         text = f"{file} has an error, so nothing of it runs: {error}: rosrv monitor load {file}"
