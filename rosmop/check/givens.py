@@ -75,10 +75,15 @@ def _number(kind: value_types.Type, text: str, position: Position) -> int | floa
 
 
 def with_topics(specification: tree.Specification, given: Mapping[str, str]) -> tree.Specification:
-    topics = {one.name: one.topic for one in specification.givens if isinstance(one, tree.TopicDeclaration)}
-    topics |= {name: topic for name, topic in given.items() if name in topics}
+    topics = _topics(specification, given)
     renamed: tree.Specification = _rename(specification, topics) if topics else specification
     return renamed
+
+
+def _topics(specification: tree.Specification, given: Mapping[str, str]) -> dict[str, str]:
+    declared = [one for one in specification.givens if isinstance(one, tree.TopicDeclaration)]
+    topics = {one.name: given.get(one.name, one.topic) for one in declared}
+    return topics | {one.name: tree.cancelling(topics[one.cancels]) for one in declared if one.cancels}
 
 
 def _rename(node: Any, topics: Mapping[str, str]) -> Any:
@@ -98,10 +103,11 @@ def _rename(node: Any, topics: Mapping[str, str]) -> Any:
 def given_topics(
     shared: CompilationContext, specification: tree.Specification, given: Mapping[str, str]
 ) -> tuple[GivenTopic, ...]:
-    found: dict[str, GivenTopic] = {}
+    topics = _topics(specification, given)
+    found: dict[str, GivenTopic | None] = {}
     for node in specification.givens:
         if isinstance(node, tree.TopicDeclaration):
-            topic = given.get(node.name, node.topic)
+            topic = topics[node.name]
             try:
                 check_topic(topic, node.position)
             except SpecificationError as error:
@@ -109,8 +115,8 @@ def given_topics(
             if node.name in found:
                 text = f"the topic {shown(node.name)} is given twice"
                 shared.findings.append(Diagnostic(node.position, "error", text))
-            found[node.name] = GivenTopic(node.name, topic, node.topic)
-    return tuple(found.values())
+            found[node.name] = None if node.cancels else GivenTopic(node.name, topic, node.topic)
+    return tuple(one for one in found.values() if one is not None)
 
 
 def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:

@@ -20,6 +20,11 @@ def fields_of(node: SyntaxNode) -> list[Any]:
     return [getattr(node, name) for name in node.__dataclass_fields__]
 
 
+def cancelling(goals: str) -> str:
+    """Return the topic that cancels the goals of an action."""
+    return goals.removesuffix("/goal") + "/cancel"
+
+
 def walk(root: object) -> Iterator[SyntaxNode]:
     waiting = [root]
     while waiting:
@@ -460,10 +465,14 @@ class GivenValue(SyntaxNode):
 
 @dataclass(frozen=True)
 class TopicDeclaration(SyntaxNode):
-    """`topic name = /default;`: a topic that a load may replace."""
+    """`topic name = /default;`: a topic that a load may replace.
+
+    One that `cancels` the goals on another topic of the specification follows that topic, and no load gives it.
+    """
 
     name: str
     topic: str
+    cancels: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)

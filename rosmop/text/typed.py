@@ -20,7 +20,6 @@ _GOAL_ID = "actionlib_msgs/GoalID"
 _ALL_GOALS = "all_goals"
 """The variable with the message that cancels all goals of an action."""
 _CANCEL = "cancel"
-_GOAL = "/goal"
 
 
 class _Chosen(NamedTuple):
@@ -370,7 +369,7 @@ def _cancelling(known: tree.Specification, topic: str, name: str) -> tree.Specif
         else event
         for event in known.events
     )
-    cancelled = tree.TopicDeclaration(at, _CANCEL, name.removesuffix(_GOAL) + "/cancel")
+    cancelled = tree.TopicDeclaration(at, _CANCEL, tree.cancelling(name), cancels=topic)
     givens = tuple(
         part for given in known.givens for part in ((given, cancelled) if given.name == topic else (given,))
     )

@@ -465,8 +465,12 @@ class GuardOrders:
         return self._row(name, self._guard(name)[0])
 
     def _guarded_commands(self) -> frozenset[str]:
-        guards = self._guards().values()
-        return frozenset(topics_in(one.text).get("command", "") for one in guards if one.name != "withhold")
+        given = self._monitors.sources.topics
+        return frozenset(
+            (topics_in(one.text) | given.get(name, {})).get("command", "")
+            for name, one in self._guards().items()
+            if one.name != "withhold"
+        )
 
     def _guard(self, name: str) -> tuple[Preset, str]:
         guards = self._guards()
@@ -522,14 +526,12 @@ class GuardOrders:
         file = monitors.checked.monitors[name]
         text = monitors.sources.files[file]
         given = monitors.givens.states(monitors.checked, name)
-        # The topic that cancels goals is not among them: it follows from the goal's.
-        topics = PRESETS[preset.name].given_topics
         return GuardRow(
             name=name,
             preset=preset.name,
             file=file,
             state=self._state(name),
-            topics={one.name: str(one.value) for one in given if one.kind == "topic" and one.name in topics},
+            topics={one.name: str(one.value) for one in given if one.kind == "topic"},
             types=types_in(text),
             given=given,
             loads=loaded_values(text),

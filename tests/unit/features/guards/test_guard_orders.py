@@ -10,6 +10,7 @@ from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph, Node, Publisher, Topic
 from appliance.channel.messages import (
+    GivenValue,
     MonitorEvent,
     MonitorRow,
     MonitorsCounted,
@@ -323,9 +324,10 @@ async def test_the_topic_that_cancels_goals_is_not_one_to_make_the_guard_with(
     monitors: SpecificationManager, orders: GuardOrders
 ) -> None:
     await load(monitors, Guard("fence", PRESETS["estop"], {"command": "/arm/goal"}, {"command": GOAL}))
-    given = {state.name for state in monitors.givens.states(monitors.checked, "fence")}
-    assert "cancel" in given
-    assert (await row(orders)).topics.keys() == PRESETS["estop"].given_topics.keys()
+    given = {
+        state.name for state in monitors.givens.states(monitors.checked, "fence") if state.kind == "topic"
+    }
+    assert given == (await row(orders)).topics.keys() == PRESETS["estop"].given_topics.keys()
 
 
 async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders) -> None:
@@ -534,3 +536,9 @@ async def test_a_new_guard_and_the_list_say_that_the_base_is_on_another_machine(
     assert (await orders.guards(guard_requests.GuardsWanted())).warnings == [warning]
     state = orders.state()
     assert state is not None and state.elsewhere == [warning]
+    given: dict[str, dict[str, GivenValue]] = {"speed": {"command": "/d"}}
+    await monitors.load(
+        admin.MonitorLoad({"speed.rv": monitors.sources.files["speed.rv"]}, given=given), "eve"
+    )
+    orders.placement.look()
+    assert (await orders.guards(guard_requests.GuardsWanted())).warnings == []

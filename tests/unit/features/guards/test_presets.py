@@ -76,6 +76,31 @@ def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) ->
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_a_load_with_other_topics_makes_the_guard_that_a_text_with_them_makes(preset: Preset) -> None:
+    """So it cancels the goals of the base that it observes now, and of no other."""
+    others = {name: f"/other/{name}/goal" for name in preset.given_topics}
+    rows_of_types = covering(filter(_fits, product(*preset.topics.values())))
+    default = tuple(types[0] for types in preset.topics.values())
+    for kinds in (default, *(each for each in rows_of_types if each[0].endswith("ActionGoal"))):
+        types = {
+            topic: kind.replace(ANY_TYPE, "std_msgs/Header")
+            for topic, kind in zip(preset.topics, kinds, strict=True)
+        }
+        text = text_of(Guard("mine", preset, {"command": "/base/goal"}, types))
+        loaded = compiled_from(
+            {"guard.rv": text}, DEFINITIONS, topics={"mine": {"cancel": "/mine", **others}}
+        )
+        made = compiled(text_of(Guard("mine", preset, others, types)))
+        [code], [wanted] = loaded.specifications, made.specifications
+        assert {one.name for one in code.given_topics} == others.keys()
+        assert [event.topic for event in code.events] == [event.topic for event in wanted.events]
+        assert (code.acts_on, [safe.topic for safe in code.safes]) == (
+            wanted.acts_on, [safe.topic for safe in wanted.safes],
+        )  # fmt: skip
+        assert {one.topic for one in loaded.publications} == {one.topic for one in made.publications}
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
 def test_a_declaration_has_the_remark_of_its_line_or_no_meaning(preset: Preset) -> None:
     text = text_of(Guard("mine", preset))
     lines, found = text.splitlines(), remarks(text)
