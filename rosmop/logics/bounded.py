@@ -582,6 +582,10 @@ class BoundedRun:
             and self._at_once == self._compiled.folded.start()
         )
 
+    @property
+    def waiting(self) -> int:
+        return sum(len(operator.rows) for operator in self.operators.values())
+
     def __copy__(self) -> "BoundedRun":
         program = self._compiled.program
         shared = (self._compiled, program, *program.instructions)
@@ -593,7 +597,7 @@ class BoundedRun:
             if deadline is not None and time_ns > deadline:
                 raise ValueError("the deadline has passed: expire the run first")
             self._now = time_ns
-        if sum(len(operator.rows) for operator in self.operators.values()) >= self._compiled.most:
+        if self.waiting >= self._compiled.most:
             raise RunFaultError(f"more than {self._compiled.most} events wait for later events")
         self.place += 1
         self._places = self._compiled.folded.take(self._at_once, event, self._now)

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
+from rosmop.logics.bounded import BoundedRun
 from rosmop.logics.interface import Categories, RunFaultError
 from rosmop.logics.pattern import TimedPattern
 from rosmop.run.explain import Bound, of_slice
@@ -46,6 +47,9 @@ EXPLAINED = 3
 """The most explained verdicts of slices for one message, or one call with deadlines; each takes a millisecond."""
 
 SLICE_SECONDS = 50e-6
+
+STEP_COST = 20
+"""The elements (`ActionState.check`) that each waiting event of a formula about the future counts at a step."""
 
 TICK_BUDGET = 2_000
 
@@ -558,10 +562,12 @@ class MonitorExecution:
         """
         monitor, slices, turn = step.monitor, step.monitor.slices, self._turn
         assert slices is not None  # noqa: S101  the caller checks this
-        found = slices.targets(step.event, key, outcome.time, self._sender.source)
-        if slices.behind:
-            self._catch_up(monitor, slices.behind, outcome)
-            found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        try:
+            found = self._targets(step, slices, key, outcome)
+        except OverBudgetError as error:
+            self._fault(error, monitor, step.event.position, outcome)
+            self._block(monitor, message, outcome)
+            return
         refused, why = slices.refused, slices.why
         before, earlier, lines, published = (
             outcome.events, (outcome.verdicts, outcome.faults), len(turn.log), len(turn.published),
@@ -578,12 +584,11 @@ class MonitorExecution:
                 turn.begin()
                 monitor.context.begin(TICK_BUDGET)
             commits.append(self._in_one(step, slice_, outcome, message, act))
-            if several and message is not None and monitor.context.budget < 0:
+            if several and message is not None and (cut := _over(outcome.faults)):
+                self._cut(monitor, found[: len(commits)])
                 del turn.log[lines:], turn.published[published:]
-                cut = outcome.faults[-1:]
                 outcome.events, (outcome.verdicts, outcome.faults) = before, earlier
                 outcome.faults = (*outcome.faults, *cut)
-                self._copies, self._explains = False, True
                 return
             faults += outcome.faults
             verdicts += outcome.verdicts  # for many slices: a tuple would be copied each time
@@ -606,6 +611,23 @@ class MonitorExecution:
             self.warn(monitor, text)
         if refused is not None and (message is None or not message.dropped):
             self._refuse_slice(step, refused, why, message, outcome)
+
+    def _targets(self, step: Step, slices: Slices, key: Key, outcome: Outcome) -> Sequence[Slice]:
+        found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        if slices.behind:
+            self._catch_up(step.monitor, slices.behind, outcome)
+            found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        return found
+
+    def _cut(self, monitor: MonitorInstance, begun: Sequence[Slice]) -> None:
+        """Undo what a message did to formulas; the runs of other properties are copies, which are not stored."""
+        for slice_ in begun:
+            if (take_back := self._taking_back.pop(id(slice_), None)) is not None:
+                take_back()
+        if monitor.trail and monitor.trail[-1] is self._bound:
+            monitor.trail.pop()
+            self._trailed[monitor] -= 1
+        self._copies, self._explains = False, True
 
     def _in_one(
         self,
@@ -659,7 +681,8 @@ class MonitorExecution:
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
-            running.run = copy(run) if self._copies else run
+            copies = self._copies and not running.code.property.suppresses  # the others have marks
+            running.run = copy(run) if copies else run
         before, monitor.slice = outcome.events, slice_
         act(outcome, message)
         runs = tuple(running.run for running in monitor.properties)
@@ -756,8 +779,10 @@ class MonitorExecution:
                         self._taking_back[id(running.run)] = running.mark()
                     categories = running.history.step(running.run, step.index, time_ns, self._sender)
                 else:
+                    if isinstance(running.run, BoundedRun):
+                        self._turn.check(STEP_COST * running.run.waiting)
                     categories = running.run.step(step.index, time_ns)
-            except RunFaultError as error:
+            except (RunFaultError, OverBudgetError) as error:
                 self._fault(error, step.monitor, running.code.property.source.origin, outcome)
                 self._block(step.monitor, message, outcome)
                 continue
@@ -899,6 +924,10 @@ class MonitorExecution:
                     self._fault(error, monitor, monitor.code.position, outcome)
                     monitor.broken = True
                     beginning.remove(monitor)
+
+
+def _over(faults: Sequence[Fault]) -> list[Fault]:
+    return [fault for fault in faults if fault.over]
 
 
 def _fault_of(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:

@@ -276,7 +276,7 @@ def _monitor(
     )
     monitor = MonitorInstance(code, interpreter.contexts[code.context], properties)
     if code.slicing is not None:
-        monitor.slices = Slices(code, interpreter.variables, slices, holder_of)
+        monitor.slices = Slices(code, interpreter.variables, slices, holder_of, interpreter.turn)
     monitor.safes = {safe.topic: SafeSender(safe) for safe in code.safes}
     steps = [
         Step(

@@ -28,7 +28,7 @@ from typing import Any, cast
 
 from rosmop.form.compiled import EventCode, PropertyCode, SpecificationCode
 from rosmop.form.sites import showing
-from rosmop.logics.bounded import MAX_OPEN_IN_SLICE, BoundedProperty
+from rosmop.logics.bounded import MAX_OPEN_IN_SLICE, BoundedProperty, BoundedRun
 from rosmop.logics.interface import (
     Categories,
     ClockedProperty,
@@ -38,7 +38,7 @@ from rosmop.logics.interface import (
     Run,
 )
 from rosmop.run.slice_quota import Holder, HolderOf, Quota
-from rosmop.runtime.action_context import FOLDED_NS
+from rosmop.runtime.action_context import FOLDED_NS, ActionState
 from rosmop.types import value_types
 from rosmop.types.value_types import Value
 
@@ -49,6 +49,9 @@ GROWING_LIMIT = 1_000
 
 TOGETHER_LIMIT = 250
 """The most slices if an event or a tick may concern all of them: each takes 2 µs, or 12 µs with a verdict."""
+
+COPY_COST = 5_000
+"""The instructions that a copy of a waiting event counts, for a new slice whose formulas begin as those of another."""
 
 MAX_BINDING = 256
 """The most bytes of all strings of a binding together."""
@@ -108,6 +111,7 @@ class Slices:
         namespace: dict[str, Value],
         limit: int,
         holder_of: HolderOf,
+        turn: ActionState,
     ) -> None:
         assert code.slicing is not None  # noqa: S101  the caller checks this
         properties = [declared.property for declared in code.properties]
@@ -126,6 +130,7 @@ class Slices:
         self.behind: list[Slice] = []
         self._code = code
         self._holder_of = holder_of
+        self._turn = turn
         self._namespace = namespace
         self._parameters = code.slicing.parameters
         self._own = code.slicing.own
@@ -319,8 +324,13 @@ class Slices:
                 for declared, run in zip(self._properties, parent.runs, strict=True)
             )
         else:
-            runs = tuple(map(copy, self._looked_at(parent).runs))
+            runs = tuple(map(self._copied, self._looked_at(parent).runs))
         return Slice(domain, key, runs, parent.values, self._holder)
+
+    def _copied(self, run: Run) -> Run:
+        if isinstance(run, BoundedRun):
+            self._turn.check(COPY_COST * run.waiting, COPY_COST * run.waiting)
+        return copy(run)
 
     def _full(self) -> str:
         if self._holder is None:

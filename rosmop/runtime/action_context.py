@@ -125,9 +125,12 @@ class ActionState:
             return False
         return self.clock() + more * _AT_ONCE > self.until
 
-    def check(self, elements: int = 0) -> None:
-        """Raise an error if the time is over; `elements` follow that no instruction is charged for."""
-        if self.late():
+    def check(self, elements: int = 0, ahead: int = 0) -> None:
+        """Raise an error if the time is over, or will be after the instructions `ahead`.
+
+        `elements` follow that no instruction is charged for.
+        """
+        if self.late(ahead):
             raise OverBudgetError(-1, self.too_late)
         self.spent += elements
 

@@ -2,6 +2,7 @@
 
 # ruff: noqa: E501  the rows of tables
 
+from itertools import count
 from random import Random
 
 import pytest
@@ -155,6 +156,52 @@ def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> No
     assert outcome.result == ("dropped" if on_fault == "drop" else "passed")
     assert (len(outcome.faults), outcome.verdicts, [*outcome.log], outcome.events) == (1, (), [], ())
     assert states(monitors) == before
+
+
+WAITING = """goals(std::string id%s) {
+    creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }
+    event stop(%s) /stop std_msgs/%s '{%s}' { }
+    mtl: goal => eventually[0,60s] stop
+    @violation { ROS_WARN("not stopped"); }
+    @validation { ROS_INFO("stopped"); }
+}"""
+
+
+@pytest.mark.parametrize("on_fault", ["drop", "pass"])
+def test_a_message_that_is_cut_ends_no_wait(on_fault: OnFault) -> None:
+    """The events that wait in the slices take the time of a message, and wait on after one that took too long."""
+    compiled = compiled_from({"x.rv": WAITING % ("", "", "Empty", "")}, definitions())
+    cut, free = MonitorSet.of(compiled, on_fault), MonitorSet.of(compiled, on_fault)
+    for monitors in (cut, free):
+        monitors.start(0)
+        for time in range(900):
+            monitors.process("/goal", bytearray(message("std_msgs/String", data="abc"[time % 3])), time)
+    cut.limit_time(count(step=0.02).__next__, 0.001)
+    for time in (900, 901):
+        outcome = cut.process("/stop", b"", time, GUEST)
+        assert [fault.over for fault in outcome.faults] == [True]
+        assert (outcome.result, outcome.events, outcome.verdicts) == ("passed", (), ())
+    cut.limit_time(lambda: 0.0, 0.01)
+    time = 60 * 10**9 + 100
+    for monitors in (cut, free):
+        assert not monitors.process("/goal", bytearray(message("std_msgs/String", data="a")), 902).faults
+    ended = [[one.verdicts for one in monitors.advance(time)] for monitors in (cut, free)]
+    assert ended[0] == ended[1] and len(ended[0]) == 100
+    after = [monitors.process("/stop", b"", time) for monitors in (cut, free)]
+    assert after[0].verdicts == after[1].verdicts and len(after[0].verdicts) == 3
+
+
+def test_a_slice_that_would_copy_too_many_waiting_events_in_the_time_does_not_begin() -> None:
+    text = WAITING % (", int n", "std::string id, int n", "Header", "frame_id:id, seq:n")
+    monitors = begun(text, 1000)
+    for time in range(300):
+        monitors.process("/goal", bytearray(message("std_msgs/String", data="a")), time)
+    stop = message("std_msgs/Header", frame_id="a", seq=1)
+    monitors.limit_time(lambda: 0.0, 0.01)
+    outcome = monitors.process("/stop", bytearray(stop), 300)
+    assert ([fault.over for fault in outcome.faults], outcome.result, live(monitors)) == ([True], "passed", 1)
+    monitors.limit_time(lambda: 0.0, 1)
+    assert (monitors.process("/stop", bytearray(stop), 301).faults, live(monitors)) == ((), 2)
 
 
 def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
