@@ -573,6 +573,7 @@ class MonitorExecution:
             outcome.events, (outcome.verdicts, outcome.faults), len(turn.log), len(turn.published),
         )  # fmt: skip
         events, verdicts, faults = before, [*outcome.verdicts], [*outcome.faults]
+        throttled = {**monitor.context.throttled}
         several, reached = len(found) > 1, 0
         commits: list[Callable[[], None]] = []
         self._copies = several and message is not None
@@ -587,6 +588,7 @@ class MonitorExecution:
             if several and message is not None and (cut := _over(outcome.faults)):
                 self._cut(monitor, found[: len(commits)])
                 del turn.log[lines:], turn.published[published:]
+                monitor.context.throttled = throttled
                 outcome.events, (outcome.verdicts, outcome.faults) = before, earlier
                 outcome.faults = (*outcome.faults, *cut)
                 return
@@ -660,6 +662,7 @@ class MonitorExecution:
         """Run an event in a slice that lacks a parameter, which gets a copy of the message; its output is discarded."""
         turn, explains = self._turn, self._explains
         lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
+        throttled = {**monitor.context.throttled}
         copied = message and WireMessage(
             bytes(message.buffer), message.time, message.channel, altered=message.altered
         )
@@ -667,6 +670,7 @@ class MonitorExecution:
         commit = self._in_slice(monitor, slice_, outcome, copied, act)
         self._explains = explains
         del turn.log[lines:], turn.published[published:]
+        monitor.context.throttled = throttled
         turn.looked, outcome.verdicts, outcome.fatal = looked, (), None
         return commit
 

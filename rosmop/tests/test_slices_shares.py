@@ -158,6 +158,25 @@ def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> No
     assert states(monitors) == before
 
 
+def test_output_that_is_discarded_leaves_its_place_due() -> None:
+    """A slice that lacks a parameter, and a message that is cut, print nothing: what `_ONCE` prints is still to come."""
+    text = """s(std::string id, int n) {
+        event a(std::string id) /a std_msgs/String '{data:id}' { ROS_WARN_ONCE("first"); ROS_WARN_THROTTLE(10, "now"); }
+        event b(int n) /b std_msgs/Int32 '{data:n}' { }
+        event stop(int more) /stop std_msgs/UInt32 '{data:more}' { ROS_INFO_ONCE("stop"); for (int i = 0; i < more; i++) { } }
+    }"""
+    monitors = begun(text, 1000)
+
+    def lines(topic: str, data: bytes, time: int) -> list[str]:
+        return [line.text for line in monitors.process(topic, bytearray(data), time).log]
+
+    a, b, stop = message("std_msgs/String", data="x"), message("std_msgs/Int32", data=1), "std_msgs/UInt32"
+    assert (lines("/a", a, 1), lines("/b", b, 2)) == ([], [])
+    assert (lines("/a", a, 3), lines("/a", a, 4)) == (["first", "now"], [])
+    assert lines("/stop", message(stop, data=400_000), 5) == []
+    assert (lines("/stop", message(stop), 6), lines("/stop", message(stop), 7)) == (["stop"], [])
+
+
 WAITING = """goals(std::string id%s) {
     creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }
     event stop(%s) /stop std_msgs/%s '{%s}' { }
