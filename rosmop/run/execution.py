@@ -951,6 +951,8 @@ def _fault_of(error: Exception, interpreter: Interpreter, monitor: str, otherwis
 def _text(error: Exception) -> str:
     if isinstance(error, FaultError):
         return error.text
+    if isinstance(error, RunFaultError):
+        return str(error)
     if isinstance(error, MalformedError):
         return f"the bytes are not a message of this type: {error}"
     if isinstance(error, struct.error):

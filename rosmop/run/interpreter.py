@@ -409,9 +409,7 @@ class _Maker:
         is_call = bool(node.service)
 
         def run(v: Variables) -> None:
-            out = bytearray()
-            encode(value(v), out)
-            context.publish(topic, kind, bytes(out), site, is_call=is_call)
+            context.publish(topic, kind, _encoded(encode, value(v), site), site, is_call=is_call)
 
         return run
 
@@ -563,12 +561,11 @@ class _Maker:
             for flag, value, encode, at, end in writes:
                 by = v[flag]
                 if by:
-                    out = bytearray()
-                    encode(value(v), out)
+                    out = _encoded(encode, value(v), marks[by.bit_length() - 1])
                     if end is None:
-                        patched.append((at(v), bytes(out), by))
+                        patched.append((at(v), out, by))
                     else:
-                        spliced.append((at(v), v[end], bytes(out), by))
+                        spliced.append((at(v), v[end], out, by))
             for start, new, by in patched:
                 message.patch(start, new, by)
             if spliced:
@@ -847,6 +844,15 @@ class _Maker:
             return wire.whole(v["m"], context, decode, assigned, site)
 
         return whole
+
+
+def _encoded(encode: Callable[[Any, bytearray], None], value: Any, site: int) -> bytes:
+    out = bytearray()
+    try:
+        encode(value, out)
+    except struct.error:  # the seconds and nanoseconds of a time are set one by one
+        raise FaultError(site, "a time or duration is out of range: no message can hold it") from None
+    return bytes(out)
 
 
 def _is_shared(name: str) -> bool:

@@ -1,8 +1,10 @@
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
-from rosmop.tests.acting import fields, load, message
+from rosmop.tests.acting import definitions, fields, load, message
+from rosmop.tests.on_module import on_module
 
 MUX = """mux() { event in(geometry_msgs::Twist t) /joy geometry_msgs/TwistStamped '{twist:t}' {
     PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
@@ -36,6 +38,25 @@ def test_messages_of_timers_are_judged() -> None:
         event e() every 1s { t.linear.x = 9; PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
     [outcome] = load(tick, y=CAP).advance(10**9)
     assert speeds(outcome) == [0.22]
+
+
+@pytest.mark.parametrize("module", [True, False])
+@pytest.mark.parametrize("kind", ["Time", "Duration"])
+def test_a_time_that_no_message_can_hold_is_a_fault_that_says_so(kind: str, module: bool) -> None:
+    """It is not said of the bytes of the message, which are right."""
+    most = {"Time": "4294967295u", "Duration": "2147483647"}[kind]
+    set_parts = f"t.sec = {most}; t.nsec = 2000000000;"
+    for action in (
+        set_parts,
+        f"std_msgs::{kind} m; {set_parts.replace('t.', 'm.data.')} PUBLISH(/q, std_msgs/{kind}, m);",
+    ):
+        text = f"s() {{ event a(ros::{kind} t) /a std_msgs/{kind} '{{data:t}}' {{ {action} }} }}"
+        compiled = compiled_from({"x.rv": text}, definitions())
+        monitors = on_module(compiled, "drop") if module else MonitorSet.of(compiled)
+        monitors.start(0)
+        outcome = monitors.process("/a", message(f"std_msgs/{kind}"), 1)
+        [fault] = outcome.faults
+        assert ("out of range" in fault.text, fault.malformed, outcome.result) == (True, False, "dropped")
 
 
 CHAIN = [
