@@ -15,6 +15,7 @@ from rosmop.learn.series import HighestValues, Series, Statistic, ValueSeries
 from rosmop.learn.topic_orders import TopicOrders, TopicPair
 from rosmop.learn.topics import TopicContent, TopicRhythm
 from rosmop.text.complaints import FORBIDDEN, RESERVED
+from rosmop.text.parser import MAX_CHARACTERS
 from roswire.counted import counted
 
 # Write numbers, strings, names and conditions of `.rv` text.
@@ -89,9 +90,9 @@ def short_names(paths: Iterable[str]) -> dict[str, str]:
     return names
 
 
-_OWN = frozenset(
-    {"now", "elapsed", "before", "begun", "i", "messages", "opened", "message", "stamped", "abs", "isinf"}
-)
+_OWN = frozenset({
+    "now", "elapsed", "before", "begun", "i", "messages", "opened", "message", "stamped", "abs", "isinf",
+})  # fmt: skip
 
 
 # Set a bound beyond the observed values, by extreme value theory on the extremes of independent windows.
@@ -141,6 +142,9 @@ QUIET_HOURS = 10.0
 MAX = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
 """The most conditions of a kind for one topic. Other kinds have at most one for each field."""
 
+_LONGEST = MAX_CHARACTERS // 4
+"""The most characters of one topic's conditions, which are in one file even if some are widened."""
+
 _FEWEST = 20  # the minimum number of messages for a statement about all messages
 _FEWEST_SET = 10
 _ALWAYS_CHANGING = 0.5  # the fraction of messages with a changed value
@@ -187,6 +191,12 @@ class Candidate:
         return self.topic, self.kind, self.path, self.element
 
     @property
+    def size(self) -> int:
+        """About the number of characters in the text."""
+        names = self.condition.count("{v}") + 12
+        return 300 + len(self.condition) + len(self.seen) + names * len(self.path)
+
+    @property
     def topics(self) -> set[str]:
         return {topic for topic, _ in self.events.values()} | {self.topic}
 
@@ -221,9 +231,12 @@ class LearntFacts:
         self.trimmed.clear()
         for topic in sorted(self.contents):
             found: Counter[str] = Counter()
+            room = _LONGEST
             for candidate in proposer.of_topic(topic):
                 found[candidate.kind] += 1
-                if found[candidate.kind] <= MAX.get(candidate.kind, len(self.fields[topic])):
+                most = MAX.get(candidate.kind, len(self.fields[topic]))
+                if found[candidate.kind] <= most and candidate.size <= room:
+                    room -= candidate.size
                     yield candidate
                 else:
                     self.trimmed[topic] += 1

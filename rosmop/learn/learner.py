@@ -40,10 +40,12 @@ from rosmop.learn.passes import (
     Run,
     TimeFacts,
     TimeStep,
+    named_files,
 )
 from rosmop.learn.recordings import LearnedSpan, LearningError, RecordingFacts, split
 from rosmop.learn.topic_orders import TopicOrders
 from rosmop.learn.topics import MAX_GAPS, TopicContent, TopicRhythm
+from rosmop.text.parser import MAX_CHARACTERS
 from roswire.counted import counted
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
@@ -217,9 +219,9 @@ _WINDOWS = 24  # the minimum number for all recordings together
 
 @dataclass(frozen=True)
 class LearningResult:
-    """The learnt specifications as text, their candidates, and the candidates that were left out."""
+    """The learnt specifications as the texts of files, their candidates, and the candidates that were left out."""
 
-    text: str
+    texts: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     left_out: tuple[Candidate, ...]
     names: dict[tuple[str, str, str, int | None], str]
@@ -228,6 +230,20 @@ class LearningResult:
     held_out: tuple[LearnedSpan, ...]
     skipped: tuple[str, ...]
     failed: Mapping[int, str]
+
+    @property
+    def text(self) -> str:
+        return "".join(self.texts)
+
+
+def packed(pieces: Iterable[str]) -> tuple[str, ...]:
+    """Return as few texts as fit in files, with these pieces in their order."""
+    texts = [""]
+    for piece in pieces:
+        if len(texts[-1]) + len(piece) > MAX_CHARACTERS:
+            texts.append("")
+        texts[-1] += piece
+    return tuple(texts)
 
 
 def learn(
@@ -280,10 +296,10 @@ class _Learner:
             )
         rows = list(specifications(kept, whole))
         names = {candidate.key: name for name, _, group in rows for candidate in group}
-        text = "\n".join([self._head(whole, kept, left_out), *(row[1] for row in rows)])
-        compiled_from({"learnt.rv": text}, self._definitions)
+        texts = packed([*self._head(whole, kept, left_out), *(f"\n{row[1]}" for row in rows)])
+        compiled_from(named_files(texts), self._definitions)
         return LearningResult(
-            text,
+            texts,
             tuple(kept),
             tuple(left_out),
             names,
@@ -363,13 +379,15 @@ class _Learner:
             name: [(numbers[candidate.key], f"{candidate.topic} {candidate.says}") for candidate in group]
             for name, _, group in rows
         }
-        text = "\n".join(row[1] for row in rows)
+        texts = packed(f"\n{row[1]}" for row in rows)
         held_out = range(len(self._trained), len(self._parts))
-        steps = [AlarmStep(*self._span(place), text=text, says=says) for place in held_out]
+        steps = [AlarmStep(*self._span(place), texts=texts, says=says) for place in held_out]
         alarms: AlarmFacts = self._pass(steps, AlarmFacts())[1]
         return alarms
 
-    def _head(self, known: LearntFacts, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
+    def _head(
+        self, known: LearntFacts, kept: Sequence[Candidate], left_out: Sequence[Candidate]
+    ) -> Iterator[str]:
         seconds = sum(part.seconds for part in self._trained)
         held = sum(part.seconds for part in self._held_out)
         lines = [
@@ -394,12 +412,12 @@ class _Learner:
         lines += [f"Not, or only partly, learnt from: {text}" for _, text in sorted(self._failed.items())]
         lines += [f"Not looked at: {text}" for text in self._skipped]
         lines += [
-            f"{count} conditions more on {topic} are not here: they are many"
+            f"{count} conditions more on {topic} are not here: they are many, or long"
             for topic, count in known.trimmed.items()
         ]
         if known.orders.left_out:
             lines.append(f"Not compared with other topics: {', '.join(known.orders.left_out)}")
-        return "".join(f"// {one_line(line)}\n" for line in lines)
+        return (f"// {one_line(line)}\n" for line in lines)
 
 
 def _names(parts: Sequence[LearnedSpan]) -> str:

@@ -18,6 +18,11 @@ from rosmop.run.outcomes import Outcome
 from roswire.definitions import Definitions
 
 
+def named_files(texts: Sequence[str], stem: str = "learnt", suffix: str = ".rv") -> dict[str, str]:
+    """Return texts by the names of their files: `learnt.rv`, `learnt_2.rv`, …"""
+    return {f"{stem}_{n}{suffix}" if n > 1 else f"{stem}{suffix}": text for n, text in enumerate(texts, 1)}
+
+
 class LearningStep(msgspec.Struct, frozen=True, tag=True):
     """The part of a recording from `began` to `ended` (nanoseconds), and the topics to read.
 
@@ -54,7 +59,7 @@ class ContentStep(LearningStep, frozen=True):
 class AlarmStep(LearningStep, frozen=True):
     """Runs the learnt specifications. `says` has a candidate's number and how its warning begins, by monitor."""
 
-    text: str
+    texts: tuple[str, ...]
     says: dict[str, list[tuple[int, str]]]
 
 
@@ -131,7 +136,7 @@ def _contents(step: ContentStep, source: RecordingSource, definitions: Definitio
 
 def _alarms(step: AlarmStep, source: RecordingSource, definitions: Definitions) -> AlarmFacts:
     found: dict[int, int] = {}
-    monitors = MonitorSet.of(compiled_from({"learnt.rv": step.text}, definitions))
+    monitors = MonitorSet.of(compiled_from(named_files(step.texts), definitions))
     monitors.start(step.began, frozenset(source.topics))
     for (topic, time, data), _window in step.messages(source):
         outcome = monitors.process(topic, data, time)

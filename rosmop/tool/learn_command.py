@@ -9,7 +9,16 @@ from pathlib import Path
 from rosmop.batch.jobs import Failure, LearnJob, Survey, SurveyJob, definitions_by_type
 from rosmop.batch.recording_list import RecordingName
 from rosmop.learn.learner import LearningResult, learn
-from rosmop.learn.passes import AlarmFacts, AnyStep, ContentFacts, ContentStep, Facts, TimeFacts, TimeStep
+from rosmop.learn.passes import (
+    AlarmFacts,
+    AnyStep,
+    ContentFacts,
+    ContentStep,
+    Facts,
+    TimeFacts,
+    TimeStep,
+    named_files,
+)
 from rosmop.learn.recordings import LearningError
 from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
@@ -122,10 +131,16 @@ def _show(
         for row in rows:
             say_json(row)
     elif out is None:
-        sys.stdout.write(learnt.text)
+        for number, text in enumerate(learnt.texts, 1):
+            if number > 1:
+                sys.stdout.write(
+                    f"\n// Too long for one file: file {number} begins here; --output writes all.\n"
+                )
+            sys.stdout.write(text)
     else:
         conditions, names = counted(len(learnt.candidates), "condition"), set(learnt.names.values())
-        say(f"{conditions} in {counted(len(names), 'specification')}: {out}")
+        files = ", ".join(map(str, _files(out, learnt)))
+        say(f"{conditions} in {counted(len(names), 'specification')}: {files}")
         widened = sum(1 for candidate in learnt.candidates if candidate.widened)
         if learnt.held_out:
             say(f"alarms on the held-out part: {widened} widened, {len(learnt.left_out)} left out")
@@ -142,8 +157,16 @@ def _rows(learnt: LearningResult) -> Iterator[dict[str, object]]:
             }  # fmt: skip
 
 
+def _files(out: Path, learnt: LearningResult) -> dict[Path, str]:
+    named = named_files(learnt.texts, out.stem, out.suffix)
+    return {out.with_name(name): text for name, text in named.items()}
+
+
 def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded: Definitions) -> None:
-    files = {out: learnt.text}
+    files = _files(out, learnt)
+    for path in files:
+        if path.exists():
+            raise program.usage_error(f"{path} already exists: name a new file with --output")
     for name in _needed(learnt, recorded):
         path = out.parent / BESIDE / f"{name}.msg"
         text = recorded.message(name).text

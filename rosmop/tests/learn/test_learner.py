@@ -8,7 +8,7 @@ import pytest
 
 from rosmop.check.sources import compiled_from
 from rosmop.learn.learner import LearningResult, learn
-from rosmop.learn.passes import run_here
+from rosmop.learn.passes import named_files, run_here
 from rosmop.learn.recordings import LearningError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
@@ -197,6 +197,25 @@ def test_omitted_conditions_are_listed() -> None:
     assert (kinds.count("range"), kinds.count("length")) == (10, 4)
     assert re.search(r"^// \d+ conditions more on /arm are not here", learnt.text, re.MULTILINE)
     assert "// Nothing was held out: it is untested." in learnt.text
+
+
+def test_what_is_too_long_for_one_file_is_in_several() -> None:
+    """A condition that is too long for a file, such as that a robot's description is always the same, is left out."""
+    texts = {f"/part{number}": "x" * 12_000 for number in range(14)} | {"/robot_description": "y" * 100_000}
+    rows = tuple(
+        (topic, START + second * 10**9 + place, message("std_msgs/String", data=text))
+        for second in range(30)
+        for place, (topic, text) in enumerate(texts.items())
+    )
+    learnt = learnt_from([Recorded("r", rows, dict.fromkeys(texts, "std_msgs/String"))], 0.3)
+    files = named_files(learnt.texts)
+    assert [*files] == ["learnt.rv", "learnt_2.rv"]
+    for name, text in files.items():
+        assert not compiled_from({name: text}, standard_definitions()).warnings
+    assert {row.topic for row in learnt.candidates if row.kind == "constant"} == texts.keys() - {
+        "/robot_description"
+    }
+    assert "// 1 conditions more on /robot_description are not here: they are many, or long" in learnt.text
 
 
 def test_numbers_of_any_size_give_a_valid_specification() -> None:
