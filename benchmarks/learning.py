@@ -44,6 +44,7 @@ Row = tuple[str, int, bytes]
 class Drive:
     name: str
     rows: tuple[Row, ...]
+    caller: str = ""
 
     @property
     def began(self) -> int:

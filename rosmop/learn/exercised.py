@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
-from rosmop.form.findings import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.learn.recordings import RecordingSource
 from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.fsm import FAIL, TIMEOUT, StateText, read_state_machine
-from rosmop.logics.interface import Categories, CompiledProperty, Run, Source
+from rosmop.logics.interface import Categories, CompiledProperty, FormulaError, Run, Source
 from rosmop.run.engine import MonitorSet
 from rosmop.run.explain import history_of
+from rosmop.run.outcomes import MessageSender
 from rosmop.text import tree
 from rosmop.text.parser import parse
 from roswire.definitions import Definitions
@@ -35,7 +36,11 @@ class CoverageItem:
 
 
 def items_of(texts: Mapping[str, str]) -> list[CoverageItem]:
-    return _items(_marked(texts))
+    """Return the items in their order. Raises `SpecificationError`."""
+    try:
+        return _items(_marked(texts))
+    except FormulaError as error:
+        raise SpecificationError(error.findings) from error
 
 
 def covered(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
@@ -50,9 +55,10 @@ def covered(texts: Mapping[str, str], definitions: Definitions, recording: Recor
     # explaining a verdict makes test runs, which are not part of the recording
     monitors.explain_when(lambda *_: False, lambda *_: False)
     watches = _watch(monitors)
+    monitors.name_senders(lambda _source: ("", recording.caller))
     monitors.start(recording.began, frozenset(recording.topics))
-    for topic, time, data in recording.messages():
-        monitors.process(topic, data, time)
+    for number, (topic, time, data) in enumerate(recording.messages(), 1):
+        monitors.process(topic, data, time, MessageSender(number))
     for monitor in monitors.monitors:
         for name, item in marked.items.items():
             if item.specification == monitor.name:
@@ -268,7 +274,9 @@ def _machine_items(file: tree.SpecificationFile) -> Iterator[CoverageItem]:
         for declared in node.properties:
             logic = declared.logic.lower()
             if LOGICS[logic].has_states:
-                source = Source(logic, declared.formula, names, declared.formula_position)
+                source = Source(
+                    logic, declared.formula, names, declared.formula_position, times=dict(declared.times)
+                )
                 for name, state in read_state_machine(source, timed=logic == "tfsm").states.items():
                     yield _state(node.name, source, name)
                     for event in state.moves:

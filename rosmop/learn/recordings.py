@@ -29,6 +29,10 @@ class RecordingFacts(Protocol):
 
 
 class RecordingSource(RecordingFacts, Protocol):
+    @property
+    def caller(self) -> str:
+        """Return the caller id of the sender of the message that `messages` has just yielded."""
+
     def messages(self) -> Iterator[Received]:
         """Yield messages in order of time; each call starts again."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import zstandard
 from mcap.exceptions import McapError
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
 from rosbags.rosbag1 import ReaderError
 
 from rosmop.recordings.bounded_bag import BoundedReader
@@ -80,6 +80,11 @@ def definitions_of(reader: Reader) -> Definitions:
     return Definitions(found)
 
 
+def sender_of(connection: Connection) -> ConnectionExtRosbag1:
+    assert isinstance(connection.ext, ConnectionExtRosbag1)  # noqa: S101  the readers make no other connections
+    return connection.ext
+
+
 def fits(topic: str, patterns: Sequence[str]) -> bool:
     return any(fnmatchcase(topic, pattern) for pattern in patterns)
 
@@ -94,6 +99,7 @@ class RecordedFile:
         self._path = path
         self.name = name or path.name
         self.topics: dict[str, str] = {}
+        self.caller = ""
         with closing(open_recording(path)) as reader:
             self.began, self.ended = reader.start_time, reader.end_time - 1
             self.message_count = reader.message_count
@@ -112,4 +118,5 @@ class RecordedFile:
         with closing(open_recording(self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:
+                    self.caller = sender_of(connection).callerid or ""
                     yield connection.topic, time_ns, data

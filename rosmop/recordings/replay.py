@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag1
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer
 from rosbags.rosbag1.writer import WriterError
 
-from rosmop.recordings.recording import Reader, RecordingError, fits, messages_of, ros_type
+from rosmop.recordings.recording import Reader, RecordingError, fits, messages_of, ros_type, sender_of
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import DROPPED, MessageSender, Outcome, Verdict, bound
 from roswire.definitions import Definitions
@@ -65,7 +65,7 @@ class OutputBag:
 
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
         sent = connection.topic, connection.msgtype, connection.msgdef.data, connection.digest
-        self._write((*sent, *_sender(connection)), time_ns, data, published=False)
+        self._write((*sent, *sender_of(connection)), time_ns, data, published=False)
 
     def publish(self, outcome: Outcome) -> None:
         for message in (one for one in outcome.sent() if not one.is_call):
@@ -87,11 +87,6 @@ class OutputBag:
         self._writer.write(self._connections[header], time_ns, data)
 
 
-def _sender(connection: Connection) -> ConnectionExtRosbag1:
-    assert isinstance(connection.ext, ConnectionExtRosbag1)  # noqa: S101  the readers make no other connections
-    return connection.ext
-
-
 def replay(
     monitors: MonitorSet,
     reader: Reader,
@@ -107,7 +102,7 @@ def replay(
     refusals = {
         connection.id: _refusal(monitors, connection)
         for connection in reader.connections
-        if fits(connection.topic, topics) and _sender(connection).callerid != _OWN
+        if fits(connection.topic, topics) and sender_of(connection).callerid != _OWN
     }
     expected = frozenset(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
@@ -121,7 +116,7 @@ def replay(
             continue
         if not begun:
             started, begun = monitors.start(time_ns, expected), True
-        selection.now, caller.name = time_ns, _sender(connection).callerid or ""
+        selection.now, caller.name = time_ns, sender_of(connection).callerid or ""
         outcome = _outcome(
             monitors, connection, time_ns, data, refusals[connection.id], MessageSender(index + 1)
         )

@@ -1,9 +1,12 @@
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
+from rosbags.rosbag1 import Writer
 
 from rosmop.form.findings import SpecificationError
 from rosmop.learn.exercised import CoverageItem, covered, items_of, merged
+from rosmop.recordings.recording import RecordedFile
 from rosmop.tests.acting import message
 from rosmop.tests.learn.test_learner import START, Recorded
 from roswire.standard import standard_definitions
@@ -107,6 +110,44 @@ def test_a_timeout_is_a_transition() -> None:
     assert counts["transition late: default -> late"] == 1
     assert counts["transition late: timeout -> idle"] == 0
     assert counts["handler @late"] == 2
+
+
+def test_a_given_time_is_that_of_a_timeout() -> None:
+    text = """preset quiet 1 as quiet { after = 2s; }
+quiet() given { time after = 4s; } {
+    event a() /a std_msgs/Int32 '{}' { }
+    tfsm: idle [ a -> busy, default idle ] busy [ timeout after -> late ] late [ default late ]
+    @late { ROS_WARN("late"); }
+}
+"""
+    recording = recorded("a", [("/a", 0), ("/c", 0), ("/c", 0), ("/c", 0), ("/a", 0)])
+    counts = {f"{item.kind} {item.what}": count for item, count in counted(text, [recording]).items()}
+    assert (counts["transition busy: timeout -> late"], counts["transition late: default -> late"]) == (1, 1)
+
+
+def test_a_branch_by_caller_is_counted(tmp_path: Path) -> None:
+    text = """gate() { event open(int x) /open std_msgs/Int32 '{data:x}' {
+        if (caller(open) == "/pad") { ROS_INFO("by hand"); }
+    } }"""
+    with Writer(tmp_path / "a.bag") as bag:
+        for number, caller in enumerate(("/pad", "/planner", None)):
+            known = standard_definitions()
+            text_and_sum = known.full_text("std_msgs/Int32"), known.md5sum("std_msgs/Int32")
+            place = bag.add_connection(
+                "/open", "std_msgs/msg/Int32", msgdef=text_and_sum[0], md5sum=text_and_sum[1], callerid=caller
+            )
+            bag.write(place, START + number, message("std_msgs/Int32"))
+    found = covered({"gate.rv": text}, standard_definitions(), RecordedFile(tmp_path / "a.bag", ["*"]))
+    named = zip(items_of({"gate.rv": text}), found, strict=True)
+    assert {item.what: count for item, count in named if item.kind == "branch"} == {"if": 1, "else": 2}
+
+
+@pytest.mark.parametrize("wrong", ["e -> nowhere", "e => idle"])
+def test_a_wrong_formula_is_refused_with_its_position(wrong: str) -> None:
+    text = f"s() {{ event e() /e std_msgs/Int32 '{{}}' {{ }}\n fsm: idle [ {wrong} ]\n @idle {{ }} }}"
+    with pytest.raises(SpecificationError) as caught:
+        counted(text, [recorded("a", [("/e", 0)])])
+    assert [finding.position.line for finding in caught.value.findings] == [2]
 
 
 def test_an_error_is_that_of_the_text() -> None:

@@ -29,6 +29,7 @@ class Recorded:
     name: str
     rows: tuple[Row, ...]
     topics: Mapping[str, str]
+    caller: str = ""
 
     @property
     def began(self) -> int:
