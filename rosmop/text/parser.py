@@ -240,7 +240,7 @@ CALL.3: /CALL(?=<GAP>*\(<GAP>*["\/~])/
 SERVICE.5: /service(?!\w)/
 EVERY.5: /every(?!\w)/
 SERVICE_PART.5: /(request|response)(?!\w)/
-TOPIC.2: /[~\/]?[A-Za-z_][\w]*(\/\w+)*\/?/
+TOPIC.2: /\/\w+(\/\w+)*\/?|~?[A-Za-z_]\w*(\/\w+)*\/?/
 MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<GAP>+[A-Za-z_])/
     | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,{]|<GAP>+(request|response)(?!\w))/
 DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/

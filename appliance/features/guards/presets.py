@@ -23,7 +23,7 @@ from rosmop.types.roles import ANY_TYPE, types_of_roles
 FOLDER = SHIPPED / "monitors" / "guards"
 
 _NAME = re.compile(r"[A-Za-z_]\w{0,63}", re.ASCII)
-_TOPIC = re.compile(r"/[A-Za-z]\w*+(?:/[A-Za-z]\w*+)*+", re.ASCII)
+_TOPIC = re.compile(r"(?:/\w++)++", re.ASCII)
 _TYPE = re.compile(r"[A-Za-z]\w*+/[A-Za-z]\w*+", re.ASCII)
 _WHOLE = re.compile(r"[-+]?\d++", re.ASCII)
 _DECIMAL = re.compile(r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?", re.ASCII)

@@ -6,6 +6,7 @@ from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
 from rosmop.text.builder import TreeBuilder
 from rosmop.text.parser import MAX_CHARACTERS, _parser, parse
+from roswire.names import is_global_name
 
 
 def parsed(text: str) -> tree.Specification:
@@ -55,6 +56,32 @@ def test_the_head_of_a_specification(head: str, name: str, modifiers: tuple[str,
     found = parsed(f"{head} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
     assert found.name == name
     assert tuple(modifier.parts[0] for modifier in found.modifiers) == modifiers
+
+
+@pytest.mark.parametrize(
+    "topic", ["/1", "/1/cmd_vel", "/robots/1/cmd_vel", "/robot/_x", "/_x", "/9to5/2e3", "/a"]
+)
+def test_every_global_name_is_a_topic(topic: str) -> None:
+    assert is_global_name(topic)
+    found = parsed(
+        f"""preset s 1 as s {{ given_one = {topic}; }} s() given {{ topic given_one = /b; topic other={topic}; }} {{
+        std_msgs::Empty m; bool quiet; safe std_msgs/Empty {{ }} on {topic} every 1s; withhold {topic} from "10.0.0.1" while quiet;
+        event e(int n) {topic} std_msgs/Int32 '{{data:n}}' {{ PUBLISH({topic}, std_msgs/Empty, m); n = n /1 + 8 /2/n; }}
+        event c() service {topic} std_srvs/Empty request '{{}}' {{ CALL({topic}, std_srvs/Empty, m); }} }}"""
+    )
+    assert [given.topic for given in found.givens if isinstance(given, tree.TopicDeclaration)] == [
+        topic,
+        topic,
+    ]
+    triggers = [event.trigger for event in found.events]
+    assert [one.topic for one in triggers if isinstance(one, tree.MessageTrigger)] == [topic, topic]
+    assert [safe.topic for safe in found.safes] == [topic]
+    assert [node.topic for node in tree.walk(found) if isinstance(node, tree.PublishStatement)] == [topic]
+    assert [node.service for node in tree.walk(found) if isinstance(node, tree.CallStatement)] == [topic]
+    assert (
+        sum(isinstance(node, tree.BinaryExpression) and node.operator == "/" for node in tree.walk(found))
+        == 3
+    )
 
 
 def test_several_specifications_in_a_file() -> None:

@@ -273,6 +273,14 @@ def test_a_preset_has_its_place_in_the_order_and_on_the_page() -> None:
         assert section.count(f"\n| `{name}` |") == 2, f"{name}: add a row to both tables of docs/guards.md"
 
 
+@pytest.mark.parametrize("topic", ["/1/cmd_vel", "/robots/1/cmd_vel", "/robot/_x"])
+def test_a_guard_of_a_robot_with_a_number_is_made(topic: str) -> None:
+    text = text_of(Guard("fast", PRESETS["speed"], {"command": topic}))
+    assert (topics_in(text)["command"], *compiled(text).specifications[0].acts_on) == (topic, topic)
+    with pytest.raises(GuardError, match="not the name of a topic"):
+        text_of(Guard("fast", PRESETS["speed"], {"command": f"{topic}/"}))
+
+
 def test_a_mistyped_type_is_answered_with_the_nearest() -> None:
     guard = Guard(
         "speed", PRESETS["speed"], {"command": "/cmd_vel"}, types={"command": "geometry_msgs/Twits"}
