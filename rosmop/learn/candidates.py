@@ -32,7 +32,7 @@ WORDS = frozenset(FORBIDDEN) | RESERVED
 def rounded_up(value: float, width: float) -> str:
     if not width > 0:
         return number(value)
-    quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
+    quantum = Decimal(1).scaleb(math.floor(math.log10(max(width / 100, 5e-324))))
     return number(float(Decimal(value).quantize(quantum, ROUND_CEILING)))
 
 
@@ -84,6 +84,7 @@ def short_names(paths: Iterable[str]) -> dict[str, str]:
             others = (other for other in paths if other != path)
             if count == len(steps) or not any(other == end or other.endswith("." + end) for other in others):
                 name = "_".join(steps[-count:])
+                name = f"n{name}" if name[0].isdigit() else name
                 taken = name in WORDS or name in names.values() or name in _OWN
                 names[path] = f"{name}_field" if taken else name
                 break
@@ -92,6 +93,7 @@ def short_names(paths: Iterable[str]) -> dict[str, str]:
 
 _OWN = frozenset({
     "now", "elapsed", "before", "begun", "i", "messages", "opened", "message", "stamped", "abs", "isinf",
+    "MESSAGE", "vector", "numeric_limits", "true", "false",
 })  # fmt: skip
 
 

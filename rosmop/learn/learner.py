@@ -270,9 +270,18 @@ class _Learner:
                 self._skipped.append(f"{topic} ({kind}): not a valid name")
                 continue
             try:
-                self._fields[topic] = Fields(definitions.layout(kind)).types
+                found = Fields(definitions.layout(kind)).types
             except DefinitionError as error:
                 self._skipped.append(f"{topic} ({kind}): {error}")
+                continue
+            self._fields[topic] = {
+                path: of for path, of in found.items() if not WORDS.intersection(path.split("."))
+            }
+            self._skipped += [
+                f"{path} of {topic} ({kind}): specifications cannot name it, as they have this word"
+                for path in found
+                if path not in self._fields[topic]
+            ]
 
     def learnt(self) -> LearningResult:
         tested, whole = self._facts()

@@ -3,15 +3,18 @@ import random
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from struct import pack
 
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.learn.candidates import WORDS
 from rosmop.learn.learner import LearningResult, learn
 from rosmop.learn.passes import named_files, run_here
 from rosmop.learn.recordings import LearningError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
+from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 
 START = 1_700_000_000 * 10**9
@@ -217,6 +220,27 @@ def test_what_is_too_long_for_one_file_is_in_several() -> None:
         "/robot_description"
     }
     assert "// 1 conditions more on /robot_description are not here: they are many, or long" in learnt.text
+
+
+def test_names_that_ros_allows_give_a_valid_specification() -> None:
+    """Fields may have words of the language, which no pattern names: they are left out, and told."""
+    words = [*sorted(WORDS - {"__RESET"}), "MESSAGE", "vector", "numeric_limits", "true", "false", "x"]
+    definitions = standard_definitions().extended(
+        Definitions.from_files({"own/Words.msg": "".join(f"float64 {word}\n" for word in words)})
+    )
+    chance = random.Random(5)  # noqa: S311  no secret
+    kinds = dict.fromkeys(("/1/words", "/robot/1", "/other/2", "/robot/_x"), "own/Words")
+    rows = tuple(
+        (topic, START + tick * 10**8, pack(f"<{len(words)}d", *(chance.choice([0, 5e-324]) for _ in words)))
+        for tick in range(200)
+        for topic in kinds
+    )
+    recorded = Recorded("r", rows, kinds)
+    learnt = learn([recorded], definitions, 0.3, run_here([recorded], definitions))
+    compiled_from({"learnt.rv": learnt.text}, definitions)
+    named = {(row.topic, row.path) for row in learnt.candidates if row.path in words}
+    assert named == {(topic, word) for topic in kinds for word in words if word not in WORDS}
+    assert "// Not looked at: new of /robot/1 (own/Words): specifications cannot name it" in learnt.text
 
 
 def test_numbers_of_any_size_give_a_valid_specification() -> None:
