@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import NameOID
 
 from appliance.base import clock
-from appliance.base.shipped import certainly_past, earliest_now
+from appliance.base.shipped import earliest_now
 
 _EARLIER = datetime.timedelta(days=1)  # the peer's clock may be behind
 
@@ -24,7 +24,7 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
     private = ec.generate_private_key(ec.SECP256R1())
     public = private.public_key()
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    begin = datetime.datetime.fromtimestamp(certainly_past(), datetime.UTC) - _EARLIER
+    now = clock.utc_now()
     until = datetime.datetime.fromtimestamp(earliest_now(), datetime.UTC) + datetime.timedelta(days=days)
     usage = x509.KeyUsage(True, False, False, False, False, True, False, False, False)
     builder = x509.CertificateBuilder(
@@ -32,7 +32,7 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
         subject,
         public,
         x509.random_serial_number(),
-        begin,
+        now - _EARLIER,
         until,
     )
     extensions: list[tuple[x509.ExtensionType, bool]] = [

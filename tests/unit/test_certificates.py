@@ -72,7 +72,9 @@ def test_a_certificate_of_the_time_before_is_valid_when_the_clock_is_set(
 def test_a_certificate_of_a_clock_that_was_ahead_is_valid_when_it_is_set(
     maker: str, days: float, tmp_path: Path
 ) -> None:
-    """REST makes another one within a minute. `rosrv status` names a host whose certificate is not valid yet."""
+    """REST makes another one within a minute. `rosrv status` names a host whose certificate is not valid yet, and the
+    collector refuses to let such a robot join.
+    """
     with clock.using(machine := VirtualClock(wall=BUILT + days * 86_400.0)):
         made = MADE[maker](tmp_path)
         machine.set_wall(BUILT + 86_400.0)
@@ -84,9 +86,10 @@ def test_a_certificate_of_a_clock_that_was_ahead_is_valid_when_it_is_set(
             made = [(tmp_path / CERTIFICATE).read_bytes()]
         read = [x509.load_pem_x509_certificate(one) for one in made]
         late = [one for one in read if not one.not_valid_before_utc <= now < one.not_valid_after_utc]
-        assert [one.subject.rfc4514_string() for one in late] == (
-            ["CN=a,O=ROSRV"] if maker == "appliance/ipsec/certificate_authority.py" else []
-        )
+        assert [one.subject.rfc4514_string() for one in late] == {
+            "appliance/ipsec/certificate_authority.py": ["CN=a,O=ROSRV"],
+            "appliance/signing/own_certificate.py": ["CN=robot"],
+        }.get(maker, [])
 
 
 def test_the_certificate_of_rest_stays_when_the_clock_is_set(tmp_path: Path) -> None:
