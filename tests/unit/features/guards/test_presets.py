@@ -87,10 +87,12 @@ def test_a_load_with_other_topics_makes_the_guard_that_a_text_with_them_makes(pr
             for topic, kind in zip(preset.topics, kinds, strict=True)
         }
         text = text_of(Guard("mine", preset, {"command": "/base/goal"}, types))
-        loaded = compiled_from(
-            {"guard.rv": text}, DEFINITIONS, topics={"mine": {"cancel": "/mine", **others}}
-        )
-        made = compiled(text_of(Guard("mine", preset, others, types)))
+        loaded, made = (
+            compiled_from({"guard.rv": one}, DEFINITIONS, lints=False, topics={"mine": topics})
+            for one, topics in (
+                (text, {"cancel": "/mine", **others}), (text_of(Guard("mine", preset, others, types)), {}),
+            )
+        )  # fmt: skip
         [code], [wanted] = loaded.specifications, made.specifications
         assert {one.name for one in code.given_topics} == others.keys()
         assert [event.topic for event in code.events] == [event.topic for event in wanted.events]
