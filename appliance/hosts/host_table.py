@@ -226,7 +226,7 @@ class HostTable:
         if certificate is None or certificate.next is None:
             return None
         following = certificate.next
-        # It was made for the life of the one before. The present time is none of its life: a host may be late.
+        # It was made for as long as the one before, counted from then: a host may confirm it much later.
         made = following.expires - (row.expires - certificate.made)
         with self._kept.together():
             self.revoked.add(name, row.serial, row.expires)

@@ -172,7 +172,7 @@ def protection(
 def through_tunnel_only(appliance: str) -> str:
     """Return the nftables file of a host with a tunnel: what this address sends or gets in clear text is dropped.
 
-    The hooks are those that every packet passes, also one that this machine forwards, with its address on the wire.
+    Its hooks see every packet with its address on the wire, even one that this machine forwards.
     """
     keyword = "ip" if ipaddress.ip_address(appliance).version == 4 else "ip6"
     arriving, leaving = (

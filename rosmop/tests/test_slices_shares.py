@@ -188,7 +188,7 @@ WAITING = """goals(std::string id%s) {
 
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_a_message_that_is_cut_ends_no_wait(on_fault: OnFault) -> None:
-    """The events that wait in the slices take the time of a message, and wait on after one that took too long."""
+    """Waiting events count in the time of a message, and still wait after one that took too long."""
     compiled = compiled_from({"x.rv": WAITING % ("", "", "Empty", "")}, definitions())
     cut, free = MonitorSet.of(compiled, on_fault), MonitorSet.of(compiled, on_fault)
     for monitors in (cut, free):

@@ -134,7 +134,7 @@ def test_each_denied_right_is_a_case_that_the_next_run_reads(category: Category,
     policy = asked()
     policy.deny(kind, node)
     policy.judged()
-    again = asked(policy.text, yaml.load(policy.cases_text, yaml.BaseLoader)["cases"])  # noqa: S506
+    again = asked(policy.text, yaml.load(policy.cases_text, yaml.BaseLoader)["cases"])  # noqa: S506  only texts
     assert list(again.missing(Counter({(kind, node): 1}))) == []
     again.judged()
 

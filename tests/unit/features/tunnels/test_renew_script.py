@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -174,7 +175,7 @@ _STEPS = ("install", "mv", "sync", "swanctl")
 
 @pytest.mark.parametrize("how", ["killed", "full disk"])
 def test_an_interruption_of_each_step_locks_the_host_out_of_nothing(host: Host, how: str) -> None:
-    """The certificate in place afterwards is the one that the appliance accepts, and charon has loaded it."""
+    """Afterwards, charon has loaded the certificate that the appliance accepts."""
     current, loaded = host.answers / "current", host.answers / "loaded"
     for path in (current, loaded):
         path.write_bytes(host.certificate.read_bytes())
@@ -182,7 +183,7 @@ def test_an_interruption_of_each_step_locks_the_host_out_of_nothing(host: Host, 
     host.program("curl", RENEWING)
     load = 'cp "$SWANCTL_DIR/x509/rosrv.pem" "$ANSWERS/loaded"'
     for name in _STEPS:
-        found = subprocess.run(["which", name], capture_output=True, text=True, check=False).stdout.strip()
+        found = shutil.which(name) or ""
         real = f"sh -c '{load}' swanctl" if name == "swanctl" else found
         host.program(name, STEP.replace("NAME", name).replace("REAL", real))
     step = 0
