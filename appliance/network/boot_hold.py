@@ -5,7 +5,8 @@
 1. It is in force only while rosrv-hold.service is active, which systemd starts with the enabled rosrv.service, and
    stops with it if an operator does; a crash does not stop it. The unit's runtime directory shows that it is active.
    systemd also restarts it with rosrv.service; then `off` leaves the hold in force, without a gap.
-2. It is armed by a start that serves. An appliance that never served, or that is off, holds up no host.
+2. It is armed by a start that serves, and disarmed by a release of the robot's graph. An appliance that never served
+   since then, or that is off, holds up no host.
 3. Other machines: new TCP connections to RVMaster's port and the kernel's range, in which nodes listen, are dropped, so
    their clients try again. Loopback, the appliance's link, established connections and other ports pass. While a graph
    is given back before a restart, only RVMaster's port is held: nodes of other machines then connect with one another.
@@ -118,9 +119,14 @@ class BootHold:
     def is_present(self) -> bool:
         return self._unit_runs.is_dir()
 
+    @property
+    def is_in_force(self) -> bool:
+        """Return whether other machines are held off, unless another program has flushed the rules."""
+        return self._in_force.exists()
+
     def is_intact(self) -> bool:
         """Return whether the rules are as `put` or `lift` left them: another program may have flushed them."""
-        return not self._in_force.exists() or any(map(_holds, self._backends))
+        return not self.is_in_force or any(map(_holds, self._backends))
 
     def put(self, *, nodes: bool = True) -> bool:
         """Hold other machines off, if armed; return whether another program had removed the rules of an earlier hold.

@@ -329,6 +329,10 @@ class Isolation:
     def awaits_graph(self) -> bool:
         return self.settings.master is not None and not self._serves_nodes and self.settings.wants()
 
+    @property
+    def is_released(self) -> bool:
+        return self.settings.master is not None and not self._serves_nodes and not self.settings.wants()
+
     def withdraw_master(self) -> None:
         """End what `forward_master` began: the port is again that of the robot's own master."""
         if self._serves_nodes:

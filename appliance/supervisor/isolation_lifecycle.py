@@ -107,6 +107,10 @@ class NoIsolation:
         """Return whether the robot's own master still has its port, and its graph is to be taken over."""
         return False
 
+    def is_released(self) -> bool:
+        """Return whether the robot's own master has its port, and keeps its graph."""
+        return False
+
     def build(self) -> None:
         """Build the isolation. Raises `StartError`, after removing everything that was built."""
 
@@ -520,6 +524,9 @@ class NetnsIsolation(ContainerIsolation):
 
     def awaits_graph(self) -> bool:
         return self._isolation.awaits_graph
+
+    def is_released(self) -> bool:
+        return self._isolation.is_released
 
     def build(self) -> None:
         try:

@@ -132,6 +132,7 @@ class HoldAround:
         self._looked_at = -math.inf
         self._removed = 0
         self._served: str | None = None
+        self._arms = True  # at the last `served`
         if (
             used
             and settings.isolation != "none"
@@ -169,24 +170,35 @@ class HoldAround:
             if not self._hold.is_intact():
                 self.put()
 
-    async def until(self, is_open: Callable[[], bool]) -> str:
-        """Keep the hold until other machines reach the appliance, and not the robot's own master; see `served`."""
+    @property
+    def held_off(self) -> str:
+        """Return what a wait for a port means for other machines; "" if they are not held off."""
+        if self._ports is None or not self._hold.is_in_force:
+            return ""
+        return "; other machines are held off until the appliance serves, or until `sudo rosrv release`"
+
+    async def until(
+        self, is_open: Callable[[], bool], is_released: Callable[[], bool] = lambda: False
+    ) -> str:
+        """Keep the hold until other machines reach the appliance, and not the robot's own master, or until that is
+        released; see `served`.
+        """
         while not is_open():
             self.keep()
             await asyncio.sleep(_KEEP_SECONDS)
-        return self.served()
+        return self.served(arms=not is_released())
 
-    def served(self) -> str:
-        """Lift and arm the hold, once.
+    def served(self, *, arms: bool = True) -> str:
+        """Lift and arm the hold, once; without `arms`, for a robot that was released, disarm it.
 
         Return an alarm if it is not lifted, if another program had removed its rules, or if the robot's own programs
         started without the appliance.
         """
-        if self._served is None:
-            self._served = self._lifted()
+        if self._served is None or arms != self._arms:
+            self._served, self._arms = self._lifted(self._ports if arms else None), arms
         return self._served
 
-    def _lifted(self) -> str:
+    def _lifted(self, armed: HeldPorts | None) -> str:
         if not self._hold.is_present:
             return ""
         lapsed, trouble = False, ""
@@ -196,7 +208,7 @@ class HoldAround:
             trouble = f"{error}: run `systemctl stop rosrv-hold`, which tries again"
             log.error("the boot hold is not lifted", error=str(error))
         try:
-            self._hold.arm(self._ports)
+            self._hold.arm(armed)
         except OSError as error:
             log.error("the hold of the next boot keeps its last settings", error=str(error))
         if self._removed and not trouble:
@@ -311,7 +323,7 @@ def _run(
         def say_ready(said: ControlReady) -> None:
             ready(said, settings)
             if not isolation.awaits_graph():
-                isolation.lapse = hold.served()
+                isolation.lapse = hold.served(arms=not isolation.is_released())
             manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
 
         def say_standing_by() -> None:
@@ -378,7 +390,14 @@ def _listeners(
 
 
 def _build(settings: Settings, isolation: NoIsolation, hold: HoldAround) -> dict[str, socket.socket]:
-    hold.keep()
+    try:
+        hold.keep()
+        return _built(settings, isolation)
+    except PortInUseError as error:
+        raise PortInUseError(f"{error}{hold.held_off}") from error
+
+
+def _built(settings: Settings, isolation: NoIsolation) -> dict[str, socket.socket]:
     if settings.isolation != "netns":  # before the firewall is built, because a wait tries every two seconds
         require_free(*settings.listen_address)
         require_free("127.0.0.1", settings.rosmaster_port)
@@ -450,7 +469,11 @@ def _listener(settings: Settings) -> socket.socket | None:
 
 
 async def _keep(hold: HoldAround, supervisor: Supervisor, isolation: NoIsolation) -> None:
-    isolation.lapse = await hold.until(lambda: supervisor.is_ready and not isolation.awaits_graph())
+    while True:
+        isolation.lapse = await hold.until(
+            lambda: supervisor.is_ready and not isolation.awaits_graph(), isolation.is_released
+        )
+        await asyncio.sleep(_KEEP_SECONDS)
 
 
 async def _supervise(

@@ -31,6 +31,7 @@ from appliance.features.adopt.machine_side import wanted_record
 from appliance.features.adopt.operator_orders import ADOPT, ordered
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus
 from appliance.features.adopt.robot_side import (
+    WAITS,
     make_audit_only,
     robot_state,
     running_settings,
@@ -42,7 +43,6 @@ from rosmop.tool.terminal import printable, say
 _VERB = "rosrv adopt"
 _START_SECONDS = 180.0
 _LOOK_SECONDS = 0.5
-_WAITS = "waits: "
 _SHOWN = 20  # nodes that are not adopted
 
 
@@ -126,7 +126,7 @@ def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | 
         answer = appliance.ask(PolicyReload())
     except NotRunningError:
         return
-    if not answer.ok and not answer.error.startswith(_WAITS):
+    if not answer.ok and not answer.error.startswith(WAITS):
         raise NetworkError(answer.error)
 
 
@@ -155,7 +155,7 @@ def _adopt(appliance: Appliance, state: Path) -> None:
         write_drop_in(load_record(state))
         _show_report(report, as_json=appliance.as_json)
         return
-    if not answer.error.startswith(_WAITS):
+    if not answer.error.startswith(WAITS):
         raise NetworkError(answer.error)
     _note(state)
     _show_started(_await_start(appliance), as_json=appliance.as_json)

@@ -32,12 +32,13 @@ from appliance.features.adopt.machine_side import master_of, start_stand_in
 from appliance.features.adopt.operator_orders import RELEASE, ordered
 from appliance.features.adopt.places import call_node
 from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
-from appliance.features.adopt.robot_side import MASTER_PORT, remove_drop_ins, running_settings
+from appliance.features.adopt.robot_side import MASTER_PORT, WAITS, remove_drop_ins, running_settings
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import restore
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.network.boot_hold import BootHold
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
@@ -74,7 +75,9 @@ async def release_dead(state: Path) -> GiveBackReport:
         raise NetworkError(str(error)) from None
     try:
         with _open(state) as store:
-            return await _release(state, store)
+            report = await _release(state, store)
+        end_hold()
+        return report
     except (AdoptError, StoreError) as error:
         raise NetworkError(str(error)) from None
     finally:
@@ -285,8 +288,22 @@ def _order(appliance: Appliance, state: Path) -> GiveBackReport:
     except NotRunningError as error:
         raise NetworkError(f"{error}. After a crash: rosrv release --dead") from None
     if not answer.ok:
+        if answer.error.startswith(WAITS) and (record := load_record(state)).phase is Phase.FREE:
+            save_record(state, msgspec.structs.replace(record, wanted=False))
+            end_hold()
+            return GiveBackReport()
         raise NetworkError(answer.error)
     return answer.given()
+
+
+def end_hold() -> None:
+    """Let other machines reach the robot again, now and at the next boot. Raises `NetworkError`."""
+    hold = BootHold(Namespace.own())
+    try:
+        hold.arm(None)
+    except OSError as error:
+        raise NetworkError(f"the boot hold stays: {error}") from None
+    hold.lift()
 
 
 def _stand(appliance: Appliance, within: float) -> None:

@@ -30,6 +30,9 @@ from appliance.rpc.graph_inventory import GraphInventory
 from appliance.rpc.graph_reader import SurveyError, SurveyLimits, survey
 
 MASTER_PORT = 11311
+WAITS = "waits: "
+"""The beginning of each answer of an appliance that waits for a port."""
+
 AUDIT_ONLY = (
     "\n[Options]\naudit-only = all             # records denials, and lets them pass: `rosrv policy learn`\n"
 )

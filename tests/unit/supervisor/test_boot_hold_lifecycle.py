@@ -3,7 +3,8 @@ import socket
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Literal, cast
 
 import pytest
 
@@ -16,6 +17,8 @@ from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace
 from appliance.supervisor import run as supervisor_run
 from appliance.supervisor import supervisor
+from appliance.supervisor.errors import PortInUseError
+from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.machine_work import NoMachineWork
 from appliance.supervisor.role import Facts
 from appliance.supervisor.run import HoldAround
@@ -123,6 +126,62 @@ async def test_other_machines_wait_until_the_robots_graph_is_taken_over() -> Non
     assert "another program removed the boot hold" in await keeping
     assert run.served() == await keeping
     assert hold.calls == ["put", "put", "lift", (11311, "veth-rosrv", None)]
+
+
+class Robot(NoIsolation):
+    state = ""
+
+    def awaits_graph(self) -> bool:
+        return self.state == "awaits"
+
+    def is_released(self) -> bool:
+        return self.state == "released"
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("states", "armed"),
+    [
+        ("serves", True),
+        ("serves awaits", True),
+        ("serves released", False),
+        ("awaits serves released", False),
+        ("awaits released", False),
+        ("released", False),
+        ("serves released awaits", False),
+        ("released awaits serves", True),
+        ("serves released awaits serves", True),
+    ],
+)
+async def test_the_next_boot_holds_unless_the_robot_was_released_since_it_was_served(
+    states: str, armed: bool
+) -> None:
+    hold, robot, ready = RecordedHold(), Robot(), cast(supervisor.Supervisor, SimpleNamespace(is_ready=True))
+    keeping = asyncio.create_task(supervisor_run._keep(around(hold), ready, robot))
+    for robot.state in states.split():
+        await asyncio.sleep(1)
+    keeping.cancel()
+    assert hold.calls[-2:] == ["lift", (11311, "veth-rosrv", None) if armed else None]
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_wait_says_that_other_machines_are_held_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, armed: bool
+) -> None:
+    monkeypatch.setattr(boot_hold, "NftBackend", lambda *_: MemoryBackend())
+    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: MemoryBackend())
+    hold, robot = BootHold(Namespace.own(), unit_runs=tmp_path, state=tmp_path), Robot()
+    hold.arm(HeldPorts(11311, 32768, 60999) if armed else None)
+
+    def build() -> None:
+        raise PortInUseError("roscore holds TCP 11311")
+
+    monkeypatch.setattr(robot, "build", build)
+    run = around(hold)
+    run.put()
+    with pytest.raises(PortInUseError) as raised:
+        supervisor_run._build(Settings(isolation="netns"), robot, run)
+    assert ("other machines are held off until" in str(raised.value)) is armed
 
 
 @pytest.mark.parametrize(

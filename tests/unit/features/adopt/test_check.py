@@ -7,9 +7,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from typer import Exit
 
 from appliance.base.shipped import SHIPPED
 from appliance.channel.admin import AdminAnswer
+from appliance.cli.connection.target import Appliance
 from appliance.features.adopt import adopt_check, release_verb
 from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
@@ -187,6 +189,32 @@ def test_a_robot_that_was_never_adopted_is_released_without_a_wait(
     monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
     release_verb.release.function(call_of(answer), dead=False, force=False, within=1.0)
     assert capsys.readouterr().out == "nothing is adopted: nodes that use this appliance go on using it\n"
+
+
+@pytest.mark.parametrize(
+    ("record", "released"),
+    [
+        (AdoptRecord(), True),
+        (AdoptRecord(program=MASTER.program), True),
+        (AdoptRecord(program=MASTER.program, wanted=True), True),
+        (AdoptRecord(program=MASTER.program, wanted=True, phase=Phase.TAKEN), False),
+    ],
+    ids=["never", "released", "wanted", "taken"],
+)
+def test_a_release_of_an_appliance_that_waits_lets_other_machines_in(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, record: AdoptRecord, released: bool
+) -> None:
+    ended: list[bool] = []
+    waits = AdminAnswer(False, error="waits: /usr/bin/rosmaster (roscore.service) holds TCP 11311")
+    save_record(tmp_path, msgspec.structs.replace(record, boot=boot_id()))
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    monkeypatch.setattr(Appliance, "state_here", lambda *_: tmp_path)
+    monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
+    monkeypatch.setattr(release_verb, "end_hold", lambda: ended.append(True))
+    with nullcontext() if released else pytest.raises(Exit):
+        release_verb.release.function(call_of(lambda _: waits), dead=False, force=False, within=1.0)
+    assert bool(ended) is released
+    assert load_record(tmp_path).wanted is (record.wanted and not released)
 
 
 def test_connections_that_would_be_cut_are_counted() -> None:
