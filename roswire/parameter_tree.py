@@ -1,6 +1,6 @@
 """The parameter tree of `rosmaster`: lookups by key, and values that block a key."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 
 from roswire.xmlrpc import Value
@@ -55,3 +55,19 @@ def same_value(one: Value, other: Value) -> bool:
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(map(same_value, one, other))
     return type(one) is type(other) and one == other
+
+
+def merged(before: Mapping[str, Value], there: Mapping[str, Value], here: Mapping[str, Value]) -> Tree:
+    """Return the tree `here` with what changed `there` since `before`, except what has also changed here."""
+    result = dict(here)
+    for name in {**before, **there}:
+        was, new, own = before.get(name), there.get(name), here.get(name)
+        if same_value(was, new):
+            continue
+        if isinstance(new, dict) and isinstance(own, dict):
+            result[name] = merged(was if isinstance(was, dict) else {}, new, own)
+        elif same_value(was, own):
+            result.pop(name, None)
+            if name in there:
+                result[name] = new
+    return result

@@ -319,13 +319,13 @@ class ParameterOrders:
         return self._calls.mirror.tree
 
     async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
-        """Set them; any host may have written at the other master, whose `{"": …}` would become the whole tree here."""
+        """See `ParameterSide`. Any host may have written there, and its `{"": …}` would become the whole tree here."""
         host = address_of(self._link())
         caller = Caller(Peer(host, str(host), str(host)), "/rosrv", clock.now_ns())
         left, writes = dict[str, str](), dict[str, ParameterWrite]()
         for name, value in values.items():
             try:
-                VALUE.canonicalise({name: value}, "")
+                VALUE.canonicalise({name: "" if value is None else value}, "")
             except PeerError as error:
                 left[name] = str(error)
             else:

@@ -4,7 +4,7 @@ Both are sequences of steps. Each step can be repeated, so a start after a kill 
 beginning. `passed` is called after each step.
 
 Taking: read, register, forward 11311, tell subscribers, cut, and read again until two readings are equal: a node that
-starts in the meantime registers at the master that it still finds.
+starts in the meantime registers at the master that it still finds, and sets its parameters there.
 
 1. Publishers are registered before services, and services before subscribers.
 2. The rules come after the first registrations; before, calls of the robot would find an empty graph.
@@ -36,6 +36,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -85,7 +86,7 @@ from appliance.rpc.master_reader import (
 from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError
 from appliance.supervisor.machine_work import Found
 from roswire.names import ROSOUT
-from roswire.parameter_tree import same_value
+from roswire.parameter_tree import merged, same_value
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 
@@ -137,7 +138,9 @@ class ParameterSide(Protocol):
     def tree(self) -> Mapping[str, Value]: ...
 
     async def take(self, values: Mapping[str, Value]) -> dict[str, str]:
-        """Set parameters; return the names of those that a limit left out, with the reason."""
+        """Set parameters, and delete those without a value; return the names of those that a limit left out, with the
+        reason.
+        """
 
 
 async def _nothing(_step: str) -> None: ...
@@ -204,6 +207,8 @@ class AdoptOperation:
     left: LeftThere = field(default_factory=LeftThere)
     _who: str = field(default="", init=False)
     _hidden: bool = field(default=False, init=False)
+    _read_there: dict[str, Value] = field(default_factory=dict, init=False)
+    """The parameters of the robot's own master, as RVMaster has taken them, until the graph is taken."""
 
     async def facts(self, nodes: Iterable[NodeUri] = ()) -> MachineFacts:
         uris = list(nodes)
@@ -304,6 +309,7 @@ class AdoptOperation:
             readings += 1
             if not reads:
                 break
+            parameters_left += await self._take_parameters(facts)  # no node reaches that master any more
             again, places = await self._read(facts, (graph, places))
             same = again.registered == graph.registered
             if not same:
@@ -335,7 +341,7 @@ class AdoptOperation:
                 f"{counted(len(places.own), 'node')} of this computer cannot be called: {listed}. The graph stays with"
                 " the robot's own master, and is read again in seconds; `rosrv adopt` takes the other nodes"
             )
-        left = await self._take_parameters(facts)
+        left = await self._take_parameters(facts, first=True)
         await self.passed("parameters")
         return graph, places, left
 
@@ -365,15 +371,23 @@ class AdoptOperation:
         await self._try(self._clear_master(facts))
         return _places_of(node for node in self.graph.nodes() if node in self.graph.subscribers.unasked)
 
-    async def _take_parameters(self, facts: MachineFacts) -> list[str]:
+    async def _take_parameters(self, facts: MachineFacts, *, first: bool = False) -> list[str]:
+        """Take the parameters of the robot's own master; later what changed there since, and not at RVMaster."""
         try:
-            values = await self.reader(facts).parameters()
+            there = await self.reader(facts).parameters()
         except MasterReadError as error:
             raise AdoptError(f"the robot's parameters cannot be read: {error}") from None
-        if self.graph.nodes():  # a node of RVMaster may have read its run_id
-            values = {name: value for name, value in values.items() if name != _KEPT_PARAMETER}
-        left = await self.parameters.take(values)
-        self.left.parameters = set(left)
+        mine = self.parameters.tree()
+        if first:
+            kept = self.graph.nodes() and _KEPT_PARAMETER  # a node of RVMaster may have read it
+            self._read_there = {name: value for name, value in mine.items() if name in there and name != kept}
+            self.left.parameters = set()
+        wanted = merged(self._read_there, there, mine)
+        left = await self.parameters.take({
+            name: wanted.get(name) for name in {**mine, **wanted} if not same_value(wanted.get(name), mine.get(name))
+        })  # fmt: skip
+        self._read_there = deepcopy(there)
+        self.left.parameters |= set(left)
         return [f"parameter /{name}: {why}" for name, why in left.items()]
 
     async def _register(self, graph: MasterGraph, places: Places, before: MasterGraph) -> None:
@@ -438,7 +452,7 @@ class AdoptOperation:
 
     async def _note_taken(self, facts: MachineFacts) -> None:
         await self.machine("phase", phase=Phase.TAKEN)
-        self._hidden = False
+        self._hidden, self._read_there = False, {}
         await self._try(self._hide_subscribers(facts))
 
     @staticmethod
@@ -687,6 +701,7 @@ class AdoptOperation:
             withdrawn = facts.record.phase is Phase.GIVING  # by a give that a kill ended
             known = None if self.forwards and facts.record.phase is Phase.TAKEN else MasterGraph()
             given, ended, after = await self._give_registrations(reader, known)
+            before = deepcopy(dict(self.parameters.tree()))
             parameters = 0 if withdrawn else await self._give_parameters(reader, complete=known is None)
             await self.passed("give")
         except (AdoptError, MasterReadError) as error:
@@ -697,6 +712,8 @@ class AdoptOperation:
         await self.passed("withdraw")
         # of calls that were under way
         more = await self._give_registrations(reader, after if known is None else known)
+        there = await reader.parameters()
+        parameters += await self._set_parameters(reader, there, merged(before, self.parameters.tree(), there))
         await self.passed("give again")
         last = await self._last_word(await reader.read(), nodes)
         await self.passed("tell")
@@ -750,7 +767,7 @@ class AdoptOperation:
         await self._remind(last, clocks)
         self.graph.forget()
         self.graph.denied.clear()
-        self.left = LeftThere()
+        self.left, self._read_there = LeftThere(), {}
         await self.passed("forget")
         await self.machine("phase", phase=Phase.FREE)
         report = msgspec.structs.replace(report, seconds=round(clock.now() - began, 2))
@@ -843,17 +860,25 @@ class AdoptOperation:
         return node is None or there.nodes.get(name) != node.api_text
 
     async def _give_parameters(self, reader: MasterReader, *, complete: bool) -> int:
-        """Set what differs. Only if RVMaster had all parameters (`complete`), what it lacks was deleted there."""
-        there, mine = await reader.parameters(), self.parameters.tree()
+        """Set what differs. If RVMaster had all parameters (`complete`), what it lacks was deleted there; else what
+        changed at the robot's own master since RVMaster took it stays.
+        """
+        there = await reader.parameters()
+        wanted = merged(there if complete else self._read_there, there, self.parameters.tree())
+        return await self._set_parameters(reader, there, wanted)
+
+    async def _set_parameters(
+        self, reader: MasterReader, there: Mapping[str, Value], wanted: Mapping[str, Value]
+    ) -> int:
         calls: list[MasterCall] = [
             ("setParam", MASTER_NAME, (f"/{name}", value))
-            for name, value in mine.items()
-            if name not in _OWN_PARAMETERS and not (name in there and same_value(there[name], value))
+            for name, value in wanted.items()
+            if name not in _OWN_PARAMETERS and not same_value(there.get(name), value)
         ]
         calls += [
             ("deleteParam", MASTER_NAME, (f"/{name}",))
             for name in there
-            if complete and name not in {*mine, *_OWN_PARAMETERS, *self.left.parameters}
+            if name not in {*wanted, *_OWN_PARAMETERS, *self.left.parameters}
         ]
         await reader.ask_all(calls)
         return len(calls)

@@ -136,7 +136,7 @@ class ScriptedReader:
 
     async def parameters(self) -> dict[str, Value]:
         self._require()
-        return dict(self.tree)
+        return copy.deepcopy(self.tree)
 
     async def ask_all(self, calls: list[MasterCall]) -> list[Value]:
         self._require()

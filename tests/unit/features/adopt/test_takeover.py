@@ -1,3 +1,4 @@
+import copy
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -276,6 +277,109 @@ def test_a_parameter_that_only_changed_its_type_is_given_back(before: Value, now
         world.record = msgspec.structs.replace(world.record, wanted=False)
         await world.until_settled()
         assert same_value(world.master.tree["speed"], now)
+
+    run(story)
+
+
+def do_after(world: RobotWorld, step: str, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Do this once, after the step."""
+    passed, waits = world.operation.passed, [work]
+
+    async def then(now: str) -> None:
+        if now == step and waits:
+            await waits.pop()()
+        await passed(now)
+
+    world.operation.passed = then
+
+
+WRITES: dict[str, tuple[str, Value]] = {
+    "set": ("/new", 7),
+    "set a namespace": ("/new_node", {"max_vel": 0.3}),
+    "set in a namespace": ("/base/new", 7),
+    "change": ("/speed", 0.5),
+    "change in a namespace": ("/base/max", 0.5),
+    "delete": ("/speed", None),
+    "delete in a namespace": ("/base/min", None),
+}
+
+
+def write(tree: dict[str, Any], name: str, value: Value) -> None:
+    *spaces, last = name.strip("/").split("/")
+    for space in spaces:
+        tree = tree[space]
+    tree.pop(last) if value is None else tree.update({last: value})
+
+
+@pytest.mark.parametrize("kind", WRITES)
+@pytest.mark.parametrize(
+    ("step", "release"),
+    [(step, False) for step in TAKE[: TAKE.index("cut")]]
+    + [(step, True) for step in GIVE[: GIVE.index("withdraw")]],
+)
+def test_no_parameter_that_is_written_during_an_adoption_or_a_release_is_lost(
+    step: str, release: bool, kind: str
+) -> None:
+    """Until the cut, nodes write at the robot's own master, and until the withdrawal at RVMaster."""
+    name, value = WRITES[kind]
+
+    async def story(world: RobotWorld) -> None:
+        world.master.tree["base"] = {"max": 1.5, "min": 0.1}
+        expected = copy.deepcopy(world.master.tree)
+        write(expected, name, value)
+
+        async def node_writes() -> None:
+            if not release:
+                write(world.master.tree, name, value)
+            elif value is None:
+                await world.parts.ask("deleteParam", "/tool", name, host=LINK)
+            else:
+                await world.parts.ask("setParam", "/tool", name, value, host=LINK)
+
+        do_after(world, step, node_writes)
+        await world.until_settled()
+        if not release:
+            assert world.tree() == expected
+        assert world.tree() == world.master.tree
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert world.tree() == world.master.tree == expected
+
+    run(story)
+
+
+def test_a_later_value_at_the_appliance_replaces_that_of_the_own_master() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.master.tree["base"] = {"max": 1.5, "min": 0.1}
+
+        async def both_write() -> None:
+            world.master.tree["base"] = {"max": 0.5, "min": 0.2}
+            await world.parts.ask("setParam", "/tool", "/base/max", 0.7, host=LINK)
+
+        do_after(world, "forward", both_write)
+        await world.until_settled()
+        assert world.tree()["base"] == {"max": 0.7, "min": 0.2}
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert world.master.tree["base"] == {"max": 0.7, "min": 0.2}
+
+    run(story)
+
+
+@pytest.mark.parametrize("step", ["parameters", "register", "forward"])
+def test_an_adoption_that_fails_leaves_what_was_written_at_the_own_master(step: str) -> None:
+    async def story(world: RobotWorld) -> None:
+        async def write_and_die() -> None:
+            world.master.tree["speed"] = 0.5
+            world.master.alive = False
+
+        do_after(world, step, write_and_die)
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        with pytest.raises(AdoptError):
+            await world.operation.adopt()
+        world.master.alive = True
+        await world.until_settled()
+        assert world.master.tree == {"run_id": "robot", "speed": 0.5}
 
     run(story)
 
