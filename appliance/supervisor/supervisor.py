@@ -212,15 +212,16 @@ class Supervisor:
 
     async def _announce_end(self) -> None:
         """Let control give a graph back that it took over, unless the appliance ends because of a failure."""
-        if self.failure is not None or not self.is_ready or not self._work.takes_over():
+        if self.failure is not None or not self._work.takes_over():
             return
-        await asyncio.to_thread(self._gives_back)
-        self._work.end()
-        self._tell_control(messages.EndAnnounced())
-        try:
-            async with asyncio.timeout(_AGREED_SECONDS):
-                await self._end_agreed.wait()
-        except TimeoutError:
+        if self.is_ready:
+            await asyncio.to_thread(self._gives_back)
+            self._work.end()
+            self._tell_control(messages.EndAnnounced())
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_AGREED_SECONDS):
+                    await self._end_agreed.wait()
+        if self._work.holds() or (self.is_ready and not self._end_agreed.is_set()):
             log.error("control did not give the robot's graph back: sudo rosrv release --dead")
 
     # --- starting -----------------------------------------------------------------------------------------

@@ -197,6 +197,7 @@ class AdoptPart:
 
     async def before_end(self) -> None:
         """Give the graph back before an ordered end; the record still wants it, so the next start takes it again."""
+        self._operation.end()
         async with self._one:
             try:
                 facts = await self._operation.facts()

@@ -34,11 +34,11 @@ publisher changes nothing; only a list without it removes it.
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from contextlib import asynccontextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import msgspec
 
@@ -112,6 +112,7 @@ _UNREGISTER = {
 
 
 HeldNode = tuple[Incarnation, set[Entry]]
+T = TypeVar("T")
 
 
 class AdoptError(Exception):
@@ -207,6 +208,8 @@ class AdoptOperation:
     left: LeftThere = field(default_factory=LeftThere)
     _who: str = field(default="", init=False)
     _hidden: bool = field(default=False, init=False)
+    _taking: asyncio.Timeout | None = field(default=None, init=False)
+    _ends: bool = field(default=False, init=False)
     _read_there: dict[str, Value] = field(default_factory=dict, init=False)
     """The parameters of the robot's own master, as RVMaster has taken them, until the graph is taken."""
 
@@ -227,12 +230,34 @@ class AdoptOperation:
         if not wanted and phase is not Phase.FREE:
             return await self.give()
         if wanted:
-            await self._take_missing(facts)
-            await self._cut_untold()
-            if not self._hidden:
-                await self._try(self._clear_master(facts))
-                await self._try(self._hide_subscribers(facts))
+            async with self._until_end():
+                await self._take_missing(facts)
+                await self._cut_untold()
+                if not self._hidden:
+                    await self._try(self._clear_master(facts))
+                    await self._try(self._hide_subscribers(facts))
         return None
+
+    def end(self) -> None:
+        """End a taking where it is, and let none begin any more; giving back is still possible."""
+        self._ends = True
+        if self._taking is not None:
+            self._taking.reschedule(0.0)
+
+    @asynccontextmanager
+    async def _until_end(self) -> AsyncIterator[None]:
+        """Take until `end`, as until a kill, but each change of RVMaster is made to its end. Raises `AdoptError`."""
+        try:
+            if self._ends:
+                raise TimeoutError
+            async with asyncio.timeout(None) as self._taking:
+                yield
+        except TimeoutError:
+            if self._ends:
+                raise AdoptError("the appliance ends") from None
+            raise
+        finally:
+            self._taking = None
 
     # --- taking over ---
 
@@ -258,7 +283,8 @@ class AdoptOperation:
         facts = await self.facts()
         if facts.record.phase is Phase.TAKEN:
             with suppress(AdoptError):
-                await self._take_missing(facts)  # so that they get their lists with the others
+                async with self._until_end():
+                    await self._take_missing(facts)  # so that they get their lists with the others
         await self.machine("want", wanted=False)
         if facts.record.phase is Phase.FREE:
             return GiveBackReport()
@@ -278,6 +304,10 @@ class AdoptOperation:
 
     async def take(self) -> TakeOverReport:
         """Take the graph over. Raises `AdoptError` if the present master is not the recorded one, or cannot be read."""
+        async with self._until_end():
+            return await self._take()
+
+    async def _take(self) -> TakeOverReport:
         began, facts = clock.now(), await self.facts()
         if facts.foreign_master:
             raise AdoptError(facts.foreign_master)
@@ -383,9 +413,9 @@ class AdoptOperation:
             self._read_there = {name: value for name, value in mine.items() if name in there and name != kept}
             self.left.parameters = set()
         wanted = merged(self._read_there, there, mine)
-        left = await self.parameters.take({
+        left = await _whole(self.parameters.take({
             name: wanted.get(name) for name in {**mine, **wanted} if not same_value(wanted.get(name), mine.get(name))
-        })  # fmt: skip
+        }))  # fmt: skip
         self._read_there = deepcopy(there)
         self.left.parameters |= set(left)
         return [f"parameter /{name}: {why}" for name, why in left.items()]
@@ -394,13 +424,13 @@ class AdoptOperation:
         for number, entry in enumerate(graph.in_order()):
             place = places.found.get(entry[2])
             if place is not None:
-                await self.graph.register(entry, place, graph)
+                await _whole(self.graph.register(entry, place, graph))
             if number % _AT_ONCE == 0:
                 await asyncio.sleep(0)
         for entry in before.in_order():
             place = places.found.get(entry[2])
             if entry not in graph.entries and place is not None:
-                await self.graph.unregister(entry, place, before)
+                await _whole(self.graph.unregister(entry, place, before))
 
     async def _tell(self, places: Places) -> None:
         self.graph.tell(places.found)
@@ -918,6 +948,16 @@ class AdoptOperation:
             if not missing or clock.now() >= until:
                 return
             await send_lists(self.call, _BESIDES_SECONDS, {row: last.lists[row] for row in missing})
+
+
+async def _whole(change: Awaitable[T]) -> T:
+    """Make a change to its end, even if the caller is cancelled."""
+    made = asyncio.ensure_future(change)
+    try:
+        return await asyncio.shield(made)
+    except asyncio.CancelledError:
+        await asyncio.wait([made])
+        raise
 
 
 def _unregistration(entry: Entry, there: MasterGraph) -> MasterCall:

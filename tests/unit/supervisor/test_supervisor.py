@@ -13,6 +13,7 @@ from structlog.testing import capture_logs
 from appliance.channel.messages import (
     Announced,
     CompilerWanted,
+    EndAgreed,
     ProcessDied,
     ProcessOverdue,
     ProcessWanted,
@@ -21,6 +22,7 @@ from appliance.channel.messages import (
 )
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.machine_work import NoMachineWork
 from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.supervisor import ControlReady, Supervisor
@@ -237,3 +239,28 @@ async def test_control_gets_each_unexpected_end_once_while_it_serves(made: Make)
     for slot in supervisor.slots:
         slot.process = None
     await supervisor.end()
+
+
+@pytest.mark.parametrize(
+    ("ready", "agreed", "holds", "printed"),
+    [
+        (False, False, False, False),
+        (False, False, True, True),
+        (True, True, False, False),
+        (True, True, True, True),
+        (True, False, False, True),
+        (True, False, True, True),
+    ],
+)
+async def test_an_ordered_end_that_does_not_give_a_graph_back_prints_the_command(
+    made: Make, monkeypatch: pytest.MonkeyPatch, *, ready: bool, agreed: bool, holds: bool, printed: bool
+) -> None:
+    monkeypatch.setattr(NoMachineWork, "takes_over", lambda _work: True)
+    monkeypatch.setattr(NoMachineWork, "holds", lambda _work: holds)
+    supervisor, control = made(CONTROL), MemoryChild()
+    supervisor.is_ready = ready
+    if agreed:
+        supervisor.control_said(control.handle, EndAgreed(), ())
+    with capture_logs() as logs:
+        await supervisor._announce_end()
+    assert any("sudo rosrv release --dead" in line["event"] for line in logs) is printed

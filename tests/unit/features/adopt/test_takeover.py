@@ -1,16 +1,22 @@
+import asyncio
 import copy
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, cast
+from unittest.mock import MagicMock
 
 import msgspec
 import pytest
 
 from appliance.base import clock
+from appliance.control.core import Core
 from appliance.features.adopt.adopt_record import Phase
+from appliance.features.adopt.control_part import AdoptPart
 from appliance.features.adopt.machine_facts import RobotMaster
+from appliance.features.adopt.requests import AdoptOrder
 from appliance.features.adopt.takeover import AdoptError
 from appliance.master.graph.registry import Kind
 from roswire.parameter_tree import same_value
+from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 from tests.support import autojump
 from tests.support.control_parts import ControlParts
@@ -277,6 +283,96 @@ def test_a_parameter_that_only_changed_its_type_is_given_back(before: Value, now
         world.record = msgspec.structs.replace(world.record, wanted=False)
         await world.until_settled()
         assert same_value(world.master.tree["speed"], now)
+
+    run(story)
+
+
+def control_part(world: RobotWorld) -> AdoptPart:
+    part = object.__new__(AdoptPart)
+    part._operation, part._one, part._settled, part._facts = world.operation, asyncio.Lock(), False, None
+    part._core, part._obstacle = cast(Core, MagicMock(trail=world.parts.records)), ""
+    part._save = lambda: None  # type: ignore[method-assign]
+    return part
+
+
+def apart(world: RobotWorld, work: Coroutine[Any, Any, Any]) -> "asyncio.Task[Any]":
+    """Begin a task for which `ControlParts.settle` does not wait."""
+    task = asyncio.create_task(work)
+    world.parts._not_ours.add(task)
+    return task
+
+
+async def stop_during(world: RobotWorld, taking: "asyncio.Task[Any]", part: AdoptPart) -> float:
+    """Return the seconds that an ordered stop takes."""
+    began = clock.now()
+    await part.before_end()
+    seconds = clock.now() - began
+    await asyncio.gather(taking, return_exceptions=True)
+    await settle_once(part)  # the record still wants the graph of a start
+    require_given(world)
+    return seconds
+
+
+async def settle_once(part: AdoptPart) -> None:
+    async with part._one:
+        await part._settle()
+
+
+@pytest.mark.parametrize("step", TAKE)
+@pytest.mark.parametrize("order", [False, True], ids=["start", "order"])
+def test_an_ordered_end_after_any_step_of_taking_ends_in_a_given_graph(step: str, order: bool) -> None:
+    async def story(world: RobotWorld) -> None:
+        part, reached = control_part(world), asyncio.Event()
+
+        async def reach() -> None:
+            reached.set()
+            await asyncio.sleep(0)
+
+        do_after(world, step, reach)
+        world.record = msgspec.structs.replace(world.record, wanted=not order)
+        taking = apart(world, part.adopt(AdoptOrder()) if order else settle_once(part))
+        await reached.wait()
+        await stop_during(world, taking, part)
+
+    run(story)
+
+
+@pytest.mark.parametrize("seconds", [0.1, 1.0, 2.0, 3.0, 6.0, 7.0, 9.0])
+def test_an_ordered_end_waits_for_no_node_that_is_asked(seconds: float) -> None:
+    async def story(world: RobotWorld) -> None:
+        part = control_part(world)
+        world.silent_host, world.resolved["laptop"] = "192.168.50.9", ["192.168.50.9"]
+        for number in range(3):
+            world.add(f"/far{number}", 5000 + number, f"http://laptop:{5000 + number}/", publishes=("/far",))
+        call = world.operation.call
+
+        async def slow(uri: NodeUri, method: str, /, *params: Value) -> Value:
+            await asyncio.sleep(4.0 * (method == "requestTopic"))
+            return await call(uri, method, *params)
+
+        world.operation.call = slow
+        taking = apart(world, settle_once(part))
+        await asyncio.sleep(seconds)
+        assert await stop_during(world, taking, part) < 1
+
+    run(story)
+
+
+@pytest.mark.parametrize("registrations", range(1, 10))
+def test_an_ordered_end_between_two_registrations_loses_nothing(registrations: int) -> None:
+    async def story(world: RobotWorld) -> None:
+        part, ask, ends = control_part(world), world.parts.ask, list[asyncio.Task[None]]()
+
+        async def slow(method: str, *params: Value, **more: Any) -> Any:
+            if len(world.began) == registrations:
+                ends.append(apart(world, part.before_end()))
+                await asyncio.sleep(0.1)
+            return await ask(method, *params, **more)
+
+        world.parts.ask = slow  # type: ignore[method-assign]
+        await settle_once(part)
+        await asyncio.wait(ends)
+        require_given(world)
 
     run(story)
 
