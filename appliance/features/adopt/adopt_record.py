@@ -70,7 +70,7 @@ def load_record(state: Path) -> AdoptRecord:
         found = AdoptRecord()
     except (OSError, ValueError) as error:
         raise NetworkError(
-            f"{file} cannot be read ({error}): `rosrv release --dead` gives the graph back, and removes it"
+            f"{file} cannot be read ({error}): `rosrv release --dead` gives the graph back, and replaces it"
         ) from None
     return found.now(boot_id())
 

@@ -43,10 +43,10 @@ class MachineFacts(msgspec.Struct, frozen=True):
 
     @property
     def foreign_master(self) -> str:
-        """Why the present master is not the recorded one; empty if it is, or if there is none."""
+        """Why the present master is not the recorded one; empty if it is, or if one of the two is missing."""
         found, record = self.master, self.record
         adopted = record.wanted or record.phase is not Phase.FREE
-        if found is None or not adopted or found.pid == record.stand_in:
+        if found is None or not adopted or not record.program or found.pid == record.stand_in:
             return ""
         if (found.unit, found.user) == (record.unit, record.user):
             return ""

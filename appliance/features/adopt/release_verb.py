@@ -25,7 +25,7 @@ from appliance.cli.standing import (
     wait_until_robot_stands,
 )
 from appliance.features.adopt.adopt_answers import GiveBackReport
-from appliance.features.adopt.adopt_record import FILE, AdoptRecord, Phase, load_record, save_record
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.machine_side import master_of, start_stand_in
@@ -168,8 +168,8 @@ def _record(state: Path) -> AdoptRecord:
     try:
         return load_record(state)
     except NetworkError:
-        (state / FILE).unlink(missing_ok=True)  # it cannot be read: the graph is given back whatever it said
-        return load_record(state)
+        # It cannot be read: the graph is given back whatever it said, to the master that runs.
+        return AdoptRecord(phase=Phase.TAKEN, boot=boot_id())
 
 
 async def _call(uri: NodeUri, method: str, /, *params: Value) -> Value:

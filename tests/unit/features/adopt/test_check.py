@@ -3,6 +3,7 @@ import ipaddress
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -16,15 +17,19 @@ from appliance.features.adopt import adopt_check, release_verb
 from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
-from appliance.features.adopt.machine_facts import RobotMaster
+from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
 from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.release_verb import release_dead
 from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
 from appliance.features.adopt.robot_side import AUDIT_ONLY, make_audit_only
+from appliance.features.adopt.takeover import AdoptError, AdoptOperation
 from appliance.network.listening_sockets import TcpSocket
 from appliance.network.namespaces import NetworkError
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.graph_inventory import GraphInventory, SurveyedNode, SurveyedService, SurveyedTopic
+from appliance.store.state_file import StateStore
 from tests.support.answers import example
+from tests.support.engines import InlineDatabase
 from tests.support.memory_call import call_of
 
 MASTER = RobotMaster(1, "/usr/bin/rosmaster", "robot", "roscore.service", "system.slice/roscore.service")
@@ -215,6 +220,47 @@ def test_a_release_of_an_appliance_that_waits_lets_other_machines_in(
         release_verb.release.function(call_of(lambda _: waits), dead=False, force=False, within=1.0)
     assert bool(ended) is released
     assert load_record(tmp_path).wanted is (record.wanted and not released)
+
+
+@pytest.mark.parametrize("kind", ["whole", "torn", "empty", "another", "unreadable"])
+def test_a_release_without_the_appliance_gives_back_whatever_its_record_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: str
+) -> None:
+    found: list[MachineFacts] = []
+
+    async def give(operation: AdoptOperation) -> GiveBackReport:
+        found.append(await operation.facts())
+        if len(found) == 1:
+            raise AdoptError("no ROS master can be started")
+        await operation.machine("phase", phase=Phase.FREE)
+        return GiveBackReport(nodes=3)
+
+    monkeypatch.setattr(AdoptOperation, "give", give)
+    monkeypatch.setattr(release_verb, "StateStore", partial(StateStore, kind=InlineDatabase))
+    monkeypatch.setattr(release_verb, "master_of", lambda *_: MASTER)
+    monkeypatch.setattr(release_verb, "end_hold", lambda: None)
+    record = AdoptRecord(
+        wanted=True,
+        phase=Phase.TAKEN,
+        boot=boot_id(),
+        program=MASTER.program,
+        unit=MASTER.unit,
+        user=MASTER.user,
+    )
+    save_record(tmp_path, record)
+    (tmp_path / "control").mkdir()
+    (tmp_path / "lock").touch()
+    file = tmp_path / "adopt.json"
+    if kind == "unreadable":
+        file.unlink()
+        file.symlink_to(file)
+    elif kind != "whole":
+        file.write_bytes({"torn": file.read_bytes()[:20], "empty": b"", "another": b"[]"}[kind])
+    with pytest.raises(NetworkError, match="no ROS master can be started"):
+        asyncio.run(release_dead(tmp_path))
+    assert asyncio.run(release_dead(tmp_path)).nodes == 3, "the first attempt has not hidden the graph"
+    assert [facts.foreign_master for facts in found] == ["", ""]
+    assert load_record(tmp_path).phase is Phase.FREE
 
 
 def test_connections_that_would_be_cut_are_counted() -> None:
