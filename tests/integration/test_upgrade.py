@@ -231,3 +231,51 @@ def test_the_package_refuses_an_upgrade_from_below_0_4_before_it_is_unpacked(
         ["sh", str(script), *arguments.split()], check=False, capture_output=True, text=True
     )
     assert (done.returncode, "install 0.4.1 first, start it once" in done.stderr) == (status, bool(status))
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["", "moved"])
+@pytest.mark.parametrize("booted", [True, False], ids=["systemd", ""])
+@pytest.mark.parametrize(
+    ("adopted", "statuses", "asked"),
+    [
+        (False, [], []),
+        (True, [0], ["--dead"]),
+        (True, [1, 0], ["--dead", "--force"]),
+        (True, [1, 1, 0], ["--dead", "--force", "--dead"]),
+        (True, [1, 1, 1], ["--dead", "--force", "--dead"]),
+    ],
+    ids=["never adopted", "given back", "by hand", "another master", "not given back"],
+)
+def test_the_removal_stops_the_service_before_it_gives_back_what_is_left(
+    tmp_path: Path, *, adopted: bool, statuses: list[int], asked: list[str], booted: bool, moved: bool
+) -> None:
+    """`rosrv release --force` of a service that waits for a port is refused, and `--dead` beside a service."""
+    places = {"/var/lib/rosrv": "default", "/usr/lib/rosrv": "program", "/run/systemd/system": "booted"}
+    text = (ROOT / "distribution" / "debian" / "rosrv.prerm").read_text()
+    for path, name in places.items():
+        text = text.replace(path, str(tmp_path / name))
+    state = tmp_path / ("moved" if moved and booted else "default")
+    for folder in (state, tmp_path / "program", tmp_path / "bin", *([tmp_path / "booted"] if booted else [])):
+        folder.mkdir()
+    if adopted:
+        (state / "adopt.json").touch()
+    (tmp_path / "statuses").write_text("".join(f"{status}\n" for status in statuses))
+    environment = f"LANG=C ROSRV_STATE={state} X=1" if moved else "LANG=C"
+    programs = {
+        "systemctl": f'echo "{environment}"',
+        "deb-systemd-invoke": 'echo "$*" >>calls',
+        "rosrv": 'echo "$*" >>calls\nstatus=$(head -n 1 statuses)\nsed -i 1d statuses\nexit "$status"',
+    }
+    for name, lines in programs.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{lines}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    done = subprocess.run(
+        ["sh", "-c", text, "rosrv.prerm", "remove"], cwd=tmp_path, check=False, capture_output=True, text=True,
+        env={"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin"},
+    )  # fmt: skip
+    calls = (tmp_path / "calls").read_text().splitlines() if (tmp_path / "calls").exists() else []
+    assert calls == [
+        *(["stop rosrv.service rosrv-hold.service"] if booted else []),
+        *(f"release {option} --state {state}" for option in asked),
+    ], done.stderr
+    assert done.returncode == (statuses or [0])[-1]
