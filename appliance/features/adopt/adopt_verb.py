@@ -3,6 +3,9 @@
 import asyncio
 import os
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +39,7 @@ from appliance.features.adopt.robot_side import (
     robot_state,
     running_settings,
     write_drop_in,
+    write_policy,
 )
 from appliance.network.namespaces import Namespace, NetworkError
 from rosmop.tool.terminal import printable, say
@@ -94,24 +98,30 @@ def adopt(
         if check or stopped:
             _show_lines(lines, as_json=appliance.as_json)
             raise typer.Exit(1 if stopped else 0)
-        if audit_only:
-            _first_audit_only(appliance, robot, None if settings is None else settings.policy)
         if when_standing:
             _wait(appliance, state, robot, within)
-        _adopt(appliance, state)
+        policy = None if settings is None else settings.policy
+        with _first_audit_only(appliance, robot, policy) if audit_only else nullcontext():
+            show = _adopt(appliance, state)
+        write_drop_in(load_record(state))
+        show()
     except NetworkError as error:
         typer.echo(f"{_VERB}: {error}", err=True)
         raise typer.Exit(1) from None
 
 
-def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | None) -> None:
+@contextmanager
+def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | None) -> Iterator[None]:
+    """Make the policy audit-only for an adoption; if that fails, the policy is as before."""
     if robot.policy is not None and robot.policy.all_audit_only:
+        yield
         return
     if policy is None:
         raise usage_error(
             "the policy is not known: start the appliance first (systemctl start rosrv)", verb=_VERB
         )
     try:
+        before = policy.read_bytes()
         lowered = make_audit_only(policy)
     except OSError as error:
         raise usage_error(f"{policy} cannot be changed: {error.strerror}", verb=_VERB) from None
@@ -121,7 +131,18 @@ def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | 
             " it, or leave out --audit-only"
         )
         raise usage_error(text, verb=_VERB)
-    say(f"{policy} now has `audit-only = all`: denials are recorded and pass; an alarm reminds you")
+    try:
+        _reload(appliance)
+        say(f"{policy} now has `audit-only = all`: denials are recorded and pass; an alarm reminds you")
+        yield
+    except NetworkError:
+        write_policy(policy, before)
+        say(f"{policy} is as before")
+        _reload(appliance)
+        raise
+
+
+def _reload(appliance: Appliance) -> None:
     try:
         answer = appliance.ask(PolicyReload())
     except NotRunningError:
@@ -142,31 +163,26 @@ def _wait(appliance: Appliance, state: Path, robot: CheckedRobot, within: float)
         raise NetworkError(f"{error}. Nothing was changed") from None
 
 
-def _adopt(appliance: Appliance, state: Path) -> None:
+def _adopt(appliance: Appliance, state: Path) -> Callable[[], None]:
+    """Order the adoption, or note it for the start of an appliance; return what shows the outcome."""
     try:
         with ordered(state, ADOPT):
             answer = appliance.ask(AdoptOrder())
     except NotRunningError:
         _note(state)
-        say("noted: the next start takes the graph over: sudo systemctl start rosrv")
-        return
+        return partial(say, "noted: the next start takes the graph over: sudo systemctl start rosrv")
     if answer.ok:
-        report = answer.given()
-        write_drop_in(load_record(state))
-        _show_report(report, as_json=appliance.as_json)
-        return
+        return partial(_show_report, answer.given(), as_json=appliance.as_json)
     if not answer.error.startswith(WAITS):
         raise NetworkError(answer.error)
     _note(state)
-    _show_started(_await_start(appliance), as_json=appliance.as_json)
+    return lambda: _show_started(_await_start(appliance), as_json=appliance.as_json)
 
 
 def _note(state: Path) -> None:
     """Write the record while no supervisor does."""
     robot = robot_state(state, running_settings(state))
-    record = wanted_record(load_record(state), robot.master)
-    save_record(state, record)
-    write_drop_in(record)
+    save_record(state, wanted_record(load_record(state), robot.master))
 
 
 def _await_start(appliance: Appliance) -> AdoptState:

@@ -110,9 +110,14 @@ def make_audit_only(policy: Path) -> bool:
         return True
     if text != shipped:
         return False
-    found = policy.stat()
-    write_whole(policy, (text + AUDIT_ONLY).encode(), found.st_mode & 0o777, (found.st_uid, found.st_gid))
+    write_policy(policy, (text + AUDIT_ONLY).encode())
     return True
+
+
+def write_policy(policy: Path, text: bytes) -> None:
+    """Replace the text of a policy's file. Raises `OSError`."""
+    found = policy.stat()
+    write_whole(policy, text, found.st_mode & 0o777, (found.st_uid, found.st_gid))
 
 
 # --- the drop-in ---

@@ -11,10 +11,12 @@ import pytest
 from typer import Exit
 
 from appliance.base.shipped import SHIPPED
-from appliance.channel.admin import AdminAnswer
+from appliance.channel.admin import AdminAnswer, PolicyReload
 from appliance.cli.connection.target import Appliance
-from appliance.features.adopt import adopt_check, release_verb
-from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport
+from appliance.cli.standing import NotStandingError
+from appliance.configuration.settings import Settings
+from appliance.features.adopt import adopt_check, adopt_verb, release_verb
+from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport, TakeOverReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
@@ -281,6 +283,67 @@ def test_only_the_shipped_policy_becomes_audit_only(tmp_path: Path) -> None:
     file.write_text(f"{DEFAULT}\n# mine\n")
     assert not make_audit_only(file)
     assert file.read_text() == f"{DEFAULT}\n# mine\n"
+
+
+@pytest.mark.parametrize(
+    ("fails", "lowered"),
+    [
+        ("standing", False),
+        ("reload", False),
+        ("order", False),
+        ("note", False),
+        ("", True),
+        ("waits", True),
+        ("starts", True),
+        ("drop-in", True),
+    ],
+)
+def test_an_adoption_that_fails_leaves_the_policy_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fails: str, lowered: bool
+) -> None:
+    """Even before it: nothing was changed while the robot moves. One that is noted goes on."""
+    policy, in_force = tmp_path / "policy.ini", [DEFAULT]
+    policy.write_text(DEFAULT)
+
+    def answer(request: object) -> object:
+        if isinstance(request, PolicyReload):
+            if fails == "reload" and policy.read_text() != DEFAULT:
+                return AdminAnswer(False, error="the audit log cannot be written")
+            in_force.append(policy.read_text())
+            return AdminAnswer(True)
+        if fails in {"note", "waits", "starts"}:
+            return AdminAnswer(False, error="waits: /usr/bin/rosmaster holds TCP 11311")
+        return AdminAnswer(False, error="it cannot be read") if fails == "order" else example(TakeOverReport)
+
+    async def stand(*_: object) -> str:
+        if fails == "standing":
+            assert in_force == [DEFAULT]
+            raise NotStandingError("the robot moves")
+        return "it stands"
+
+    def drop_in(_record: object) -> None:
+        if fails == "drop-in":
+            raise NetworkError("50-rosrv-adopt.conf cannot be written")
+
+    def await_start(_appliance: object) -> AdoptState:
+        if fails == "starts":
+            raise NetworkError("noted, but not adopted within 180 s")
+        return example(AdoptState)
+
+    world = {
+        "running_settings": lambda _state: Settings(isolation="netns", policy=policy),
+        "robot_state": lambda *_: replace(robot(), master=None) if fails == "note" else robot(),
+        "check_lines": lambda *_: [], "wait_until_standing": stand, "write_drop_in": drop_in,
+        "_await_start": await_start, "link_address": lambda: "",
+    }  # fmt: skip
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    monkeypatch.setattr(Appliance, "state_here", lambda *_: tmp_path)
+    for name, value in world.items():
+        monkeypatch.setattr(adopt_verb, name, value)
+    options = {"check": False, "status": False, "audit_only": True, "when_standing": True, "within": 1.0}
+    with nullcontext() if fails in {"", "waits"} else pytest.raises(Exit):
+        adopt_verb.adopt.function(call_of(answer), **options)
+    assert policy.read_text() == in_force[-1] == (DEFAULT + AUDIT_ONLY if lowered else DEFAULT)
 
 
 def test_the_record_survives_and_its_phase_is_of_one_boot(tmp_path: Path) -> None:
