@@ -5,7 +5,7 @@ import contextlib
 import ipaddress
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -89,7 +89,8 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
     restore(registry, store)
     trail = cast(AuditTrail, _Log())
     port = port_of_master(state)
-    machine = DeadMachine(state, record, port)
+    links = {text for node in registry.all() if _is_link(text := str(node.host))}
+    machine = DeadMachine(state, record, port, links)
     graph = AdoptedGraph(
         registry, RosGraph(registry, Grants(lambda _row: None, set), trail), cast(Subscribers, _NoSubscribers()), trail,
         _no_order, flush=lambda: None,
@@ -144,14 +145,14 @@ def _open(state: Path) -> Iterator[StateStore]:
 class DeadMachine:
     """Does the supervisor's work in its absence: see `machine_side.py`."""
 
-    def __init__(self, state: Path, record: AdoptRecord, port: int) -> None:
+    def __init__(self, state: Path, record: AdoptRecord, port: int, links: Iterable[str] = ()) -> None:
         self._state, self._record, self._port = state, record, port
-        self._host = Namespace.own()
+        self._host, self._own = Namespace.own(), [_HERE, *links]
 
     async def __call__(self, work: str, /, **terms: object) -> Found:
         if work == "look":
             facts = MachineFacts(
-                self._record, _HERE, _HERE, own=[_HERE], master=master_of(self._host, self._port)
+                self._record, _HERE, _HERE, own=self._own, master=master_of(self._host, self._port)
             )
             return dict(msgspec.to_builtins(facts))
         if work == "stand in":

@@ -11,7 +11,6 @@ from collections.abc import Awaitable, Callable, Collection, Mapping
 from appliance.base import clock
 from appliance.features.adopt.places import NodeCaller
 from appliance.master.graph.registry import Incarnation
-from appliance.policy.model import Address
 from appliance.rpc.host_shares import HostShare, serve_by_host
 from appliance.rpc.master_reader import PUBLICATION, MasterGraph
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -25,6 +24,8 @@ _PAUSE_SECONDS = 0.02
 _LONGEST = 200  # characters of URIs that a node says
 
 Subscription = tuple[Incarnation, str]
+NodeShare = Callable[[Incarnation], str]
+"""Returns the share by which a node is called, see `NodePlace.share`."""
 
 
 def lists_of(graph: MasterGraph) -> dict[str, list[str]]:
@@ -36,31 +37,28 @@ def lists_of(graph: MasterGraph) -> dict[str, list[str]]:
     return lists
 
 
-async def send_lists(call: NodeCaller, seconds: float, *lists: Mapping[Subscription, list[str]]) -> list[str]:
+async def send_lists(
+    call: NodeCaller, seconds: float, share: NodeShare, *lists: Mapping[Subscription, list[str]]
+) -> list[str]:
     """Send each subscriber its lists in this order; return the names of the nodes that did not take them in that time.
 
-    A host that does not answer delays only its own nodes.
+    A node of this machine that does not answer delays only itself, and another host only its own nodes.
     """
     failed: set[str] = set()
-    turns: dict[Address, asyncio.Semaphore] = {}
 
-    async def tell(node: Incarnation, topic: str) -> None:
-        async with turns.setdefault(node.host, asyncio.Semaphore(_AT_ONCE_OF_HOST)):
-            for one in lists:
-                if node.name in failed:
-                    return
-                try:
-                    await call(node.call_uri, "publisherUpdate", topic, [*one[node, topic]])
-                except CallFailedError:
-                    failed.add(node.name)
+    async def tell(row: Subscription) -> None:
+        node, topic = row
+        for one in lists:
+            if node.name in failed:
+                return
+            try:
+                await call(node.call_uri, "publisherUpdate", topic, [*one[row]])
+            except CallFailedError:
+                failed.add(node.name)
 
-    calls = {asyncio.create_task(tell(*row)): row[0].name for row in (lists[0] if lists else ())}
-    late: set[asyncio.Task[None]] = set()
-    if calls:
-        _done, late = await asyncio.wait(calls, timeout=seconds)
-    for one in late:
-        one.cancel()
-    return sorted(failed.union(calls[one] for one in late))
+    rows = {row: share(row[0]) for row in (lists[0] if lists else ())}
+    told = await serve_by_host(rows, tell, HostShare(seconds, seconds, _AT_ONCE_OF_HOST))
+    return sorted(failed.union(node.name for node, topic in rows if (node, topic) not in told))
 
 
 async def until_least(number: Callable[[], Awaitable[int]]) -> None:
@@ -101,6 +99,7 @@ async def until_connected(
 
 async def reconnect(
     call: NodeCaller,
+    share: NodeShare,
     lists: Mapping[Subscription, Collection[str]],
     tell: Callable[[Subscription], Awaitable[object]],
 ) -> dict[str, str]:
@@ -130,7 +129,7 @@ async def reconnect(
             await asyncio.sleep(_PAUSE_SECONDS)
         return why
 
-    lost = await serve_by_host({row: str(row[0].host) for row in lists}, lose, _LOSE_SHARE)
+    lost = await serve_by_host({row: share(row[0]) for row in lists}, lose, _LOSE_SHARE)
     late = {row: why for row in lists if (why := lost.get(row, "not asked in time"))}
     for row in late:
         await tell(row)

@@ -208,6 +208,7 @@ class AdoptOperation:
     left: LeftThere = field(default_factory=LeftThere)
     _who: str = field(default="", init=False)
     _hidden: bool = field(default=False, init=False)
+    _facts: MachineFacts = field(init=False)
     _taking: asyncio.Timeout | None = field(default=None, init=False)
     _ends: bool = field(default=False, init=False)
     _read_there: dict[str, Value] = field(default_factory=dict, init=False)
@@ -217,7 +218,11 @@ class AdoptOperation:
         uris = list(nodes)
         ports = sorted({uri.port for uri in uris})
         found = await self.machine("look", ports=ports, names=names_to_resolve(uris))
-        return msgspec.convert(found, MachineFacts, strict=False)
+        self._facts = msgspec.convert(found, MachineFacts, strict=False)
+        return self._facts
+
+    def _share(self, node: Incarnation) -> str:
+        return _place_of(node).share(self._facts)
 
     async def settle(self, facts: MachineFacts, *, settled: bool) -> TakeOverReport | GiveBackReport | None:
         """Bring the graph to what the record wants; `settled`: this process has done so already.
@@ -442,7 +447,9 @@ class AdoptOperation:
         async def tell(row: Subscription) -> None:
             self.graph.remind(*row)
 
-        self.left.connections |= await reconnect(self.call, self.graph.clocks(places.found), tell)
+        self.left.connections |= await reconnect(
+            self.call, self._share, self.graph.clocks(places.found), tell
+        )
         await self._until_told()
 
     async def _until_told(self) -> None:
@@ -764,8 +771,10 @@ class AdoptOperation:
         return await self._forget(report, began, last)
 
     def _nodes(self) -> list[HeldNode]:
+        """Return the nodes, those of this machine first."""
         held = list(self.graph.held())
-        return [(node, {entry for entry, holder in held if holder is node}) for node in self.graph.nodes()]
+        nodes = sorted(self.graph.nodes(), key=lambda node: not _place_of(node).is_here(self._facts))
+        return [(node, {entry for entry, holder in held if holder is node}) for node in nodes]
 
     async def _give_topics(self, foreign: str, began: float) -> GiveBackReport:
         """Connect the nodes with one another again. The master there may be hostile, so it gets nothing."""
@@ -788,12 +797,12 @@ class AdoptOperation:
         await self.machine("leave")
         lists = last.of_nodes_that_answer()
         clocks = {row: lists.pop(row) for row in [*lists] if row[1] == CLOCK}
-        await send_lists(self.call, _BESIDES_SECONDS, lists)
+        await send_lists(self.call, _BESIDES_SECONDS, self._share, lists)
 
         async def tell(row: Subscription) -> None:
-            await send_lists(self.call, _BESIDES_SECONDS, {row: clocks[row]})
+            await send_lists(self.call, _BESIDES_SECONDS, self._share, {row: clocks[row]})
 
-        await reconnect(self.call, clocks, tell)
+        await reconnect(self.call, self._share, clocks, tell)
         await self._remind(last, clocks)
         self.graph.forget()
         self.graph.denied.clear()
@@ -871,8 +880,8 @@ class AdoptOperation:
             for name, uri in there.nodes.items()
             if known.nodes.get(name) != uri and (name not in nodes or nodes[name].api_text != uri)
         ]
-        hosts = {name: str(nodes[name].host) for name in names if name in nodes}
-        found = await serve_by_host(hosts, is_newer, HostShare(_NEWER_SECONDS, _NEWER_SECONDS))
+        shares = {name: self._share(nodes[name]) for name in names if name in nodes}
+        found = await serve_by_host(shares, is_newer, HostShare(_NEWER_SECONDS, _NEWER_SECONDS))
         return {name for name in names if found.get(name, True)}
 
     @staticmethod
@@ -934,9 +943,10 @@ class AdoptOperation:
             (node, topic): [*self.graph.given(node, topic)] if self.forwards else [] for node, topic in rows
         }
         both = {row: [*dict.fromkeys((*last.lists[row], *present[row]))] for row in rows}
-        await send_lists(self.call, _BESIDES_SECONDS, present, both)
+        await send_lists(self.call, _BESIDES_SECONDS, self._share, present, both)
         await until_connected(self.call, last.wanted(rows))
-        last.failed = await send_lists(self.call, _LISTS_SECONDS, {row: last.lists[row] for row in rows})
+        final = {row: last.lists[row] for row in rows}
+        last.failed = await send_lists(self.call, _LISTS_SECONDS, self._share, final)
         await self._remind(last, rows)
         return last
 
@@ -947,7 +957,9 @@ class AdoptOperation:
             missing = await until_connected(self.call, last.wanted(rows))
             if not missing or clock.now() >= until:
                 return
-            await send_lists(self.call, _BESIDES_SECONDS, {row: last.lists[row] for row in missing})
+            await send_lists(
+                self.call, _BESIDES_SECONDS, self._share, {row: last.lists[row] for row in missing}
+            )
 
 
 async def _whole(change: Awaitable[T]) -> T:
@@ -967,7 +979,11 @@ def _unregistration(entry: Entry, there: MasterGraph) -> MasterCall:
 
 
 def _places_of(nodes: Iterable[Incarnation]) -> Places:
-    return Places({node.name: NodePlace(node.api_text, node.api, node.host) for node in nodes})
+    return Places({node.name: _place_of(node) for node in nodes})
+
+
+def _place_of(node: Incarnation) -> NodePlace:
+    return NodePlace(node.api_text, node.api, node.host)
 
 
 def _graph_of(nodes: list[HeldNode]) -> MasterGraph:

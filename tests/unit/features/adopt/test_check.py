@@ -21,6 +21,7 @@ from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
 from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.places import NodePlace
 from appliance.features.adopt.release_verb import release_dead
 from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
 from appliance.features.adopt.robot_side import AUDIT_ONLY, make_audit_only
@@ -30,6 +31,7 @@ from appliance.network.namespaces import NetworkError
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.graph_inventory import GraphInventory, SurveyedNode, SurveyedService, SurveyedTopic
 from appliance.store.state_file import StateStore
+from roswire.uris import NodeUri
 from tests.support.answers import example
 from tests.support.engines import InlineDatabase
 from tests.support.memory_call import call_of
@@ -176,9 +178,13 @@ def test_a_release_without_the_appliance_looks_for_the_master_on_its_port(
     (tmp_path / "run" / "config.json").write_text(json.dumps({"listen": listen}))
     asked: list[int] = []
     monkeypatch.setattr(release_verb, "master_of", lambda _host, port: asked.append(port))
-    machine = release_verb.DeadMachine(tmp_path, AdoptRecord(), release_verb.port_of_master(tmp_path))
-    asyncio.run(machine("look"))
+    machine = release_verb.DeadMachine(
+        tmp_path, AdoptRecord(), release_verb.port_of_master(tmp_path), [str(LINK)]
+    )
+    found = asyncio.run(machine("look"))
     assert asked == [int(listen[-5:])]
+    place = NodePlace("http://base:4001/", NodeUri("http", "base", 4001, "/"), LINK)
+    assert place.share(msgspec.convert(found, MachineFacts, strict=False)) == "port 4001"
 
 
 @pytest.mark.parametrize("phase", ["free", "taken"])

@@ -39,15 +39,17 @@ TAKE = (
 GIVE = ("silence", "stand in", "give", "withdraw", "give again", "tell", "given", "forget", "released")
 
 
+def add_nodes(world: RobotWorld) -> None:
+    world.add("/base", 4001, publishes=("/odom", "/rosout"), subscribes=("/cmd_vel",), services=("/reset",))
+    world.add("/teleop", 4002, publishes=("/cmd_vel", "/rosout"), subscribes=("/odom",))
+    world.add("/rviz", 4003, publishes=("/rosout",), subscribes=("/odom",))
+
+
 def run(story: Callable[[RobotWorld], Coroutine[Any, Any, None]], *, nodes: bool = True) -> RobotWorld:
     async def told() -> RobotWorld:
         world = RobotWorld(await ControlParts.begun())
         if nodes:
-            world.add(
-                "/base", 4001, publishes=("/odom", "/rosout"), subscribes=("/cmd_vel",), services=("/reset",)
-            )
-            world.add("/teleop", 4002, publishes=("/cmd_vel", "/rosout"), subscribes=("/odom",))
-            world.add("/rviz", 4003, publishes=("/rosout",), subscribes=("/odom",))
+            add_nodes(world)
         await story(world)
         return world
 
@@ -216,6 +218,38 @@ def test_a_kill_after_any_step_of_giving_back_ends_as_the_record_wants(
         require_given(world)
 
     run(story)
+
+
+@pytest.mark.parametrize("topics", [1, 16, 40])
+@pytest.mark.parametrize("where", ["here", "one host", "many hosts"])
+def test_nodes_that_hang_delay_no_node_of_this_computer(where: str, topics: int) -> None:
+    async def story(world: RobotWorld) -> None:
+        subscribed = tuple(f"/t{number}" for number in range(topics))
+        for number in range(1 if where == "here" else 20):
+            host = "base" if where == "here" else f"nuc{number if where == 'many hosts' else 0}"
+            if where != "here":
+                world.resolved.setdefault(host, [f"192.168.50.{100 + len(world.resolved)}"])
+            world.add(
+                f"/a_recorder{number}",
+                4100 + number,
+                f"http://{host}:{4100 + number}/",
+                publishes=("/a_diagnosis",),
+                subscribes=subscribed,
+            )
+        add_nodes(world)
+        await world.until_settled()
+        hanging = [node for node in world.robot.values() if node.name.startswith("/a_recorder")]
+        for node in hanging:
+            node.hangs = True
+        report = await world.operation.release()
+        assert report.failed == sorted(node.name for node in hanging)
+        assert report.seconds < 9
+        for node in hanging:
+            del world.robot[node.name]
+        require_hearing(world)
+        assert world.robot["/rviz"].lists["/odom"] == [world.robot["/base"].uri]
+
+    run(story, nodes=False)
 
 
 def test_a_dead_connection_to_a_publisher_leaves_no_subscriber_deaf_after_the_release() -> None:
