@@ -1,6 +1,7 @@
 """Describe the machine of an adoption, as the supervisor sees it."""
 
 import ipaddress
+import re
 from contextlib import suppress
 
 import msgspec
@@ -10,6 +11,10 @@ from roswire.uris import NodeUri
 
 FIRST_PORT = 1024
 """The first port that is cut: smaller ones belong to the machine, whatever a node says."""
+
+STAND_IN_UNIT = "rosrv-left-master"
+_TRANSIENT = re.compile(rf".+\.scope|{STAND_IN_UNIT}\.service|run-(?:u?\d+|r[0-9a-f]+)\.service")
+"""Units without a file, of which a login, a release or `systemd-run` makes another one each time."""
 
 
 class RobotMaster(msgspec.Struct, frozen=True):
@@ -48,7 +53,9 @@ class MachineFacts(msgspec.Struct, frozen=True):
         adopted = record.wanted or record.phase is not Phase.FREE
         if found is None or not adopted or not record.program or found.pid == record.stand_in:
             return ""
-        if (found.unit, found.user) == (record.unit, record.user):
+        lasts = record.unit and not _TRANSIENT.fullmatch(record.unit)
+        same = found.unit == record.unit if lasts else found.program == record.program
+        if same and found.user == record.user:
             return ""
         recorded = f"{record.program} ({record.unit or 'no unit'}, user {record.user})"
         return f"{found.program} ({found.unit or 'no unit'}, user {found.user}) is not the recorded master {recorded}"

@@ -27,7 +27,7 @@ import structlog
 from appliance.base import clock
 from appliance.base.host_names import addresses_of
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, load_record, save_record
-from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts, RobotMaster
+from appliance.features.adopt.machine_facts import FIRST_PORT, STAND_IN_UNIT, MachineFacts, RobotMaster
 from appliance.features.adopt.operator_orders import ADOPT, RELEASE, take_order
 from appliance.network import interfaces
 from appliance.network.cut import RemotePort, end_connections, refuse_no_port, refuse_ports
@@ -47,7 +47,6 @@ from appliance.network.socket_owners import (
 from appliance.supervisor.machine_work import Found, Terms
 from appliance.supervisor.users import account_of
 
-STAND_IN_UNIT = "rosrv-left-master"
 ROSMASTER = "/usr/bin/rosmaster"
 _SYSTEMD = Path("/run/systemd/system")
 _MAX_NAMES = _MAX_PORTS = 20_000
@@ -303,16 +302,20 @@ class AdoptWork:
 def wanted_record(record: AdoptRecord, found: RobotMaster | None) -> AdoptRecord:
     """Return the record of a wanted adoption of the graph of `found`. Raises `NetworkError` without a master.
 
-    An adoption that is wanted already keeps the master that was recorded.
+    An adoption that is wanted already, or of the graph of a stand-in, keeps the master that was recorded.
     """
     if record.wanted:
         return record
     if found is None:
         raise NetworkError("no ROS master of the robot is running: start the robot first")
+    record = msgspec.structs.replace(
+        record, wanted=True, since_utc=clock.utc_now().isoformat(timespec="seconds")
+    )
+    if record.program and found.pid == record.stand_in:
+        return record
     return msgspec.structs.replace(
-        record, wanted=True, since_utc=clock.utc_now().isoformat(timespec="seconds"), unit=found.unit, user=found.user,
-        program=found.program, group=found.group,
-    )  # fmt: skip
+        record, unit=found.unit, user=found.user, program=found.program, group=found.group
+    )
 
 
 def master_of(host: Namespace, port: int) -> RobotMaster | None:

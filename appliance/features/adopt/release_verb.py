@@ -158,7 +158,8 @@ class DeadMachine:
         if work == "stand in":
             Isolation(self._host, IsolationSettings(ports=(PortRange.one(self._port),))).clear()
             if master_of(self._host, self._port) is None:
-                start_stand_in(self._host, self._port, self._record)
+                stand_in = start_stand_in(self._host, self._port, self._record)
+                self._record = msgspec.structs.replace(self._record, stand_in=stand_in)
                 return {"started": True}
         if work == "phase" and terms["phase"] is Phase.FREE:
             save_record(self._state, msgspec.structs.replace(self._record, wanted=False, phase=Phase.FREE))

@@ -11,7 +11,7 @@ from appliance.base.clock import using
 from appliance.features.adopt import machine_side
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
-from appliance.features.adopt.machine_side import AdoptWork
+from appliance.features.adopt.machine_side import AdoptWork, wanted_record
 from appliance.features.adopt.operator_orders import ADOPT, RELEASE, ordered
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings, LinkAddresses
@@ -212,6 +212,45 @@ def test_a_foreign_master_is_foreign_until_the_graph_is_given_back() -> None:
     assert "user mallory) is not the recorded master" in facts.foreign_master
     free = msgspec.structs.replace(facts, record=msgspec.structs.replace(facts.record, phase=Phase.FREE))
     assert free.foreign_master == ""
+
+
+STAND_IN = msgspec.structs.replace(MASTER, pid=8, unit="rosrv-left-master.service")
+
+
+@pytest.mark.parametrize("boot", ["this", "next"])
+@pytest.mark.parametrize(
+    ("first", "next_boot"),
+    [
+        (MASTER, MASTER),
+        (msgspec.structs.replace(MASTER, unit=""), MASTER),
+        *(
+            (msgspec.structs.replace(MASTER, unit=one), msgspec.structs.replace(MASTER, unit=other))
+            for one, other in (
+                ("session-3.scope", "session-5.scope"),
+                ("vte-spawn-1f.scope", "vte-spawn-2e.scope"),
+                ("docker-1f.scope", "docker-2e.scope"),
+                ("run-u17.service", "run-u4.service"),
+                ("run-r1f2e.service", "run-r2e1f.service"),
+                ("session-3.scope", "roscore.service"),
+            )
+        ),
+        (STAND_IN, MASTER),
+    ],
+    ids=lambda master: master.unit,
+)
+def test_the_recorded_master_is_the_same_after_a_login_a_boot_and_a_release(
+    first: RobotMaster, next_boot: RobotMaster, boot: str
+) -> None:
+    earlier = AdoptRecord(boot="this", user="root", unit="roscore.service", program=MASTER.program)
+    for before in (AdoptRecord(boot="this"), msgspec.structs.replace(earlier, stand_in=STAND_IN.pid)):
+        stands_in = first is STAND_IN and before.stand_in
+        record = wanted_record(before, first).now(boot)
+        later = msgspec.structs.replace(next_boot, pid=20, user="root" if stands_in else first.user)
+        there = first if boot == "this" else later
+        assert MachineFacts(record, "", "", master=there).foreign_master == ""
+        for changed in ({"user": "mallory"}, {"program": "/tmp/master", "unit": "another.service"}):
+            other = msgspec.structs.replace(there, pid=21, **changed)
+            assert MachineFacts(record, "", "", master=other).foreign_master
 
 
 def test_other_machines_wait_for_a_graph_until_it_is_released(machine: Machine) -> None:
