@@ -233,7 +233,7 @@ def test_the_package_refuses_an_upgrade_from_below_0_4_before_it_is_unpacked(
     assert (done.returncode, "install 0.4.1 first, start it once" in done.stderr) == (status, bool(status))
 
 
-@pytest.mark.parametrize("moved", [False, True], ids=["", "moved"])
+@pytest.mark.parametrize(("moved", "closed"), [(False, False), (True, True)], ids=["", "moved, closed"])
 @pytest.mark.parametrize("booted", [True, False], ids=["systemd", ""])
 @pytest.mark.parametrize(
     ("adopted", "statuses", "asked"),
@@ -247,7 +247,14 @@ def test_the_package_refuses_an_upgrade_from_below_0_4_before_it_is_unpacked(
     ids=["never adopted", "given back", "by hand", "another master", "not given back"],
 )
 def test_the_removal_stops_the_service_before_it_gives_back_what_is_left(
-    tmp_path: Path, *, adopted: bool, statuses: list[int], asked: list[str], booted: bool, moved: bool
+    tmp_path: Path,
+    *,
+    adopted: bool,
+    statuses: list[int],
+    asked: list[str],
+    booted: bool,
+    moved: bool,
+    closed: bool,
 ) -> None:
     """`rosrv release --force` of a service that waits for a port is refused, and `--dead` beside a service."""
     places = {"/var/lib/rosrv": "default", "/usr/lib/rosrv": "program", "/run/systemd/system": "booted"}
@@ -263,6 +270,7 @@ def test_the_removal_stops_the_service_before_it_gives_back_what_is_left(
     environment = f"LANG=C ROSRV_STATE={state} X=1" if moved else "LANG=C"
     programs = {
         "systemctl": f'echo "{environment}"',
+        "nft": f"exit {int(not closed)}",
         "deb-systemd-invoke": 'echo "$*" >>calls',
         "rosrv": 'echo "$*" >>calls\nstatus=$(head -n 1 statuses)\nsed -i 1d statuses\nexit "$status"',
     }
@@ -279,3 +287,4 @@ def test_the_removal_stops_the_service_before_it_gives_back_what_is_left(
         *(f"release {option} --state {state}" for option in asked),
     ], done.stderr
     assert done.returncode == (statuses or [0])[-1]
+    assert ("nft delete table inet rosrv_protect" in done.stderr) is (closed and done.returncode == 0)

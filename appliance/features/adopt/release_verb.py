@@ -38,6 +38,7 @@ from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import restore
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.network import close_ports
 from appliance.network.boot_hold import BootHold
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
@@ -213,6 +214,10 @@ class _Log:
 
 
 _VERB = "rosrv release"
+_STILL_CLOSED = (
+    "the rules of `rosrv protect` stay in force, so other machines do not reach the topics and services of the robot's"
+    " nodes: sudo rosrv protect --remove"
+)
 
 
 @speaks_here
@@ -256,6 +261,9 @@ def release(
     except NetworkError as error:
         typer.echo(f"{_VERB}: {error}", err=True)
         raise typer.Exit(1) from None
+    with contextlib.suppress(NetworkError):  # without nft, nothing closes them
+        if report.nodes and close_ports.is_applied():
+            typer.echo(_STILL_CLOSED, err=True)
     if appliance.as_json:
         say_json(msgspec.to_builtins(report))
         return

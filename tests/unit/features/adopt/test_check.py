@@ -230,6 +230,37 @@ def test_a_release_of_an_appliance_that_waits_lets_other_machines_in(
     assert load_record(tmp_path).wanted is (record.wanted and not released)
 
 
+@pytest.mark.parametrize("as_json", [False, True])
+@pytest.mark.parametrize(
+    ("report", "status"),
+    [
+        (GiveBackReport(nodes=3), 0),
+        (GiveBackReport(nodes=3, withheld=5, withheld_from="another master"), 1),
+        (GiveBackReport(), 0),
+    ],
+    ids=["given back", "withheld", "nothing adopted"],
+)
+@pytest.mark.parametrize("closed", [True, False], ids=["closed", "open"])
+def test_a_release_names_the_rules_that_still_close_the_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    report: GiveBackReport,
+    status: int,
+    closed: bool,
+    as_json: bool,
+) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    monkeypatch.setattr(release_verb, "ordered", lambda _state, _order: nullcontext())
+    monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
+    monkeypatch.setattr(release_verb.close_ports, "is_applied", lambda: closed)
+    with pytest.raises(Exit) if status and not as_json else nullcontext():
+        release_verb.release.function(
+            call_of(lambda _: report, as_json=as_json), dead=False, force=True, within=1.0
+        )
+    assert ("sudo rosrv protect --remove" in capsys.readouterr().err) is (closed and report.nodes > 0)
+
+
 @pytest.mark.parametrize("kind", ["whole", "torn", "empty", "another", "unreadable"])
 def test_a_release_without_the_appliance_gives_back_whatever_its_record_is(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: str
