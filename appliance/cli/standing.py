@@ -46,6 +46,7 @@ from appliance.cli.robot_motions import (
     speed_of,
     unseen,
 )
+from appliance.network.close_ports import LINK
 from appliance.network.interfaces import addresses_by_interface
 from appliance.network.namespaces import Namespace
 from appliance.rpc.graph_reader import is_here
@@ -61,7 +62,6 @@ from roswire.uris import node_uri, parse_node_uri
 
 A = TypeVar("A")
 _NAME = "/rosrv_standing"
-_LINK = "veth-rosrv"
 _LOOK_SECONDS = 0.2
 _MAX_OF_LOOK = 20  # messages
 _COUNTED_SECONDS = 1.5  # after which the appliance's numbers have what passed
@@ -185,7 +185,7 @@ def _is_address(text: str) -> bool:
 
 def link_address() -> str:
     """Return the machine's address on the appliance's link; empty while no appliance with such a link runs."""
-    held = addresses_by_interface(Namespace.own()).get(_LINK, [])
+    held = addresses_by_interface(Namespace.own()).get(LINK, [])
     return next((text.partition("/")[0] for text in held if "." in text), "")
 
 

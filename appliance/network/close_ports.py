@@ -25,6 +25,9 @@ from appliance.network.hang_detection import run_program
 from appliance.network.namespaces import NetworkError
 
 TABLE = "rosrv_protect"
+LINK = "veth-rosrv"
+"""The interface of this machine that leads to its own appliance, whose address each start chooses (`isolation.py`)."""
+
 TUNNEL_TABLE = "rosrv_tunnel"
 RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 # Not through IPsec, arriving and leaving. The first pair is for ESP in the kernel, the other for ESP in user space on
@@ -118,16 +121,21 @@ def protection(
     *,
     strict: LocalCallers | None = None,
 ) -> str:
-    """Return the nftables file. `strict`: only these programs of the machine itself reach the ports."""
+    """Return the nftables file for appliances with these addresses, or behind `LINK`.
+
+    `strict`: only these programs of the machine itself reach the ports.
+    """
     if not appliances:
         raise ValueError("give the address of at least one appliance")
-    rules, leaving = ['iifname "lo" accept'], []
+    addresses = sorted({*appliances} - {LINK})
+    ends = [(f'iifname "{LINK}"', f'oifname "{LINK}"')] if LINK in appliances else []
     for keyword, version in (("ip", 4), ("ip6", 6)):
-        found = [text for text in appliances if ipaddress.ip_address(text).version == version]
+        found = [text for text in addresses if ipaddress.ip_address(text).version == version]
         if found:
-            addresses = f"{{ {', '.join(sorted(set(found)))} }}"
-            rules.append(f"{keyword} saddr {addresses} accept")
-            leaving.append(f"{keyword} daddr {addresses} {_SYN} iif != 0 fib saddr type local counter drop")
+            named = f"{{ {', '.join(found)} }}"
+            ends.append((f"{keyword} saddr {named}", f"{keyword} daddr {named}"))
+    rules = ['iifname "lo" accept', *(f"{arriving} accept" for arriving, _leaving in ends)]
+    leaving = [f"{end} {_SYN} iif != 0 fib saddr type local counter drop" for _arriving, end in ends]
     opened = [f"{service.protocol} dport {service.ports} accept" for service in dict.fromkeys(services)]
     local = (
         []

@@ -5,8 +5,9 @@ Exit status: 0 done, or closed; 1 a port is open; 2 failed, no answer, or closed
 
 import json
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
+from ipaddress import ip_address, ip_interface
 from typing import Annotated, Any, Literal, NoReturn
 from urllib.parse import urlsplit
 
@@ -22,6 +23,7 @@ from appliance.features.tunnels.requests import HostPorts
 from appliance.network import close_ports as protection
 from appliance.network import scan as scanner
 from appliance.network.firewall.firewall_rules import PortRange
+from appliance.network.interfaces import addresses_by_interface
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.scan import ScanResult, addresses_of
 from rosmop.tool.terminal import printable
@@ -163,7 +165,7 @@ def _make(
     as_json: bool,
 ) -> None:
     text = protection.protection(
-        [protection.parse_address(appliance) for appliance in appliances], ports, services, strict=local
+        _named(map(protection.parse_address, appliances)), ports, services, strict=local
     )
     for service in services:
         if service.ports.last < ports.first or service.ports.first > ports.last:
@@ -184,6 +186,16 @@ def _make(
         )
     else:
         _say(as_json, {"event": "file", "ports": str(ports), "appliances": appliances, "text": text}, text)
+
+
+def _named(appliances: Iterable[str]) -> list[str]:
+    """Return the addresses, and the link for one on this machine, whose address may change at a start."""
+    held = addresses_by_interface(Namespace.own()).get(protection.LINK, [])
+    near = [ip_interface(text).network for text in held]
+    named = (
+        protection.LINK if any(ip_address(one) in network for network in near) else one for one in appliances
+    )
+    return [*dict.fromkeys(named)]
 
 
 def _remove(as_json: bool) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network import interfaces
+from appliance.network.close_ports import LINK
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program
 from tests.support.translators import TRANSLATORS, guest_behind, load
@@ -86,6 +87,23 @@ def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attack
         assert reaches(robot, "127.0.0.1", INSIDE)
         protect(robot, "--remove")
         assert reaches(attacker, robot.address, INSIDE)
+
+
+def test_the_appliance_of_this_machine_reaches_the_ports_by_each_address(
+    lab: Lab, robot: Host, attacker: Host
+) -> None:
+    """Its next start chooses another one, for example after the route of a VPN."""
+    appliance = lab.host("inside", "10.77.0.3/24")
+    interfaces.create_veth(robot.namespace, LINK, appliance.namespace, "link")
+    for number in (1, 5):
+        interfaces.add_address(robot.namespace, LINK, f"10.111.0.{number}/30")
+        interfaces.add_address(appliance.namespace, "link", f"10.111.0.{number + 1}/30")
+        if number == 1:
+            protect(robot, "--appliance", "10.111.0.2", "--ports", FEW, "--apply")
+        with listening(robot, INSIDE):
+            assert reaches(appliance, f"10.111.0.{number}", INSIDE)
+            assert not reaches(appliance, robot.address, INSIDE), "it comes by another interface"
+            assert not reaches(attacker, robot.address, INSIDE)
 
 
 @contextlib.contextmanager

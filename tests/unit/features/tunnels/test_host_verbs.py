@@ -1,5 +1,6 @@
 import io
 import tarfile
+from ipaddress import ip_address, ip_interface
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ from appliance.channel.admin import (
 )
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.main import app
+from appliance.features.tunnels import protect_verb
 from appliance.features.tunnels.tunnel_answers import KitParts
+from appliance.network.close_ports import LINK, protection
+from appliance.network.firewall.firewall_rules import PortRange
+from appliance.network.isolation import IsolationSettings
 from tests.support.answers import example
 
 
@@ -58,3 +63,23 @@ def test_a_kit_on_standard_output(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     with tarfile.open(tmp_path / "rosrv-laptop.tar.gz") as archive:
         assert any(name.endswith("join.sh") for name in archive.getnames())
     assert (tmp_path / "rosrv-laptop.tar.gz").read_bytes()[-4:] != bytes(4), "it has its own size"
+
+
+@pytest.mark.parametrize("link", [["10.111.0.1/30", "fd52:4f53:5256::1/64"], ["10.111.0.5/30"], []])
+@pytest.mark.parametrize(
+    "appliance", ["10.111.0.2", "10.111.0.6", "fd52:4f53:5256::2", "10.111.5.20", "192.168.1.2"]
+)
+def test_the_rules_for_an_appliance_of_this_machine_have_no_address(
+    monkeypatch: pytest.MonkeyPatch, link: list[str], appliance: str
+) -> None:
+    """Each start chooses it. Another machine may have an address of the same private network."""
+    assert IsolationSettings(ports=(PortRange(1, 2),)).link == LINK
+    monkeypatch.setattr(
+        protect_verb, "addresses_by_interface", lambda _: {"eth0": ["10.111.5.1/24"], LINK: link}
+    )
+    text = protection(protect_verb._named([appliance, "10.9.9.9"]), PortRange(32768, 60999), ())
+    near = any(ip_address(appliance) in ip_interface(one).network for one in link)
+    assert (appliance in text, 'iifname "veth-rosrv" accept' in text) == (not near, near)
+    dropped = " flags & (syn | ack) == syn iif != 0 fib saddr type local counter drop"
+    assert (f'oifname "veth-rosrv" tcp{dropped}' in text) is near
+    assert "10.9.9.9" in text
