@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -26,6 +27,7 @@ from appliance.features.adopt.release_verb import release_dead
 from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
 from appliance.features.adopt.robot_side import AUDIT_ONLY, make_audit_only
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation
+from appliance.network import close_ports
 from appliance.network.listening_sockets import TcpSocket
 from appliance.network.namespaces import NetworkError
 from appliance.policy.policy_compiler import compile_policy
@@ -218,7 +220,7 @@ def test_a_release_of_an_appliance_that_waits_lets_other_machines_in(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, record: AdoptRecord, released: bool
 ) -> None:
     ended: list[bool] = []
-    waits = AdminAnswer(False, error="waits: /usr/bin/rosmaster (roscore.service) holds TCP 11311")
+    waits = AdminAnswer[Any](False, error="waits: /usr/bin/rosmaster (roscore.service) holds TCP 11311")
     save_record(tmp_path, msgspec.structs.replace(record, boot=boot_id()))
     monkeypatch.setattr("os.geteuid", lambda: 0)
     monkeypatch.setattr(Appliance, "state_here", lambda *_: tmp_path)
@@ -253,7 +255,7 @@ def test_a_release_names_the_rules_that_still_close_the_nodes(
     monkeypatch.setattr("os.geteuid", lambda: 0)
     monkeypatch.setattr(release_verb, "ordered", lambda _state, _order: nullcontext())
     monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
-    monkeypatch.setattr(release_verb.close_ports, "is_applied", lambda: closed)
+    monkeypatch.setattr(close_ports, "is_applied", lambda: closed)
     with pytest.raises(Exit) if status and not as_json else nullcontext():
         release_verb.release.function(
             call_of(lambda _: report, as_json=as_json), dead=False, force=True, within=1.0
