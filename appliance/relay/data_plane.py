@@ -31,6 +31,7 @@ from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.guard_trial import GuardTrials
 from appliance.relay.monitors.heartbeat import Heartbeat
 from appliance.relay.monitors.interceptor import Interceptor, MonitorOrder
+from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.ranked_topics import RankedTopics
 from appliance.relay.relay_limits import RelayLimits
@@ -218,6 +219,7 @@ class DataPlane:
             if client.service.key == key and service in {None, client.service.service}:
                 client.cut(reason)
         for entry in [entry for entry in self._services if entry[0] == key and service in {None, entry[1]}]:
+            self.interceptor.shadow.understand(ObservationPoint(*entry), "")
             row = self._services.pop(entry).row(*entry)
             if row is not None:
                 self._last_rows.append(row)
@@ -385,6 +387,7 @@ class DataPlane:
         if self._own.get(topic) is relayed.upstream:
             del self._own[topic]
         relayed.upstream.close()  # its remaining subscribers get nothing more
+        self.interceptor.shadow.understand(relayed.point, "")
         self._ranks.withdraw(key, topic)
         self.interceptor.invalidate_prepared()  # its pipeline's counts are collected once more, and then freed
         self._cut_members(relayed, reason)

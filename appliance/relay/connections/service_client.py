@@ -248,7 +248,7 @@ class ServiceClient:
 
     def recheck(self) -> None:
         if self._greeted:
-            objection = self._context.interceptor.service_objection(self.service.service, self._header)
+            objection = self._context.interceptor.service_objection(self._server_point, self._header)
             if objection:
                 self.cut(objection)
 
@@ -296,7 +296,7 @@ class ServiceClient:
         if "error" in header:
             self._turn_away(header["error"])
             return
-        objection = self._context.interceptor.service_objection(self.service.service, header)
+        objection = self._context.interceptor.service_objection(self._server_point, header)
         if objection:
             self._context.reporter.send(PublicationRefused(self.service.key, self.service.service, objection))
             self._turn_away(objection)
@@ -313,10 +313,14 @@ class ServiceClient:
         self._safely(self._exchange.from_service, self._parser.rest)
 
     def _judge(self, part: str, body: bytes) -> ServiceReply:
-        service = self.service
-        sender = (self.host, self.caller_id) if part == "request" else (service.host, service.node)
-        point = ObservationPoint(service.key, service.service, *sender)
+        point = self._server_point
+        if part == "request":
+            point = point._replace(host=self.host, caller_id=self.caller_id)
         return self._context.interceptor.judge(point, part, body)
+
+    @property
+    def _server_point(self) -> ObservationPoint:
+        return ObservationPoint(self.service.key, self.service.service, self.service.host, self.service.node)
 
     def _ask(self, body: bytes) -> bool:
         if not self._context.table.asks(*self.grant[1:]):

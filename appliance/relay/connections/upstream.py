@@ -160,7 +160,7 @@ class PublisherConnection(Upstream):
         """
         if self._reader is not None:
             self._reader.disarm()
-            reason = self._context.interceptor.objection(self._topic.topic, self._reader.header)
+            reason = self._context.interceptor.objection(self._topic.point, self._reader.header)
             if reason:
                 self._object(reason)
         elif self._objected and self.state is UpstreamState.WAITING:
@@ -200,7 +200,7 @@ class PublisherConnection(Upstream):
             end = self._turned_away if "error" in header else self._lose
             end(*refusal)
             return
-        reason = self._context.interceptor.objection(self._topic.topic, header)
+        reason = self._context.interceptor.objection(self._topic.point, header)
         if reason:
             self._object(reason)
             return

@@ -382,27 +382,27 @@ class Interceptor:
             return None
         return HostMask(lambda: monitors.withheld_from(topic)).hides
 
-    def objection(self, topic: str, header: Mapping[str, str]) -> str:
-        monitors = self.monitors
+    def objection(self, point: ObservationPoint, header: Mapping[str, str]) -> str:
+        monitors, topic = self.monitors, point.resource
         name = monitors.type_of(topic, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
             return ""
         objection = _other_definition(topic, name, monitors.md5sum(name), header) or _other_text(
             topic, name, monitors.definitions, header
         )
-        return self._objection(topic, objection, monitors.type_of(topic) is None)
+        return self._objection(point, objection, monitors.type_of(topic) is None)
 
-    def service_objection(self, service: str, header: Mapping[str, str]) -> str:
-        monitors = self.monitors
+    def service_objection(self, point: ObservationPoint, header: Mapping[str, str]) -> str:
+        monitors, service = self.monitors, point.resource
         name = monitors.service_type_of(service, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
             return ""
         objection = _other_definition(service, name, monitors.definitions.service_md5sum(name), header)
-        return self._objection(service, objection, monitors.service_type_of(service) is None)
+        return self._objection(point, objection, monitors.service_type_of(service) is None)
 
-    def _objection(self, resource: str, objection: str, only_tried: bool) -> str:
+    def _objection(self, point: ObservationPoint, objection: str, only_tried: bool) -> str:
         """Return the objection, unless only monitors in shadow mode have it: they just miss what they cannot read."""
-        self.shadow.understand(resource, objection)
+        self.shadow.understand(point, objection)
         return "" if only_tried else objection
 
     def header_of(self, topic: str) -> dict[str, str] | None:

@@ -54,7 +54,7 @@ class ShadowMonitors:
         self.waiting: deque[_Waiting] = deque()
         self._bytes = 0
         self._spent = 0.0
-        self._foreign: set[str] = set()
+        self._foreign: dict[tuple[str, str], str] = {}  # why, by the publisher's key and resource
         self._timer: LoopTimer | None = None
         self._resting: dict[MonitorSet, str] = {}  # with the reason
 
@@ -78,25 +78,24 @@ class ShadowMonitors:
             self._observer.report(shadowed, NOWHERE)
         self.schedule()
 
-    def understand(self, resource: str, objection: str) -> None:
-        if not objection:
-            self._foreign.discard(resource)
-            return
-        self._foreign.add(resource)
-        for shadow in self._monitors.shadows if self._monitors is not None else ():
-            if shadow.wants(resource) or shadow.service_type_of(resource) is not None:
-                self._miss(shadow, ObservationPoint("", resource), objection)
+    def understand(self, point: ObservationPoint, objection: str) -> None:
+        """Note why messages of this publisher cannot be read, or that they can if `objection` is empty."""
+        if objection:
+            self._foreign[point[:2]] = objection
+        else:
+            self._foreign.pop(point[:2], None)
 
     # --- their messages ---
 
     def wait(self, point: ObservationPoint, observed: ObservedMessage | None) -> None:
         assert self._monitors is not None  # noqa: S101  they have copied it
-        idle = not self.waiting
+        idle, foreign = not self.waiting, self._foreign.get(point[:2], "")
         for tapped in self._monitors.tapped:
-            if tapped.resource in self._foreign:
-                continue
+            why = foreign if tapped.resource == point.resource else ""  # otherwise a monitor published it
             if len(self.waiting) >= _MAX_WAITING or self._bytes + len(tapped.data) > _MAX_BYTES:
-                self._miss(tapped.shadow, point, _TOO_MANY, observed)
+                why = why or _TOO_MANY
+            if why:
+                self._miss(tapped.shadow, point, why, observed)
                 continue
             self.waiting.append(_Waiting(tapped, point, observed))
             self._bytes += len(tapped.data)

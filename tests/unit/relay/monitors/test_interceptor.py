@@ -107,9 +107,10 @@ def test_a_definition_with_other_arrays_is_refused_in_spite_of_its_md5sum(
     definitions = standard_definitions()
     text = definitions.full_text("geometry_msgs/Twist").replace(*change)
     header = {"type": "geometry_msgs/Twist", "md5sum": definitions.md5sum("geometry_msgs/Twist")}
-    objection = world.engine.interceptor.objection("/cmd_vel", header | {"message_definition": text})
+    point = ObservationPoint("k", "/cmd_vel")
+    objection = world.engine.interceptor.objection(point, header | {"message_definition": text})
     assert ("with the same md5sum, but with other arrays" in objection) == refused
-    assert world.engine.interceptor.objection("/cmd_vel", header) == ""
+    assert world.engine.interceptor.objection(point, header) == ""
 
 
 def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Monitored) -> None:

@@ -1,3 +1,4 @@
+import random
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -5,20 +6,28 @@ from typing import Any
 import pytest
 
 from appliance.channel.messages import (
+    FactWithdrawn,
     MonitorRow,
     MonitorsCounted,
     MonitorsReported,
+    NodePlaced,
+    PublicationPlaced,
     SpecificationsTaken,
+    UpstreamFound,
+    UpstreamWanted,
 )
 from appliance.relay.monitors import shadow
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.observer import Observer
+from roswire.tcpros import encode_header
 from tests.support.stated import stated
 from tests.unit.relay.monitors.monitored import (
     GUARD,
+    TYPED,
     Monitored,
     string,
 )
+from tests.unit.relay.world import LOOPBACK, Peer
 
 pytestmark = pytest.mark.usefixtures("sockets")
 
@@ -168,3 +177,74 @@ def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
     world.gets(subscriber, string("a"))
     assert "a defect of rosrv" in world.event("shadow fault").text
     assert world.row("guard").missed == 1
+
+
+class Publisher:
+    """A node that publishes /chatter, of a type that a monitor in shadow mode can read or of another one."""
+
+    def __init__(self, world: Trying, key: str) -> None:
+        self.world, self.key = world, key
+        self.listening = world.listen()
+        world.state(NodePlaced(key, f"/{key}", LOOPBACK), world.listen())
+        self.fits = False
+        self.peer: Peer | None = None
+
+    def leave(self) -> None:
+        if self.peer is not None:
+            self.world.state(FactWithdrawn(("publication", self.key, "/chatter")))
+            self.world.ends(self.peer)
+            self.peer = None
+
+    def connect(self, *, fits: bool) -> None:
+        """Publish with this type; a publisher that is connected loses its connection, and returns with it."""
+        world, self.fits = self.world, fits
+        if self.peer is None:
+            world.state(PublicationPlaced(self.key, "/chatter", "*"))
+        else:
+            self.peer.sock.close()
+        world.hears(UpstreamWanted, key=self.key)
+        world.state(UpstreamFound(self.key, "/chatter", LOOPBACK, self.listening.getsockname()[1]))
+        self.peer = world.accept(self.listening)
+        world.gets_header(self.peer)
+        self.peer.send(encode_header(TYPED if fits else TYPED | {"type": "my/Label", "md5sum": "f" * 32}))
+
+    def send(self) -> None:
+        if self.peer is not None:
+            topic = self.world.engine.topics[self.key, "/chatter"]
+            before = topic.counters.following
+            self.peer.send(string("bad"))
+            self.world.until(lambda: topic.counters.following > before)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_it_gets_exactly_the_messages_of_the_publishers_that_it_can_read(world: Trying, seed: int) -> None:
+    chance = random.Random(seed)  # noqa: S311  the same story in every run
+    revision, read, missed = 1, 0, 0
+    world.state_shadows(GUARD, shadowed=("guard",))
+    world.state(FactWithdrawn(("publication", "k", "/chatter")))
+    publishers = [Publisher(world, f"p{number}") for number in range(3)]
+    for _ in range(25):
+        publisher = chance.choice(publishers)
+        match chance.choice(("connect", "connect", "leave", "reload", "switch")):
+            case "connect":
+                publisher.connect(fits=chance.random() < 0.5)
+            case "leave":
+                publisher.leave()
+            case "reload":
+                revision += 1
+                other = f"other() {{ int n = {revision}; event tick() every 1s {{ }} }}"
+                assert "guard" not in world.state_shadows(
+                    GUARD, other, shadowed=("guard",), revision=revision
+                )
+            case _:
+                world.engine.interceptor.switch("guard", enabled=False)
+                world.engine.interceptor.switch("guard", enabled=True)
+        for sender in publishers:
+            sender.send()
+        read += sum(sender.peer is not None and sender.fits for sender in publishers)
+        missed += sum(sender.peer is not None and not sender.fits for sender in publishers)
+        world.until(lambda: not world.engine.interceptor.shadow.waiting)
+        row = world.row("guard")
+        assert (row.events, row.missed) == (read, missed)
+    assert read
+    assert missed
