@@ -69,7 +69,7 @@ class LatchedMessage:
         self.batch: Batch | None = None
         self.is_latching = False
         self.withheld = False
-        """Whether monitors have held back a message of this publisher."""
+        """Whether monitors have held back the last message of this publisher."""
 
     @property
     def size(self) -> int:
@@ -77,7 +77,7 @@ class LatchedMessage:
 
     @property
     def is_lacking(self) -> bool:
-        return self.is_latching and self.withheld and self.batch is None
+        return self.is_latching and self.withheld
 
     @property
     def is_asked_again(self) -> bool:
@@ -88,6 +88,7 @@ class LatchedMessage:
         return self._refused_size is not None
 
     def keep(self, batch: Batch) -> None:
+        self.withheld = False
         self._free()
         size = len(batch.view) - batch.find_last()
         if self._share.refusal(size):
@@ -485,12 +486,13 @@ class RelayedTopic:
     def lacks_latched(self) -> bool:
         return self.latch.is_lacking and not self._is_command
 
-    def upstream_closed(self) -> None:
+    def upstream_closed(self, *, repeats: bool = False) -> None:
+        """Note that the connection is lost. If the publisher `repeats` its message, keep the last one that passed."""
         if self._rank is not None:
             self._rank.closed(self._clock())
         self._end_stream()
         self.hand_out(divided=False)
-        if not self._superseded:
+        if not self._superseded and not (repeats and self.latch.batch is not None):
             self.latch.forget()
         self.flow.forget()
         self._state = TopicState.LOST
@@ -570,12 +572,14 @@ class RelayedTopic:
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
-        if self._served.mask is not None and batch.messages > 1:  # a message may withhold the next one
+        through = self._monitoring.through
+        # A message may withhold the next one, and the last one may be held back.
+        alone = self._served.mask is not None or (self.latch.is_latching and through is not None)
+        if alone and batch.messages > 1:
             first = batch.head(1)
             self._admit(first, since, divided=False)
             batch.judged = first.judged
             return batch.tail(batch.messages - 1)
-        through = self._monitoring.through
         left = batch if through is None else through(batch)
         rest = batch.tail(batch.left) if batch.left else None
         if left is None:
@@ -734,7 +738,8 @@ class RelayedTopic:
         return given
 
     def _forget_header(self) -> None:
-        if self._state is TopicState.LOST and not self._served and not self._superseded:
+        needed = self._served or self._superseded or self.latch.batch is not None
+        if self._state is TopicState.LOST and not needed:
             self._state, self._header = TopicState.UNKNOWN, None
 
     def announce(self) -> None:

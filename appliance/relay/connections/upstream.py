@@ -147,7 +147,7 @@ class PublisherConnection(Upstream):
 
     def request_latched(self) -> None:
         if self._reader is not None and self._wanted:
-            self._drop_connection()
+            self._drop_connection(repeats=True)
             self.ask()
 
     def greet(self, greeted: Callable[[bytes], None]) -> None:
@@ -266,7 +266,7 @@ class PublisherConnection(Upstream):
         self._drop_connection()
         self._enter(UpstreamState.IDLE)
 
-    def _drop_connection(self) -> None:
+    def _drop_connection(self, *, repeats: bool = False) -> None:
         self._named_subscribers.close()
         if self._attempt is not None:
             self._attempt.stream.close()
@@ -276,7 +276,7 @@ class PublisherConnection(Upstream):
                 self.failures = 0
             self._reader.close()
             self._reader = None
-            self._topic.upstream_closed()
+            self._topic.upstream_closed(repeats=repeats)
 
     def _enter(
         self, state: UpstreamState, seconds: float = 0.0, late: Callable[[], None] | None = None

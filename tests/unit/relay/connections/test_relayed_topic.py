@@ -1,3 +1,4 @@
+import itertools
 import struct
 from collections.abc import Callable, Collection, Mapping
 
@@ -337,6 +338,39 @@ def test_a_latched_message_is_given_once_to_each() -> None:
     second = story.join()
     assert first.received == bytes(batch(b"old", b"new").view)
     assert second.received == bytes(batch(b"new").view)
+
+
+@pytest.mark.parametrize("ends", [*itertools.product((False, True), repeat=3)])
+@pytest.mark.parametrize("held", [*itertools.product((False, True), repeat=4)])
+def test_a_latched_message_is_asked_for_again_if_the_last_one_was_held_back(
+    held: tuple[bool, ...], ends: tuple[bool, ...]
+) -> None:
+    """The publisher sends four messages, of which monitors hold back some; a batch ends after some of them."""
+
+    def through(frames: Batch) -> Batch | None:
+        parts = [frames.tail(frames.messages - n).head(1) for n in range(frames.messages)]
+        passing = [bytes(part.view[4:]) for part in parts if not (hold and part.view[4:] == b"held")]
+        return batch(*passing) if passing else None
+
+    story, hold = Story("/map"), [True]
+    story.topic.monitor(through, wanted=True)
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    texts = [b"held" if one else b"%d" % number for number, one in enumerate(held)]
+    for _, part in itertools.groupby(range(4), lambda number: sum(ends[:number])):
+        rest: Batch | None = batch(*(texts[number] for number in part))
+        while rest is not None:
+            rest = story.topic.received(rest, story.now)
+    passed = [text for text in texts if text != b"held"][-1:]
+    assert story.topic.lacks_latched == held[-1]
+    assert story.join("/early").received == bytes(batch(*passed).view if passed else b"")
+    if held[-1]:
+        story.topic.upstream_closed(repeats=True)
+        assert story.join("/between").received == bytes(batch(*passed).view if passed else b"")
+        hold.clear()
+        story.topic.upstream_opened(HEADER | {"latching": "1"})
+        story.receive(batch(texts[-1]))
+        assert not story.topic.lacks_latched
+        assert story.join("/late").received == bytes(batch(texts[-1]).view)
 
 
 def test_messages_of_monitors_are_counted() -> None:
