@@ -19,7 +19,7 @@ class TopicSubscriber(Protocol):
     """The fields of the subscriber's header."""
 
     missed: bool
-    """Whether the subscriber missed the last message, because of its rate limit or a withheld topic."""
+    """Whether the subscriber missed the last message: it was withheld, over a limit, or there was no memory for it."""
 
     behind_since: float | None
     """When the queue first became so long that the subscriber is behind; None once it has caught up."""
@@ -28,7 +28,7 @@ class TopicSubscriber(Protocol):
         """Send the publisher's header; return False if the subscriber has a different type."""
 
     def admits(self, batch: Batch) -> bool:
-        """Whether the subscriber's rate limit lets the whole batch pass now."""
+        """Whether the subscriber's rate limit and memory let the whole batch pass now."""
 
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; return how many messages are dropped."""

@@ -191,6 +191,8 @@ class Subscriber:
         return self._live
 
     def admits(self, batch: Batch) -> bool:
+        if self.exhausted and (self._writing or len(batch.view) > LARGE):
+            return False
         return self._flow is None or self._flow.room(batch, self._loop.clock()) == batch.messages
 
     def deliver(self, batch: Batch) -> int:
@@ -203,6 +205,7 @@ class Subscriber:
         sent, view = 0, batch.view
         if not self._writing:
             if len(view) > LARGE and self.exhausted:
+                self.missed = True
                 return batch.messages
             try:
                 sent = self._send(view)
@@ -248,7 +251,9 @@ class Subscriber:
         return self._share.exhausted
 
     def trim(self) -> int:
-        return self._queue.trim()
+        dropped = self._queue.trim()
+        self.missed |= dropped > 0 and not self._queue.messages
+        return dropped
 
     def check_stall(self) -> None:
         """Cut a subscriber that stalls within a message while its host's memory is exhausted."""

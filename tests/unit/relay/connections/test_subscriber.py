@@ -1,6 +1,15 @@
+import contextlib
+import socket
+from collections.abc import Callable
+
 import pytest
 
-from appliance.relay.connections.subscriber import describe_mismatch
+from appliance.channel.messages import FlowLimit
+from appliance.relay.connections.subscriber import Subscriber, describe_mismatch
+from appliance.relay.loop import EventLoop
+from appliance.relay.transport.rate_limit import SharedRateLimit
+from tests.unit.relay.connections.test_relayed_topic import HEADER, Story, batch
+from tests.unit.relay.contexts import context_of
 
 OFFERED = {"type": "std_msgs/String", "md5sum": "aaa"}
 
@@ -29,3 +38,105 @@ def test_a_mismatch_names_both_sides() -> None:
     assert "[/l] wants topic [/t]" in text
     assert "[std_msgs/String/b]" in text
     assert "[std_msgs/String/aaa]" in text
+
+
+class Display:
+    """A subscriber of a latching publisher over a real connection."""
+
+    def __init__(self) -> None:
+        self.loop = EventLoop()
+        context = context_of(self.loop, named_hosts=("10.0.0.2",))
+        self.memory = context.memory.queues.of("10.0.0.2")
+        self.story = Story("/map")
+        self.story.topic.upstream_opened(HEADER | {"latching": "1"})
+        ours, self.peer = socket.socketpair()
+        ours.setblocking(False)
+        self.peer.setblocking(False)
+        fields = {"callerid": "/rviz", "topic": "/map", "md5sum": "m", "type": "std_msgs/String"}
+        self.member = Subscriber(
+            context, ours, self.story.topic, "10.0.0.2", fields,
+            refuse=lambda *_given: None, ended=lambda _member: None,
+        )  # fmt: skip
+
+    def read(self) -> bytes:
+        data = b""
+        for _ in range(200):
+            self.loop.turn(0.0)
+            with contextlib.suppress(BlockingIOError):
+                data += self.peer.recv(1 << 20)
+        return data
+
+    def tidy(self) -> None:
+        for _second in range(3):
+            self.story.now += 1
+            self.story.topic.tidy()
+
+    def close(self) -> None:
+        self.member.cut("")
+        self.loop.turn(0.0)
+        self.peer.close()
+        self.loop.close()
+
+
+def masked(display: Display) -> Callable[[], None]:
+    display.story.topic.withhold(lambda _host: True)
+    return lambda: display.story.topic.withhold(None)
+
+
+def limited(display: Display) -> Callable[[], None]:
+    limit = SharedRateLimit(FlowLimit(messages=0.001), display.loop.clock()).of("")
+    limit.take(batch(b"1", b"2", b"3"))
+    display.member.limit(limit)
+    return lambda: display.member.limit(None)
+
+
+def no_memory(display: Display) -> Callable[[], None]:
+    display.memory.add(128 << 20)
+    return lambda: display.memory.add(-(128 << 20))
+
+
+def slow(display: Display) -> Callable[[], None]:
+    """Let the message wait in the queue, from which it is dropped once the host has no memory."""
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            display.member._socket.send(b"x" * (1 << 16))
+    free = no_memory(display)
+
+    def read() -> None:
+        display.read()
+        free()
+
+    return read
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("size", [100, 4 << 20])
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize("cause", [masked, limited, no_memory, slow])
+def test_a_subscriber_that_missed_a_latched_message_gets_it_once_the_cause_has_ended(
+    cause: Callable[[Display], Callable[[], None]], early: bool, size: int
+) -> None:
+    """The subscriber is there `early`, or comes after the message."""
+    display, latched = Display(), batch(b"m" * size)
+    topic = display.story.topic
+    try:
+        if early:
+            topic.join(display.member)
+            display.read()
+            end = cause(display)
+            display.story.receive(latched)
+        else:
+            display.story.receive(latched)
+            end = cause(display)
+            topic.join(display.member)
+        display.tidy()
+        got = b"" if cause is slow else display.read()
+        has_room = cause is no_memory and size == 100  # of the connection, so the queue is not needed
+        assert (bytes(latched.view) in got) == has_room
+        end()
+        for _ in range(3):
+            display.tidy()
+            got += display.read()
+        assert got.count(bytes(latched.view)) == 1
+    finally:
+        display.close()
