@@ -74,11 +74,11 @@ class Reconciler:
                 types = (await self.rosmaster.call_now("getTopicTypes", NAME))[2]
                 self.registry.adopt_types(cast(list[tuple[str, str]], types))
                 await self._compare()
-                # An earlier control process may not have sent the last values.
-                for node in self.registry.live():
-                    self.subscribers.tell_parameters(node)
             else:
                 await self._rebuild()
+            # An earlier control process may not have sent the last values.
+            for node in self.registry.live() if self.entries.pid is None else ():
+                self.subscribers.tell_parameters(node)
             self.entries.pid = cast(int, pid)
 
     # --- a new ROS master ---

@@ -9,18 +9,25 @@ pytestmark = pytest.mark.anyio
 NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 
-async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
+@pytest.mark.parametrize("new_control", [True, False])
+@pytest.mark.parametrize("new_master", [True, False])
+async def test_each_subscriber_of_a_parameter_gets_its_value_after_a_start(
+    new_control: bool, new_master: bool
+) -> None:
+    """If only the ROS master is new, the subscribers have the values already."""
     world = ControlParts()
     node = world.node("/n")
     for key in ("/speed", "/unset"):
         world.registry.register(node, Kind.PARAMETER, key, "")
     world.registry.take_changes()  # an earlier control made them
-    world.hidden.parameters["speed"] = 2
+    world.hidden.parameters["speed"] = world.parameters.tree["speed"] = 2
+    world.entries.pid = None if new_control else world.hidden.pid
+    if new_master:
+        world.hidden.restart()
     await world.round()
-    assert world.deliveries.told == [
-        ("/n", "paramUpdate", ("/speed/", 2)),
-        ("/n", "paramUpdate", ("/unset/", {})),
-    ]
+    expected = [("/n", "paramUpdate", ("/speed/", 2)), ("/n", "paramUpdate", ("/unset/", {}))]
+    assert world.deliveries.told == (expected if new_control else [])
+    assert world.hidden.parameters["speed"] == 2
 
 
 async def test_a_new_master_is_complete_before_the_first_call() -> None:
