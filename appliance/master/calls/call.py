@@ -24,6 +24,10 @@ from roswire.xmlrpc import Value
 T = TypeVar("T")
 
 
+class NotServedError(Exception):
+    """The appliance does not carry out a call that the policy allows; the message says why."""
+
+
 @dataclass(frozen=True, slots=True)
 class ApiUri:
     """A URI as received, and parsed."""

@@ -22,6 +22,7 @@ from appliance.master.calls.call import (
     Attempt,
     Caller,
     CallVerb,
+    NotServedError,
     RosCall,
     Table,
     claimed_name,
@@ -30,7 +31,7 @@ from appliance.master.calls.call import (
 )
 from appliance.master.calls.gate import CallGate, NameConflict, contested
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
-from appliance.master.calls.registration import NodeElsewhereError, given_up
+from appliance.master.calls.registration import given_up
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import HostFullError, Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
@@ -40,6 +41,7 @@ from appliance.policy.model import Address, CallHold, Category, Decision, Reques
 from appliance.policy.policy import Policy
 from appliance.rpc.fair_queue import Bulk, LargeWrites, weigh
 from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail
 from roswire.errors import EncodingError, PeerError, ProtocolError
 from roswire.xmlrpc import Value
@@ -47,7 +49,8 @@ from roswire.xmlrpc import Value
 _log = structlog.get_logger()
 _REGISTERS = (CallVerb.REGISTER, CallVerb.UNREGISTER)
 _FAILURES = (
-    HostFullError, NoPortError, NodeElsewhereError, LimitReachedError, PeerError, EncodingError, CallFailedError,
+    HostFullError, NoPortError, NotServedError, LimitReachedError, PeerError, EncodingError, CallFailedError,
+    StoreError,
 )  # fmt: skip
 
 
@@ -332,12 +335,9 @@ class Execution:
                     call=call.name,
                 )
                 return [0, with_record(str(error), record), call.denial]
-            case NodeElsewhereError():
+            case NotServedError() | StoreError():
                 decision = Decision(False, None, str(error))
-                record = self.trail.decided(
-                    caller.asker, call.name, call.row.category.value, attempt.resource, decision
-                )
-                return [0, self._denial_text(decision, record), call.denial]
+                return self._recorded(attempt, decision) or [0, str(error), call.denial]
             case PeerError():
                 return self._malformed(call, caller, error)
             case EncodingError():

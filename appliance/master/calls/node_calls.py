@@ -8,7 +8,16 @@ import os
 from collections import defaultdict
 from dataclasses import dataclass
 
-from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, Caller, CallVerb, RosCall, method
+from appliance.master.calls.call import (
+    MESSAGE,
+    PROTOCOLS,
+    TOPIC,
+    Caller,
+    CallVerb,
+    NotServedError,
+    RosCall,
+    method,
+)
 from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.delivery import NodeApiClient
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
@@ -48,7 +57,7 @@ class NodeCalls:
         names = [protocol[0] for protocol in protocols if protocol]
         if "TCPROS" not in names:
             offered = ", ".join(str(name)[:40] for name in names) or "nothing"
-            return [0, f"the appliance relays only TCPROS; the subscriber offers {offered}", []]
+            raise NotServedError(f"the appliance relays only TCPROS; the subscriber offers {offered}")
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # always connected through the relay
         if not own and not self.relay.carries_topic(topic):
             return await self._negotiate_directly(target, topic, caller)
@@ -85,11 +94,8 @@ class NodeCalls:
         """`shutdown(caller_id, msg)`: sent to the node, which often ends before it answers."""
         target = _target(caller)
         if target.of_monitors:
-            return [
-                0,
-                f"{target.name} publishes for the appliance's monitors; remove these with `rosrv monitor`",
-                0,
-            ]
+            text = f"{target.name} publishes for the appliance's monitors; remove these with `rosrv monitor`"
+            raise NotServedError(text)
         try:
             await self.nodes.call(target, "shutdown", caller.caller_id, message)
         except CallFailedError:

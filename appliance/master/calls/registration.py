@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.base import clock
-from appliance.master.calls.call import ApiUri, Attempt, Caller
+from appliance.master.calls.call import ApiUri, Attempt, Caller, NotServedError
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts, NoPortError
 from appliance.master.endpoints.relay_control import RelayControl
@@ -40,7 +40,7 @@ ServeNode = Callable[[Incarnation], Handler]
 """Makes the handler of a node's proxy endpoint."""
 
 
-class NodeElsewhereError(Exception):
+class NodeElsewhereError(NotServedError):
     """The registered node does not run on the caller's host; the message says what to do."""
 
 
