@@ -105,10 +105,14 @@ class _GoingOn:
 
 
 class Repetitions:
-    """Counts repeated actions of monitors, which have one audit record for a time."""
+    """Counts repeated actions of monitors, which have one audit record for a time.
+
+    The kinds of a host may be as many as are left for others; its further ones are counted together.
+    """
 
     def __init__(self) -> None:
         self._known: dict[tuple[str, ...], _GoingOn] = {}
+        self._of_host = Counter[str]()
 
     @property
     def some(self) -> bool:
@@ -122,7 +126,10 @@ class Repetitions:
     def take(self, event: MonitorEvent, now: float) -> MonitorEvent | None:
         """Return the report to record now, if any; it stands for all actions since the last record."""
         key = self._key(event)
+        if key[3] != event.host:  # it stands for many hosts
+            event = msgspec.structs.replace(event, host="", caller_id="")
         known = self._known.get(key)
+        self._of_host[key[3]] += known is None
         if known is None or now - known.at > PERIOD:
             allowance = _Allowance(RECORDS, PERIOD, RECORDS, now) if known is None else known.allowance
             known = self._known[key] = _GoingOn(allowance, event.time, event.time, now)
@@ -152,12 +159,19 @@ class Repetitions:
                 known.waits = None
             if known.waits is None and quiet and known.allowance.full(now):
                 del self._known[key]
+                self._of_host -= Counter([key[3]])
 
     def _key(self, event: MonitorEvent) -> tuple[str, ...]:
         kind = event.kind.removeprefix("shadow ")
         text = without_numbers(event.text) if kind in _BY_TEXT else ""
-        key = (event.kind, event.monitor, event.resource, event.host, text)
-        return key if key in self._known or len(self._known) < _MAX else (event.kind, event.monitor)
+        known, host = len(self._known), event.host
+        key = (event.kind, event.monitor, event.resource, host, text)
+        if key in self._known or self._of_host[host] < _MAX - known:
+            return key
+        together = (event.kind, event.monitor, "", host)
+        return (
+            together if together in self._known or known < 2 * _MAX else (event.kind, event.monitor, "", "")
+        )
 
 
 @dataclass(slots=True)

@@ -1,3 +1,5 @@
+import random
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -5,7 +7,7 @@ import pytest
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export
 from appliance.channel.messages import MonitorEvent
-from appliance.specifications.records import MonitorRecords
+from appliance.specifications.records import MonitorRecords, Repetitions
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import settle
 from tests.support.engines import open_log
@@ -47,3 +49,36 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     assert (found[0].host, found[0].caller_id) == ("10.0.0.7", "/joystick")
     assert (found[0].detail["category"], found[0].detail["logic"]) == ("its category", "fsm")
     log.close()
+
+
+@pytest.mark.parametrize("hosts", [1, 3, 40])
+def test_the_records_of_a_host_have_the_number_of_its_actions_under_any_flood(hosts: int) -> None:
+    """The robot's own drops have their own records, although hosts flood a monitor with texts."""
+    chance = random.Random(hosts)  # noqa: S311  the same flood in every run
+    repetitions, now = Repetitions(), 0.0
+    sent, recorded, own = Counter[str](), Counter[str](), list[MonitorEvent]()
+
+    def take(kind: str, host: str, text: str, count: int = 0) -> None:
+        event = MonitorEvent(kind, "safe", "k", "/cmd", 0, text, {}, host=host, caller_id="/x", count=count)
+        sent[host] += count or 1
+        note(repetitions.take(event, now))
+
+    def note(event: MonitorEvent | None) -> None:
+        if event is not None:
+            recorded[event.host] += event.count or 1
+            own.extend([event] * (event.host == "10.0.0.2"))
+
+    for second in range(120):
+        now += 1
+        for _ in range(40 if second else 2500):
+            word = "".join(chance.choices("abcdefgh", k=4))
+            host = f"10.0.1.{chance.randrange(hosts)}"
+            take(chance.choice(["log", "drop", "fault"]), host, word, chance.choice([0, 0, 7]))
+        take("drop", "10.0.0.2", "one")
+    for _ in range(300):
+        now += 100
+        for event in repetitions.ended(now):
+            note(event)
+    assert recorded == sent
+    assert not repetitions.some
+    assert {event.text for event in own} == {"one"}
