@@ -5,19 +5,21 @@ their own type and md5sum, some demand a `message_definition`, and some refuse b
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import islice
+from itertools import zip_longest
 
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.context import RelayContext
 
 _ANY = "*"
-_MAX = 8  # claims to try on one publisher, because subscribers can make up any number
+_Key = tuple[str, str, bool]
+_MAX = 8  # claims to try in a row on one publisher, because subscribers can make up any number
 
 
 class HeaderCandidates:
     """The header fields for the next connection to one publisher; accepted fields are used for all later ones.
 
-    `claims` returns known fields, the most likely ones first; the `registered` type replaces an unknown one.
+    `claims` returns known fields, the most likely ones first; the `registered` type replaces an unknown one. After
+    `_MAX` of them the next ones follow in the next row, and the first ones again after all.
     """
 
     def __init__(
@@ -25,19 +27,26 @@ class HeaderCandidates:
     ) -> None:
         self._claims = claims
         self._registered = registered
-        self._refused: set[tuple[str, str, bool]] = set()
+        self._refused: set[_Key] = set()
+        self._earlier: set[_Key] = set()  # refused in earlier rows
         self.fields: Mapping[str, str] = {"type": _ANY, "md5sum": _ANY}
 
     @classmethod
     def of(cls, context: RelayContext, topic: RelayedTopic) -> "HeaderCandidates":
-        """Return candidates with the previous header, the type in specifications, and those of subscribers."""
+        """Return candidates with the previous header, the type in specifications, and those of subscribers.
+
+        The hosts of subscribers take turns, so that none hides the others.
+        """
 
         def claims() -> Iterator[Mapping[str, str]]:
             if topic.header is not None:
                 yield topic.header
             yield context.interceptor.claim_of(topic.topic)
+            hosts: dict[str, list[Mapping[str, str]]] = {}
             for member in topic.members:
-                yield member.fields
+                hosts.setdefault(member.host, []).append(member.fields)
+            for turn in zip_longest(*hosts.values(), fillvalue={}):
+                yield from turn
 
         def registered() -> str:
             publication = context.table.publication(topic.key, topic.topic)
@@ -46,29 +55,41 @@ class HeaderCandidates:
         return cls(claims, registered)
 
     def refused(self) -> bool:
-        """Choose the next fields; return False if all are refused."""
+        """Choose the next fields; return False at the end of a row."""
         self._refused.add(_key(self.fields))
-        named = (claim for claim in self._claims() if _named(claim, "md5sum"))
-        for claim in (*islice(named, _MAX), {}):
-            fields = {
-                "type": _named(claim, "type") or self._registered() or _ANY,
-                "md5sum": _named(claim, "md5sum") or _ANY,
-                "message_definition": claim.get("message_definition", ""),
-            }
+        named: dict[_Key, Mapping[str, str]] = {}
+        for claim in self._claims():
+            if _named(claim, "md5sum"):
+                fields = self._with_type(claim)
+                named.setdefault(_key(fields), fields)
+        self._earlier &= named.keys()
+        if not named.keys() - self._earlier:
+            self._earlier.clear()
+        row = [fields for key, fields in named.items() if key not in self._earlier][:_MAX]
+        for fields in (*row, self._with_type({})):
             if _key(fields) not in self._refused:
                 self.fields = fields
                 return True
+        self._earlier |= self._refused
         self._refused.clear()
         self.fields = {"type": _ANY, "md5sum": _ANY}
         return False
 
+    def _with_type(self, claim: Mapping[str, str]) -> dict[str, str]:
+        return {
+            "type": _named(claim, "type") or self._registered() or _ANY,
+            "md5sum": _named(claim, "md5sum") or _ANY,
+            "message_definition": claim.get("message_definition", ""),
+        }
+
     def accepted(self) -> None:
         self._refused.clear()
+        self._earlier.clear()
 
 
 def _named(claim: Mapping[str, str], field: str) -> str:
     return claim.get(field, "").replace(_ANY, "")
 
 
-def _key(fields: Mapping[str, str]) -> tuple[str, str, bool]:
+def _key(fields: Mapping[str, str]) -> _Key:
     return fields["type"], fields["md5sum"], "message_definition" in fields

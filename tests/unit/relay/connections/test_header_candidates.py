@@ -1,6 +1,9 @@
 import pytest
 
 from appliance.relay.connections.header_candidates import HeaderCandidates
+from appliance.relay.loop import EventLoop
+from tests.unit.relay.connections.test_relayed_topic import RecordedMember, Story
+from tests.unit.relay.contexts import context_of
 
 STRING, MD5 = "std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1"
 SUBSCRIBER = {"callerid": "/listener", "topic": "/chatter", "type": STRING, "md5sum": MD5}
@@ -53,3 +56,40 @@ def test_an_accepted_header_is_used_again() -> None:
     assert (candidates.fields["type"], candidates.fields["md5sum"]) == (STRING, MD5)
     assert candidates.refused()  # the publisher has changed its mind: another claim is left
     assert candidates.fields["md5sum"] == "*"
+
+
+@pytest.mark.parametrize("hosts", [1, 3, 7])
+@pytest.mark.parametrize("alike", [1, 5])
+@pytest.mark.parametrize("types", [1, 8, 9, 40])
+def test_each_type_of_a_subscriber_is_tried_in_turn(types: int, alike: int, hosts: int) -> None:
+    story, loop = Story(), EventLoop()
+    for number in range(types * alike):
+        member = RecordedMember(host=f"10.0.0.{number % hosts}", caller_id=f"/n_{number}")
+        member.fields = {"type": STRING, "md5sum": f"md5sum of {number // alike}"}
+        story.topic.join(member)
+    candidates = HeaderCandidates.of(context_of(loop), story.topic)
+
+    def next_row() -> list[str]:
+        row = []
+        while candidates.refused():
+            row.append(candidates.fields["md5sum"])
+        return row
+
+    rows = [next_row() for _ in range(-(-types // 8))]
+    tried = [md5sum for row in rows for md5sum in row if md5sum != "*"]
+    assert sorted(tried) == sorted(f"md5sum of {number}" for number in range(types))
+    assert all(len(row) <= 8 + 1 for row in rows)
+    assert next_row() == rows[0]
+    loop.close()
+
+
+def test_a_host_that_makes_up_types_hides_no_subscriber_of_another() -> None:
+    story, loop = Story(), EventLoop()
+    for number in range(100):
+        member = RecordedMember(host="10.0.0.66" if number < 99 else "10.0.0.2", caller_id=f"/n_{number}")
+        member.fields = {"type": "a/B", "md5sum": str(number)}
+        story.topic.join(member)
+    candidates = HeaderCandidates.of(context_of(loop), story.topic)
+    asked_for = [candidates.fields["md5sum"] for _ in range(3) if candidates.refused()]
+    assert asked_for == ["0", "99", "1"]
+    loop.close()
