@@ -5,7 +5,7 @@ recognizes the server by the `callerid` of the status messages (actionlib, `wait
 after the relay has begun to serve the subscriber, which so misses nothing that the publisher sends from then on.
 
 Some publishers send a message to each new subscriber alone, from their connect callback (costmap_2d). `Greeting` opens
-a connection for a moment, and returns what comes.
+a connection for a short time, and returns what comes.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -23,7 +23,8 @@ from roswire.tcpros import HeaderParser, encode_header
 _GOAL = "ActionGoal"
 _CANCEL = "actionlib_msgs/GoalID"
 _RETRY_SECONDS = 1.0
-_GREETING_SECONDS = 0.1  # after the header, or since the last bytes of an unfinished message
+_GREETING_SECONDS = 2.0  # after the header, for the first message: some publishers greet in their own rhythm
+_SILENT_SECONDS = 0.1  # after the first bytes, or since the last ones of an unfinished message
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
@@ -155,7 +156,7 @@ class NamedSubscribers:
 
 
 class Greeting:
-    """A connection to a publisher, until it has been silent for a moment; `ended(frames)` is called once after it.
+    """A connection to a publisher until its first messages, or for two seconds; then `ended(frames)` is called once.
 
     The memory of the publisher's host counts the frames. Without memory, or after a failure, they are empty. Raises
     `OSError` or `OverflowError` for an address that cannot be used.
@@ -203,22 +204,24 @@ class Greeting:
             if header is None:
                 return
             data, self._parser = self._parser.rest, None
-            self._wait()
+            self._wait(_GREETING_SECONDS)
+        if data and not self._data:
+            self._wait(_SILENT_SECONDS)
         if self._held.share.refusal(len(data)) or len(self._data) > self._context.limits.message_bytes:
             self._fail()
             return
         self._data += data
         self._held.set(len(self._data))
 
-    def _wait(self) -> None:
+    def _wait(self, seconds: float) -> None:
         self._timer.cancel()
-        self._timer = self._context.loop.after(_GREETING_SECONDS, self._look)
+        self._timer = self._context.loop.after(seconds, self._look)
 
     def _look(self) -> None:
         whole = walk(memoryview(self._data))[0]
         if whole < len(self._data) != self._seen:
             self._seen = len(self._data)
-            self._wait()
+            self._wait(_SILENT_SECONDS)
         else:
             self._end(bytes(self._data[:whole]))
 

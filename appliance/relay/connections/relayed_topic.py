@@ -17,9 +17,10 @@ command (a message of a topic that had a guard, or a goal) is never requested ag
 it was refused.
 
 A publisher may greet each new subscriber with a message, from its connect callback (costmap_2d). For a later subscriber
-of a topic that is quiet, the relay opens an extra connection for a moment, and passes what comes to the newcomers
-alone, through monitors. It does so at most once a second, and once a minute if no greeting came twice in a row. A topic
-that sends within that moment does not greet. A command is never requested in this way.
+of a topic that is quiet, the relay opens an extra connection for up to two seconds, and passes what comes to the
+newcomers alone, through monitors. It does so at most once a second, and once a minute if no greeting came twice in a
+row; a newcomer that got nothing has a part in the second request. A topic that sends within that time does not greet. A
+command is never requested in this way.
 
 Messages of a topic with a rank pass while their publisher is heard (`give_rank`). A message that was taken before a
 hand-over, and waits for monitors, does not pass after it; nor does a latched one.
@@ -150,16 +151,18 @@ class Newcomers:
         )
 
     def take(self, following: int, now: float) -> Collection[TopicSubscriber]:
-        """Return the members that have got no message since they came; no others are due until `asked`."""
-        members = {member: first for member, first in self.members.items() if first == following}
-        self.members.clear()
-        if members:
+        """Return the members that have got no message since they came; none is due until `asked`."""
+        self.members = {member: first for member, first in self.members.items() if first == following}
+        if self.members:
             self._not_before = now + _UNGREETED_SECONDS
-        return members
+        return tuple(self.members)
 
-    def asked(self, now: float, *, greeted: bool) -> None:
+    def asked(self, members: Collection[TopicSubscriber], now: float, *, greeted: bool) -> None:
         self._ungreeted = 0 if greeted else self._ungreeted + 1
-        self._not_before = now + (_QUIET_SECONDS if self._ungreeted < 2 else _UNGREETED_SECONDS)
+        again = self._ungreeted < 2
+        self._not_before = now + (_QUIET_SECONDS if again else _UNGREETED_SECONDS)
+        for member in members if greeted or not again else ():
+            self.members.pop(member, None)
 
     def wait_on(self, following: int, now: float) -> None:
         """Let those who came during a greeting wait for the next one."""
@@ -675,7 +678,7 @@ class RelayedTopic:
 
     def _on_greeting(self, members: Collection[TopicSubscriber], before: int, frames: bytes) -> None:
         is_stream = self.counters.following != before  # a message for all, which came over both connections
-        self._newcomers.asked(self._clock(), greeted=bool(frames) or is_stream)
+        self._newcomers.asked(members, self._clock(), greeted=bool(frames) or is_stream)
         if is_stream or not frames:
             return
         batch = Batch(memoryview(frames), walk(memoryview(frames))[1], None, owned=True)

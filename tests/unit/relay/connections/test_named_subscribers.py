@@ -115,6 +115,32 @@ def test_only_the_topics_of_actions_need_names(type_name: str, named: bool) -> N
 
 
 @pytest.mark.nightly
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.15, 0.5, 1.0, 1.8])
+@pytest.mark.parametrize("number", [1, 3])
+def test_a_greeting_may_come_within_two_seconds(
+    loop: EventLoop, publisher: socket.socket, delay: float, number: int
+) -> None:
+    ended: list[bytes] = []
+    context = context_of(loop, named_hosts=("10.0.0.9",))
+    Greeting(context, "10.0.0.9", publisher.getsockname(), {"callerid": "/rosrv", **ACCEPTED}, ended.append)
+    sock, _header = accept(loop, publisher)
+    sock.send(encode_header(ACCEPTED))
+    frames, sent = encode_frame(b"map") * number, loop.clock() + delay
+
+    def over() -> bool:
+        nonlocal frames
+        if frames and loop.clock() >= sent:
+            sock.send(frames)
+            frames = b""
+        return bool(ended)
+
+    turn_until(loop, over)
+    assert ended == [encode_frame(b"map") * number]
+    assert loop.clock() - sent < 1
+    sock.close()
+
+
+@pytest.mark.nightly
 @pytest.mark.parametrize("sent", [b"", b"map", b"a long map", b"torn", b"too long", b"closed"])
 def test_a_greeting_is_what_comes_at_once(loop: EventLoop, publisher: socket.socket, sent: bytes) -> None:
     ended: list[bytes] = []

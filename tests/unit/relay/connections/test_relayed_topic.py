@@ -191,6 +191,37 @@ def test_a_publisher_that_does_not_greet_is_asked_once_a_minute() -> None:
     assert asked == 5
 
 
+def test_a_subscriber_that_got_no_greeting_has_a_part_in_the_next_one() -> None:
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    late, left = story.join("/late"), story.join("/left")
+    assert greeting(story)
+    story.upstream.greeted(b"")
+    story.topic.leave(left)
+    assert greeting(story)
+    story.upstream.greeted(bytes(batch(b"map").view))
+    assert (late.received, left.received) == (bytes(batch(b"map").view), b"")
+    assert not greeting(story)
+
+
+def test_subscribers_of_a_publisher_that_does_not_greet_are_asked_for_twice() -> None:
+    """Each request is a connection of two seconds."""
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.join("/late")
+    asked = 0
+    for _second in range(600):
+        story.upstream.asked.clear()
+        story.topic.tidy()
+        if "greet" in story.upstream.asked:
+            asked += 1
+            story.upstream.greeted(b"")
+        story.now += 1
+    assert asked == 2
+
+
 @pytest.mark.parametrize("why", ["latching", "stream", "goal", "guarded", "limited", "same"])
 def test_no_greeting(why: str) -> None:
     story = Story("/a/goal" if why == "goal" else "/map")
