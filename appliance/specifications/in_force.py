@@ -37,8 +37,9 @@ class InForce:
     """Specifications with everything that operators ordered about them.
 
     `number` is that of the revision; `acts` counts all switches and resumptions so far. `returns` are of switches for a
-    time. Unless it is confirmed in time, the revision gives way to the revision `back_to`. `since` names what operators
-    have ordered since that one was in force: `deadman` for a switch, `deadman.vMax` for a constant.
+    time. Unless it is confirmed in time, the revision gives way to the revision `back_to`, and so do all after it.
+    `since` names what operators have ordered since that one was in force: `deadman` for a switch, `deadman.vMax` for a
+    constant.
     `folder_refused` is why the last start rejected the folder; empty if it did not, and in the next revision.
     """
 
@@ -87,7 +88,8 @@ class Order:
     `within` is the time in which it must be confirmed. `author` is the author of the revision, unless it is `who`.
     `kept` are files that are not in the folder, `loaded` those that the operator named. `shadow` and `enable` name
     files. `topics` and `constants` are given values. `switches` and `given` are for monitors that are not in force yet,
-    and, if the order `undoes` a change, for all others as well.
+    and, if the order `undoes` a change, for all others as well. After one that is `settled`, nothing waits for a
+    confirmation.
     """
 
     sources: Sources
@@ -105,6 +107,7 @@ class Order:
     switches: Mapping[str, Switch] = field(default_factory=dict)
     given: Given = field(default_factory=dict)
     undoes: bool = False
+    settled: bool = False
 
 
 class Coming(NamedTuple):
@@ -123,6 +126,7 @@ class Coming(NamedTuple):
 def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed: bool) -> Coming:
     """Return the next revision. With `signed`, the site signs the texts."""
     constants, before = constants_of(order, checked, signed=signed), now
+    waiting = now.back_to is not None and not order.settled
     if order.undoes:
         now = _undone(now, order, checked)
     present = {name: to for name, to in now.states.items() if name in checked.switches}
@@ -135,14 +139,13 @@ def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed
         Givens({**_absent(now, order.given), **now.givens.said}).giving(constants),
         now.acts,
         now.returns,
-        None if order.within is None else now.number if now.back_to is None else now.back_to,
+        now.back_to if waiting else None if order.within is None else now.number,
     )
     files = checked.monitors.items()
     put: dict[str, Switch] = {name: SHADOW for name, file in files if file in order.shadow}
     put |= {name: True for name, file in files if file in order.enable and new.states[name] is False}
-    one_more = order.within is not None and now.back_to is not None
     ordered = put.keys() | {f"{name}.{constant}" for name, given in constants.items() for constant in given}
-    since = now.since - ordered if one_more else frozenset[str]()
+    since = now.since - ordered if waiting else frozenset[str]()
     new = replace(new, switches=new.switches.saying({**said, **put}), since=since)
     enabled = {name: True for name in checked.monitors if now.switches.enabled(name)}
     if order.undoes:

@@ -11,7 +11,8 @@
 5. A load or switch of other monitors never takes an existing monitor out of force.
 6. Files that are not in the folder stay in force unless a reload prunes, so a missing file ends no protection.
 7. Each revision is stored with its last switches and constants. A rollback gives them to monitors that return; that of
-   an unconfirmed change to all, except for what operators ordered since.
+   an unconfirmed change to all, except for what operators ordered since. It undoes later revisions as well: only a
+   confirmation, and a rollback to a revision before it, end the time to confirm.
 8. Each change gets a new tag, which never repeats; a change that expects another tag is refused.
 """
 
@@ -52,6 +53,7 @@ from appliance.specifications.specification_files import (
 )
 from appliance.specifications.specification_revisions import (
     NOTHING,
+    UNCONFIRMED_CHANGE,
     Check,
     CheckBeside,
     kept_in,
@@ -105,7 +107,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     refusal = SpecificationsRefusedError
     outdated = MonitorsChangedError
-    unconfirmed = EndKind("confirm monitors")
+    unconfirmed = UNCONFIRMED_CHANGE
 
     def __init__(
         self,
@@ -188,7 +190,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             coming = coming._replace(now=replace(coming.now, folder_refused=why))
         fresh = last is None and sources_of(row) != sources
         if fresh:
-            coming = coming._replace(now=replace(coming.now, number=self.revision + 1, back_to=None))
+            coming = coming._replace(now=replace(coming.now, number=self.revision + 1))
             row = self._row(coming.now, DISK, "read at start")
         elif self.revision:  # a start may have looked for warnings that an earlier version did not store
             row = row._replace(sources=text_with_warnings(sources, checked))
@@ -382,7 +384,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:
         """Load the folder; files that are not in it stay in force, unless `prune` is set.
 
-        The same texts make no new revision, unless one has an error or waits for a confirmation.
+        The same texts make no new revision, unless one has an error.
         """
         async with self.changing(request.expected):
             if self._folder.path is None:
@@ -394,7 +396,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 sources = self.sources.with_files(sources)
             keeper = who if kept else DISK  # with `DISK`, the next start would read only the folder
             same = sources == self.sources and (self.in_force.who == DISK) == (keeper == DISK)
-            if same and not broken(self.now) and self.confirm_by is None:
+            if same and not broken(self.now):
                 return self.replaced(self.revision, kept=kept)
             added, changed, _removed = sources.difference(self.sources)
             shadow = [*added, *changed] if request.shadow else []
@@ -420,8 +422,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         coming = replace(self.now, sources=sources, checked=await self._strictly(sources))
         return self.judge.held(self.now, coming, in_shadow(coming), hold=False).conflicts
 
-    async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
-        """Remove files, or the files of monitors, if no other monitor is in them or uses their variables."""
+    async def remove(self, request: admin.MonitorRemove, who: str, *, settled: bool = False) -> Replaced:
+        """Remove files, or the files of monitors, if no other monitor is in them or uses their variables.
+
+        With `settled`, nothing waits for a confirmation afterwards.
+        """
         async with self.changing(request.expected):
             names, owners = request.names, self.checked.monitors
             known = set(self.sources.files) | set(owners)
@@ -441,7 +446,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             keeper, within = who, request.confirm_within
             if within is None and self._is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
-            order = Order(sources, who, note, within, author=keeper)
+            order = Order(sources, who, note, within, author=keeper, settled=settled)
             return await self._change(order, self._beside(self._check))
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
@@ -460,7 +465,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
             order = Order(
                 sources_of(row), who, note, consent=_ALL, switches=last.switches, given=last.given,
-                undoes=who == UNCONFIRMED,
+                undoes=who == UNCONFIRMED, settled=self.settles(row.revision),
             )  # fmt: skip
             return await self._change(order, check)
 
@@ -763,7 +768,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     def _write(self, new: InForce, row: MonitorRevisionRow, limits: Sequence[_Limit] = ()) -> None:
         """Store a value and its revision, with the last switches and values of the one before it."""
-        if (row.revision, new.back_to) != (self.revision, self.now.back_to):
+        if new.back_to is None or any(kind is self.unconfirmed for kind, *_ in limits):
             self._cancel_return()
         with self.store.database.together():  # control may die during the change
             if row.revision != self.revision and self.revision:
@@ -816,8 +821,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self, earlier: Sources, who: str, warnings: Sequence[str] = (), began: Sequence[str] = ()
     ) -> None:
         changed = self.sources.difference(earlier)
+        row = self.in_force._replace(note=f"{self.in_force.note}{self.unless_confirmed}")
         self._change_records.loaded(
-            self.in_force, earlier, self.now, who, began=began, changed=changed, warnings=warnings
+            row, earlier, self.now, who, began=began, changed=changed, warnings=warnings
         )
 
     def _say_switched(

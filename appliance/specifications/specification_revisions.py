@@ -16,6 +16,7 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
 )
 from appliance.specifications.switches import Switch
+from appliance.store.ends import EndKind
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str], Sequence[str] | None], Awaitable[CheckedSpecifications]]
@@ -29,6 +30,10 @@ MAX_WARNINGS = 100
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first one."""
+
+
+UNCONFIRMED_CHANGE = EndKind("confirm monitors")
+"""The end of the time to confirm specifications."""
 
 
 class StartingSpecifications(NamedTuple):
@@ -157,10 +162,16 @@ async def _check_row(
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """Discard the last revision; return its number. Call this only while the appliance is not running."""
+    """Discard the last revision, and the time to confirm it; return its number.
+
+    Call this only while the appliance is not running.
+    """
     last = next(iter(store.monitor_revisions(1)), NOTHING)
     if last.who == DISK:
         return None
+    for end in store.ends():
+        if end.kind == UNCONFIRMED_CHANGE.name:
+            store.forget_end(end.kind, end.name)
     note = f"revision {last.revision} was discarded"
     store.save_monitor_revision(MonitorRevisionRow(last.revision + 1, "{}", now, DISK, note))
     return last.revision

@@ -41,8 +41,10 @@ R = TypeVar("R", bound=Row)
 class Revisions(ABC, Generic[R]):
     """The revisions of the policy or of the specifications; only one change is made at a time.
 
-    An unconfirmed change is rolled back even if the appliance restarts. A rollback that raises `refusal` or
-    `StoreError` changes nothing, and is tried again, because the operators may be absent.
+    An unconfirmed change is rolled back even if the appliance restarts, with all later ones: only a confirmation, and a
+    rollback to a revision before it, end the time to confirm, because who makes another change may not know of it. A
+    rollback that raises `refusal` or `StoreError` changes nothing, and is tried again, because the operators may be
+    absent.
     """
 
     refusal: ClassVar[type[Exception]]
@@ -84,6 +86,16 @@ class Revisions(ABC, Generic[R]):
         return next(
             (self.ends.date(self.unconfirmed, name) for name in self.ends.names(self.unconfirmed)), None
         )
+
+    @property
+    def unless_confirmed(self) -> str:
+        """Return in words what comes into force without a confirmation; empty if nothing waits for one."""
+        back_to = self.ends.names(self.unconfirmed)
+        return f"; without a confirmation, revision {back_to[0]} returns" if back_to else ""
+
+    def settles(self, revision: int) -> bool:
+        """Return whether nothing waits for a confirmation after a rollback to this revision."""
+        return all(revision <= int(back_to) for back_to in self.ends.names(self.unconfirmed))
 
     @abstractmethod
     async def _go_back(self, revision: int) -> None:
@@ -135,11 +147,12 @@ class Revisions(ABC, Generic[R]):
                 raise self.outdated(expected, self.tag)
             yield
 
-    def _put_in_force(self, row: R, within: float | None = None) -> None:
-        """Store a revision, with the time limit to confirm it, in seconds, or without one."""
+    def _put_in_force(self, row: R, within: float | None = None, *, settled: bool = False) -> None:
+        """Store a revision. `within` is a new time limit to confirm it, in seconds; a `settled` one has none."""
         back_to = next(iter(self.ends.names(self.unconfirmed)), str(self.revision))
         with self.store.database.together():  # control may die during the change
-            self.end_limit()
+            if settled or within is not None:
+                self.end_limit()
             if within is not None:
                 self.ends.set(self.unconfirmed, back_to, within)
             self._save(row)

@@ -140,7 +140,6 @@ class Policies(Revisions[RevisionRow]):
         kept = kept_policy(self.in_force) if self.revision else None
         policy, signature, refused = policy_at_start(kept, self.file, self.known, kept_first=kept_first)
         if kept is None or (kept.text, kept.signature) != (policy.text, signature):
-            self.end_limit()
             self._keep(policy, signature, who=DISK, note="read at start")
             return
         self._enforce(policy)
@@ -159,8 +158,8 @@ class Policies(Revisions[RevisionRow]):
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        The text in force makes no new revision, unless it waits for a confirmation, but begins rights again that a
-        wrong clock ended. Others are recorded as loaded from disk; the note names who ordered it.
+        The text in force makes no new revision, but begins rights again that a wrong clock ended. Others are
+        recorded as loaded from disk; the note names who ordered it.
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self.changing(request.expected):
@@ -170,8 +169,7 @@ class Policies(Revisions[RevisionRow]):
                 self._note_refused(error.findings[0])
                 raise
             now = self.in_force
-            equal = (now.who, now.text, now.signature) == (DISK, policy.text, signature)
-            if equal and self.confirm_by is None:
+            if (now.who, now.text, now.signature) == (DISK, policy.text, signature):
                 self._note_refused("")
                 return self._unchanged()
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
@@ -233,7 +231,9 @@ class Policies(Revisions[RevisionRow]):
         """
         row = await self.wanted(revision)
         policy = judged(row.text, row.signature, row.file, self.known)
-        return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
+        note = f"rolled back to revision {row.revision}"
+        settled = self.settles(row.revision)
+        return self._keep(policy, row.signature, who=who, note=note, settled=settled)
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
         async with self.changing(request.expected):
@@ -353,6 +353,7 @@ class Policies(Revisions[RevisionRow]):
         note: str,
         by: str | None = None,
         within: float | None = None,
+        settled: bool = False,
     ) -> Loaded:
         take_effect()
         self._note_refused("")
@@ -362,13 +363,13 @@ class Policies(Revisions[RevisionRow]):
         lost = _losses(known.complete(policy), self.policy(), self._live()) if self.policy else []
         earlier = {"policy": self.policy().text} if self.policy else {}
         with self.store.database.together():
-            self._put_in_force(row, within)
+            self._put_in_force(row, within, settled=settled)
             self.ends.forget(self.changes, *self.ends.names(self.changes))
             self._expect_changes(policy)
         revoked = self._enforce(policy)
         self._trail.happened(
             "policy loaded",
-            f"revision {row.revision} is in force: {note}",
+            f"revision {row.revision} is in force: {note}{self.unless_confirmed}",
             who=by or who,
             file=policy.file,
             sha256=fingerprint(policy.text),

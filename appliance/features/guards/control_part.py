@@ -61,6 +61,7 @@ class DriverChecks:
         self._monitors, self._trail, self._graph, self._processes = monitors, trail, graph, processes
         self._check = DriverCheck()
         self._who = ""
+        self._revision = 0
         self._asked_at = self._until = 0.0
         self._relays: list[int] = []
         self._changing = asyncio.Lock()
@@ -80,7 +81,7 @@ class DriverChecks:
         monitors = self._monitors
         if NAME in monitors.checked.monitors:
             raise SenselessError("a driver is being checked: try again when that check has ended")
-        if monitors.confirm_by is not None:  # the load and the removal would confirm it
+        if monitors.confirm_by is not None:  # it would get the time limit of the check
             raise SenselessError("specifications wait for rosrv monitor confirm: confirm them, or wait")
         text, seconds = self._text(request), request.patience + request.seconds
         order = admin.MonitorLoad(
@@ -90,7 +91,7 @@ class DriverChecks:
         self._check, self._who = DriverCheck(request.command, request.by), who
         self._ended.clear()
         try:
-            await monitors.load(order, who, enable=True)
+            self._revision = (await monitors.load(order, who, enable=True)).revision
         except BaseException:
             self._check = before
             raise
@@ -142,7 +143,10 @@ class DriverChecks:
 
     async def _remove(self) -> None:
         try:
-            await self._monitors.remove(admin.MonitorRemove([_FILE]), self._who or NAME)
+            monitors, request = self._monitors, admin.MonitorRemove([_FILE])
+            # A change during the check has its time limit, or one of its own.
+            settled = monitors.revision == self._revision
+            await monitors.remove(request, self._who or NAME, settled=settled)
         except (SpecificationsRefusedError, StoreError) as error:
             _log.warning("the monitor of a driver check is not removed yet", error=str(error))
             await asyncio.sleep(1)

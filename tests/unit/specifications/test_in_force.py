@@ -134,7 +134,8 @@ def test_changes_without_a_confirmation_go_back_to_the_last_revision_before_them
 
     waiting = following(following(NOW, 5.0), 5.0)
     assert (waiting.number, waiting.back_to, switched(waiting, ["a"], True).back_to) == (5, 3, 3)
-    assert (following(waiting).back_to, confirmed(waiting).back_to) == (None, None)
+    assert (following(waiting).back_to, confirmed(waiting).back_to) == (3, None)
+    assert loaded(waiting, Order(sources("a"), settled=True), checked("a"), signed=False).now.back_to is None
 
 
 def undone(now: InForce, text: CheckedSpecifications, former: InForce) -> InForce:

@@ -345,14 +345,15 @@ async def test_a_start_without_monitors_makes_no_revision(desk: Desk) -> None:
     assert (monitors.revision, desk.store.monitor_revisions()) == (0, [])
 
 
-async def test_a_changed_folder_ends_the_time_to_confirm_a_reload(desk: Desk) -> None:
+async def test_a_changed_folder_leaves_the_time_to_confirm_a_reload(desk: Desk) -> None:
     monitors = await desk.monitors()
     (desk.folder / "b.rv").write_text(B)
-    assert (await monitors.reload(admin.MonitorReload(confirm_within=600.0), "eve")).confirm_by is not None
+    end = (await monitors.reload(admin.MonitorReload(confirm_within=600.0), "eve")).confirm_by
     (desk.folder / "c.rv").write_text(C)
     for restarted in (False, True):
         again = await desk.monitors(restarted=restarted)
-        assert (again.names(), again.confirm_by) == (["a", "b", "c"], None)
+        assert (again.names(), again.now.back_to) == (["a", "b", "c"], 1)
+        assert again.confirm_by == pytest.approx(end, abs=1)
 
 
 async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) -> None:

@@ -57,6 +57,8 @@ async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keepe
         assert limit(keeper) == {"7": pytest.approx(within, abs=1)}
         assert keeper.confirm_by == pytest.approx(clock.wall() + within, abs=1)
     keeper.change(row(10))
+    assert limit(keeper) == {"7": pytest.approx(600.0, abs=1)}
+    keeper.change(row(11), settled=True)
     assert (limit(keeper), keeper.confirm_by, keeper.going_back) == ({}, None, None)
 
 
@@ -80,7 +82,7 @@ async def test_a_change_that_cannot_go_back_is_tried_again_until_it_has(keeper: 
         attempts.append(revision)
         if len(attempts) < 3:
             raise StoreError("the disk is full")
-        again.change(row(9, "not confirmed in time"))
+        again.change(row(9, "not confirmed in time"), settled=True)
         raise StoreError("the disk is full again")
 
     again = Keeper(keeper.store, keeper.ends, back)

@@ -25,8 +25,8 @@ class Keeper(Revisions[MonitorRevisionRow]):
     async def _go_back(self, revision: int) -> None:
         await self._back(revision)
 
-    def change(self, to: MonitorRevisionRow, within: float | None = None) -> None:
-        self._put_in_force(to, within)
+    def change(self, to: MonitorRevisionRow, within: float | None = None, *, settled: bool = False) -> None:
+        self._put_in_force(to, within, settled=settled)
 
 
 def unconfirmed(kind: EndKind) -> Callable[[StateStore, EndTable], Ending]:
@@ -35,7 +35,7 @@ def unconfirmed(kind: EndKind) -> Callable[[StateStore, EndTable], Ending]:
 
     def owner(store: StateStore, ends: EndTable) -> Ending:
         async def back(revision: int) -> None:
-            keeper.change(row(revision))
+            keeper.change(row(revision), settled=True)
 
         keeper = keepers(store, ends, back, 7)
         return Ending(lambda within: keeper.change(row(8), within), lambda: keeper.confirm_by is not None)

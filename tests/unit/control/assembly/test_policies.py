@@ -180,17 +180,55 @@ async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> N
         assert policies.current.text == OPEN
 
 
-@pytest.mark.nightly
-async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "order",
+    [
+        "load",
+        "load again",
+        "reload",
+        "reload again",
+        "roll back the next",
+        "decide again",
+        "start",
+        "crash",
+        "confirm",
+        "roll back",
+    ],
+)
+async def test_only_a_confirmation_and_a_rollback_end_the_timeout(tmp_path: Path, order: str) -> None:
+    """The file is edited before each order, except before those that read it again."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        await policies.reload(PolicyReload(confirm_within=60.0), "operator")
-    appliance.file.write_text(OTHER + "# edited\n")
-    with appliance.started() as policies:
-        assert (policies.revision, policies.confirm_by) == (3, None)
-    with appliance.started(restarted=True) as policies:
-        assert (policies.revision, policies.confirm_by) == (3, None)
+        end = (await policies.reload(PolicyReload(confirm_within=60.0), "ann")).confirm_by
+        if order != "reload again":
+            appliance.file.write_text(OTHER + "# edited\n")
+        match order:
+            case "load":
+                await policies.load(PolicyLoad(OTHER + "# another\n"), "bob")
+            case "load again":
+                for _ in range(2):
+                    await policies.load(PolicyLoad(OTHER), "bob")
+            case "reload" | "reload again":
+                await policies.reload(PolicyReload(), "bob")
+            case "roll back the next":
+                await policies.load(PolicyLoad(OTHER + "# another\n"), "bob")
+                await policies.roll_back(PolicyRollback(), "bob")
+            case "confirm":
+                await policies.confirm(PolicyConfirm(), "bob")
+            case "roll back":
+                await policies.roll_back(PolicyRollback(), "bob")
+            case _:
+                policies.decide_again()
+    with appliance.started(restarted=order == "crash") as policies:
+        if order in ("confirm", "roll back"):
+            assert policies.confirm_by is None
+            return
+        assert policies.confirm_by == pytest.approx(end, abs=1)
+        before = policies.revision
+        let_time_pass(60.5)
+        await until(policies, before + 1)
+        assert policies.current.text == OPEN
 
 
 @pytest.mark.nightly

@@ -97,6 +97,17 @@ async def test_its_monitor_is_removed_before_the_client_reads_the_outcome(site: 
     assert not site.removed()
     assert (await site.checks.wanted(DriverCheckWanted())).outcome == "idle"
     assert site.removed()
+    assert site.monitors.confirm_by is None
+
+
+async def test_its_end_does_not_confirm_a_change_during_the_check(site: Site) -> None:
+    await site.checks.begin(BEGIN, "eve")
+    change = admin.MonitorLoad({"speed.rv": SPEED}, confirm_within=600.0)
+    loaded = await site.monitors.load(change, "ann")
+    site.says("driver check: idle after 30.000 s")
+    await site.checks.look()
+    assert site.removed()
+    assert site.monitors.confirm_by == loaded.confirm_by
 
 
 async def test_the_monitor_is_loaded_behind_all_others_and_for_a_time(site: Site) -> None:

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.store.state_file import EndRow, MonitorRevisionRow, StateStore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory
 from tests.support.engines import InlineDatabase
@@ -16,6 +16,7 @@ def state_with(tmp_path: Path, who: str) -> Path:
     home.mkdir()
     store = StateStore(home, failed=print, kind=InlineDatabase)
     store.save_monitor_revision(MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, who, ""))
+    store.save_end(EndRow("confirm monitors", "6", 1, 0, 0, None))
     store.close()
     return tmp_path
 
@@ -27,10 +28,11 @@ def reset(state: Path, *options: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def last(state: Path) -> MonitorRevisionRow | None:
+def last(state: Path) -> tuple[MonitorRevisionRow, list[str]]:
+    """Return the last revision, and to which revisions it goes back without a confirmation."""
     store = StateStore(state / "control", failed=print, kind=InlineDatabase)
     try:
-        return next(iter(store.monitor_revisions(1)), None)
+        return store.monitor_revisions(1)[0], [end.name for end in store.ends()]
     finally:
         store.close()
 
@@ -39,9 +41,8 @@ def last(state: Path) -> MonitorRevisionRow | None:
 def test_specifications_loaded_by_command_are_dropped(tmp_path: Path) -> None:
     state = state_with(tmp_path, "operator")
     assert json.loads(reset(state, "--json")[1]) == {"given_up": 7}
-    row = last(state)
-    assert row is not None
-    assert (row.revision, row.who) == (8, "disk")
+    row, back_to = last(state)
+    assert (row.revision, row.who, back_to) == (8, "disk", [])
     status, said = reset(state)
     assert status == 0
     assert "nothing to discard" in said
@@ -55,7 +56,7 @@ def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
     running.close()
     assert status == 1
     assert "already uses the state directory" in said
-    assert last(state) == MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, "operator", "")
+    assert last(state) == (MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, "operator", ""), ["6"])
 
 
 def test_a_directory_without_a_state_is_an_error(tmp_path: Path) -> None:
