@@ -60,8 +60,8 @@ class HeaderCandidates:
         named: dict[_Key, Mapping[str, str]] = {}
         for claim in self._claims():
             if _named(claim, "md5sum"):
-                fields = self._with_type(claim)
-                named.setdefault(_key(fields), fields)
+                typed = self._with_type(claim)
+                named.setdefault(_key(typed), typed)
         self._earlier &= named.keys()
         if not named.keys() - self._earlier:
             self._earlier.clear()

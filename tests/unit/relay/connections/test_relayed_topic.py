@@ -380,7 +380,8 @@ def test_a_latched_message_is_asked_for_again_if_the_last_one_was_held_back(
 
     def through(frames: Batch) -> Batch | None:
         parts = [frames.tail(frames.messages - n).head(1) for n in range(frames.messages)]
-        passing = [bytes(part.view[4:]) for part in parts if not (hold and part.view[4:] == b"held")]
+        texts = [bytes(part.view[4:]) for part in parts]
+        passing = [text for text in texts if not (hold and text == b"held")]
         return batch(*passing) if passing else None
 
     story, hold = Story("/map"), [True]
