@@ -175,8 +175,10 @@ class DataPlane:
         elif isinstance(message, messages.PublicationPlaced):
             self._place_topic(message.key, message.topic)
             self._limit_topic(message)
-            self._ranks.place(message, self.topics[message.key, message.topic])
-            self.topics[message.key, message.topic].upstream.silence(silent=message.silent)
+            relayed = self.topics[message.key, message.topic]
+            self._ranks.place(message, relayed)
+            relayed.upstream.silence(silent=message.silent)
+            relayed.keep_open(kept=message.wanted)
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
         if self.waiting and message.key in self.waiting:

@@ -77,6 +77,7 @@ class PublicationPlaced(Message):
     `limit` applies to all publications of the topic on this host. `together` applies to all publications of the topic;
     hosts, by `counted_as`, share it equally. `silent`: the relay drops all messages of the node, because its host does
     not hold the topic's group (`[Authority]`). `rank`: the relay drops the messages while a higher rank moves.
+    `wanted`: the host loses a right by silence, so the relay stays connected without a subscriber, and reports silence.
     """
 
     key: str
@@ -88,6 +89,7 @@ class PublicationPlaced(Message):
     named: bool = True
     silent: bool = False
     rank: RankPlace | None = None
+    wanted: bool = False
 
 
 class ServicePlaced(Message):
@@ -252,7 +254,8 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     """Traffic since the last report.
 
     `delays` counts messages by the time from their receipt to the write to the subscribers' sockets: up to each of
-    `DELAY_BOUNDS`, and beyond. `md5sum` is empty while unknown, and for services.
+    `DELAY_BOUNDS`, and beyond. `md5sum` is empty while unknown, and for services. `silent`: the seconds in which the
+    relay was connected to a `wanted` publication that sent nothing.
     """
 
     key: str
@@ -264,6 +267,7 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     delays: list[int] = msgspec.field(default_factory=list)
     delay_seconds: float = 0.0
     md5sum: str = ""
+    silent: float = 0.0
 
 
 class LimitedRow(msgspec.Struct, frozen=True, array_like=True):

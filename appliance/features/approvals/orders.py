@@ -264,7 +264,8 @@ class ApprovalOrders:
     def _silence(self, entry: ApprovalEntry) -> str:
         moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)
         seconds = SILENT_SECONDS if group is None else group.release_after
-        silent = moved > entry.since and clock.now() - moved >= seconds
+        about = entry.call.host, frozenset({entry.call.resource})
+        silent = moved > entry.since and self._signs.silence(*about, moved) >= seconds
         return f"its host was silent for {seconds:g} s" if silent else ""
 
     async def _end_if_guarded(self, entry: ApprovalEntry) -> None:

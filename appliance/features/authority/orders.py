@@ -8,6 +8,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from weakref import WeakValueDictionary
 
 from appliance.base import clock
@@ -124,15 +125,17 @@ class GroupHolders:
         self._held[group] = Holding(host, now, now) if before is None else replace(before, renewed=now)
         self._waiting.get(group, {}).pop(host, None)
 
-    def seconds_left(self, group: AuthorityGroup, now: float, moved: float) -> float | None:
+    def seconds_left(
+        self, group: AuthorityGroup, moved: float, silence: Callable[[float], float]
+    ) -> float | None:
         """Return the seconds until a silent holder loses the group.
 
-        `moved` is the time of its last message to the group.
+        `moved` is the time of its last message to the group, `silence(since)` the seconds of its silence after a time.
         """
         holding = self._held.get(group.name)
         if holding is None:
             return None
-        return max(holding.renewed, holding.moved, moved) + group.release_after - now
+        return group.release_after - silence(max(holding.renewed, holding.moved, moved))
 
     def lost_nodes(self, group: str, *, live: bool) -> bool:
         """Return whether the holder had a live node until now. It keeps the group for a node that comes back."""
@@ -142,7 +145,7 @@ class GroupHolders:
         self._held[group] = replace(holding, has_node=live)
         return holding.has_node and not live
 
-    def loss(self, group: AuthorityGroup, now: float, *, moved: float) -> str:
+    def loss(self, group: AuthorityGroup, moved: float, silence: Callable[[float], float]) -> str:
         """Return why the holder loses the group, or an empty string."""
         holding = self._held.get(group.name)
         if holding is None:
@@ -150,7 +153,7 @@ class GroupHolders:
         if holding.lost or self._claim_of(group, holding.host) is None:
             return "the policy no longer lets it hold the group"
         self._held[group.name] = replace(holding, moved=max(moved, holding.moved))
-        left = self.seconds_left(group, now, moved)
+        left = self.seconds_left(group, moved, silence)
         return f"it was silent for {group.release_after:g} s" if left is not None and left <= 0 else ""
 
     def successor(self, group: AuthorityGroup, now: float) -> Address | None:
@@ -317,12 +320,16 @@ class DriveOrders:
                 if self._next(group) is not None:
                     await self._hand_over(group, None, "it waited for the group", "")
                 return
-            moved = self._signs.moved(held.host, group.names)
             ended = self._groups.lost_nodes(group.name, live=self._signs.live(held.host))
-            if loss := self._groups.loss(group, clock.now(), moved=moved):
+            if loss := self._groups.loss(group, *self._quiet(group, held)):
                 await self._hand_over(group, None, loss, "", stop=True)
             elif ended:
                 await self._stop(str(held.host), group.names, f"{group.name}: its nodes ended")
+
+    def _quiet(self, group: AuthorityGroup, held: Holding) -> tuple[float, Callable[[float], float]]:
+        """Return the time of the holder's last message, and what returns its silence since a time."""
+        about = held.host, group.names
+        return self._signs.moved(*about), partial(self._signs.silence, *about)
 
     def _turn(self, group: AuthorityGroup) -> asyncio.Lock:
         return self._turns.setdefault(group.name, asyncio.Lock())
@@ -467,8 +474,7 @@ class DriveOrders:
         if group.ranks:
             return self._ranked_state(group)
         now, holding = clock.now(), self._groups.holder(group.name)
-        moved = 0.0 if holding is None else self._signs.moved(holding.host, group.names)
-        left = self._groups.seconds_left(group, now, moved)
+        left = None if holding is None else self._groups.seconds_left(group, *self._quiet(group, holding))
         return requests.GroupState(
             group.name,
             sorted(group.names),

@@ -389,6 +389,7 @@ class RelayControl:
             _names(policy, node.host),
             not may_command,
             rank,
+            group is not None or (node.host, Category.PUBLISH, resource) in (policy.approved or ()),
         )
 
     def _granted(self, post: RelayOutbox, node: Incarnation, row: PermissionRow) -> messages.RelayFact | None:

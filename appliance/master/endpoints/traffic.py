@@ -24,6 +24,8 @@ OTHERS = "(others)"  # ROS names cannot contain brackets
 
 _STILL_SECONDS = 3.0  # after this time without a report, rates are 0
 _MOVING_SECONDS = 60.0
+_UNHEARD_SECONDS = 20.0
+"""The time without a report in which a publisher may have sent: its relay hangs, starts, or is not connected to it."""
 
 
 @dataclass(slots=True)
@@ -35,6 +37,8 @@ class Traffic:
     dropped: int = 0
     seconds: float = 0.0  # the time of the last report (monotonic)
     moved: float = 0.0  # the time of the last report with messages (monotonic)
+    silent: float = 0.0  # seconds since then in which a relay was connected, and reported silence
+    heard: float = 0.0  # the time of the last report of messages or silence (monotonic)
     messages_per_second: float = 0.0  # the rate between the last two reports
     bytes_per_second: float = 0.0
     delays: list[int] = field(default_factory=list)  # as in `TopicTraffic`
@@ -48,6 +52,9 @@ class Traffic:
         self.dropped += row.dropped
         self.md5sum = row.md5sum or self.md5sum
         self.moved = now if row.messages else self.moved
+        # A relay that hung may report before it reads what waited.
+        self.silent = 0.0 if row.messages else self.silent + min(row.silent, over)
+        self.heard = now if row.messages or row.silent else self.heard
         passed = max(now - self.seconds, 1.0) if self.seconds else max(over, 1.0)
         self.messages_per_second = row.messages / passed
         self.bytes_per_second = row.bytes / passed
@@ -56,6 +63,11 @@ class Traffic:
             self.delays = [a + b for a, b in zip_longest(self.delays, row.delays, fillvalue=0)]
             self.delay_seconds += row.delay_seconds
         self.delay = row.delay_seconds / sum(row.delays) if row.delays else 0.0
+
+    def silence(self, since: float) -> float:
+        """Return the seconds of silence after a time, without `_UNHEARD_SECONDS` of which no relay reports."""
+        unheard = clock.now() - max(self.heard, since)
+        return min(self.silent, max(0.0, self.heard - since)) + max(0.0, unheard - _UNHEARD_SECONDS)
 
     def include(self, other: "Traffic") -> None:
         self.messages += other.messages

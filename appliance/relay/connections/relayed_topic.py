@@ -315,6 +315,8 @@ class RelayedTopic:
         self._superseded = False  # whether a guard's stop is the last message
         self._is_command = topic.endswith("/goal")  # no monitor can declare what stops an action
         self._rank: RankedPublication | None = None
+        self._kept = False
+        self._listened = 0.0  # the time of the last report, or since when it has been open
         self._newcomers = Newcomers()
 
     @property
@@ -394,9 +396,17 @@ class RelayedTopic:
 
     @property
     def _is_wanted(self) -> bool:
-        if self._rank is not None:  # its motions count even without a subscriber
+        if self._kept or self._rank is not None:  # its motions count even without a subscriber
             return True
         return bool(self._waiting or self._served or self._monitoring.wanted or self._taps)
+
+    def keep_open(self, *, kept: bool) -> None:
+        """Stay connected without a subscriber, and report silence, if `kept`."""
+        if kept != self._kept:
+            self._kept = kept
+            if kept:
+                self.upstream.connect()
+            self._spare_unwanted()
 
     def _spare_unwanted(self) -> None:
         if not self._is_wanted:
@@ -460,7 +470,7 @@ class RelayedTopic:
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
         self.latch.is_latching = header.get("latching", "0") == "1"
-        self._state = TopicState.OPEN
+        self._state, self._listened = TopicState.OPEN, self._clock()
         self._newcomers.reset()
         if self._rank is not None:
             self._rank.opened(header, self._clock())
@@ -471,7 +481,7 @@ class RelayedTopic:
         self._end_stream()
         if self._sink is not None:
             self._stream = self._sink.open(self.topic, self.host, header)
-        watched = self._monitoring.wanted or self._rank is not None
+        watched = self._monitoring.wanted or self._kept or self._rank is not None
         alone = watched and not (self.latch.is_latching or self._waiting or self._served)
         self._startup_replay.opened(self._clock(), alone=alone)
         if before is not None and _identity(before) != _identity(header):
@@ -700,7 +710,9 @@ class RelayedTopic:
         return self.delays.take(self.counters)
 
     def traffic(self) -> TopicTraffic | None:
-        if self._reported and not self.counters.messages and not self._served.dropped:
+        before, self._listened = self._listened, self._clock()
+        silent = self._listened - before if self._kept and self._state is TopicState.OPEN else 0.0
+        if self._reported and not self.counters.messages and not self._served.dropped and not silent:
             return None
         messages, size, counts, seconds = self.counters.take()
         dropped, self._served.dropped = self._served.dropped, 0
@@ -714,6 +726,7 @@ class RelayedTopic:
             counts,
             seconds,
             "" if self._header is None else self._header.get("md5sum", ""),
+            0.0 if messages else silent,
         )
         self._reported = True
         return row

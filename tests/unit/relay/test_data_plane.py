@@ -37,7 +37,7 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.connections.admission import missing
-from appliance.relay.connections.upstream import PublisherConnection
+from appliance.relay.connections.upstream import PublisherConnection, UpstreamState
 from appliance.relay.grant_table import GrantTable
 from appliance.relay.loop import EventLoop
 from appliance.relay.relay_limits import MIB
@@ -381,6 +381,20 @@ def test_no_message_of_a_silent_publisher_passes(world: World) -> None:
     again.send(encode_frame(b"after"))
     for one in (subscriber, other):
         world.gets(one, encode_frame(b"after"))
+
+
+def test_a_publisher_whose_silence_ends_a_right_is_connected_without_a_subscriber(world: World) -> None:
+    """Once it may command, and until its silence ends nothing."""
+    world.state(PublicationPlaced("k", "/cmd_vel", "*", wanted=True, silent=True))
+    world.loop.turn(0.05)
+    world.told += [message for message, _fds in world.control.receive()]
+    assert not any(isinstance(message, UpstreamWanted) for message in world.told)
+    world.state(PublicationPlaced("k", "/cmd_vel", "*", wanted=True))
+    world.hears(UpstreamWanted, topic="/cmd_vel")
+    upstream = world.engine.topics["k", "/cmd_vel"].upstream
+    assert isinstance(upstream, PublisherConnection)
+    world.state(PublicationPlaced("k", "/cmd_vel", "*"))
+    world.until(lambda: upstream.state is UpstreamState.IDLE)
 
 
 def test_a_withdrawn_nodes_port_is_closed(world: World) -> None:

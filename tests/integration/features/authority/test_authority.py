@@ -87,6 +87,8 @@ def test_one_host_at_a_time_is_heard(site: Site) -> None:
     site.pilot_node.kill()
     site.tablet.talker("rospy", "/chatter", name="pilot")
     assert site.heard("/pilot") == {"/pilot"}, "a node that restarts within the lease has its group"
+    site.appliance.kill("relay")
+    assert site.heard("/pilot") == {"/pilot"}, "and so has one whose relay restarts"
     site.drive("assign", "base", "--host", BOSS)
     assert site.heard("/boss") == {"/boss"}
     assert f"{BOSS} holds base" in site.drive("assign", "base", "--host", PILOT, check=False)

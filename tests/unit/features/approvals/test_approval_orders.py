@@ -49,7 +49,7 @@ def bearer(number: str, name: str, role: str = "operator") -> TokenKept:
 
 
 class Site:
-    def __init__(self, time: VirtualClock, ends: EndTable) -> None:
+    def __init__(self, time: VirtualClock, ends: EndTable, signs: HostSigns | None = None) -> None:
         self.time = time
         self.text = compile_policy(TEXT, file="site.ini")
         self.policy: Policy
@@ -64,7 +64,7 @@ class Site:
         self.orders = ApprovalOrders(
             lambda: self.policy,
             self.trail,
-            HostSigns(lambda _host: True, lambda _host, _names: self.moved),
+            signs or HostSigns(lambda _host: True, lambda _host, _names: self.moved),
             self.stop,
             ends,
             first=17,

@@ -40,7 +40,7 @@ lease base = {RELEASE_AFTER:g}s
 
 
 class Site:
-    def __init__(self, chance: random.Random, time: VirtualClock) -> None:
+    def __init__(self, chance: random.Random, time: VirtualClock, signs: HostSigns | None = None) -> None:
         self.time = time
         self.chance = chance
         self.policy: Policy = compile_policy(TEXT, file="site.ini")
@@ -59,7 +59,7 @@ class Site:
         self.orders = DriveOrders(
             lambda: self.policy,
             self.trail,
-            HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
+            signs or HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
             self.stop,
             ranked,
             decide_again=self.decide_again,

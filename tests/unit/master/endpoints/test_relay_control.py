@@ -2,6 +2,7 @@
 
 import asyncio
 import ipaddress
+from dataclasses import replace
 
 import pytest
 
@@ -11,7 +12,7 @@ from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Kind, Registry
-from appliance.policy.model import Address
+from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import Bounds
@@ -334,3 +335,24 @@ async def test_grants_of_all_hosts_are_bounded() -> None:
             world.grant_topic("/left", address, f"/ear{number}")
         assert len(world.grants.all()) <= 100
     assert "10.0.0.9" in {row.host for row in world.grants.all()}
+
+
+@pytest.mark.parametrize(
+    ("lines", "wanted"),
+    [
+        ("", False),
+        ("[Authority]\nbase = /left\ntake base = 10.0.0.5\n", True),
+        ("[Authority]\nbase = /left\nask base = 10.0.0.5\n", True),
+        ("[Authority]\nbase = /left\nrank base = 10.0.0.5/node > 10.0.0.6\n", True),
+        ("[Publishers]\n/left = ask 10.0.0.5\n", False),
+        ("[Publishers]\n/left = ask 10.0.0.5\n# approved\n", True),
+    ],
+)
+async def test_a_relay_keeps_each_publication_whose_silence_ends_a_right(
+    world: World, lines: str, wanted: bool
+) -> None:
+    """Every topic of a group, with any holder or none, and each approved one; not all that could be approved."""
+    asked = frozenset({(HOST, Category.PUBLISH, "/left")} if "# approved" in lines else ())
+    world.use(replace(compile_policy(lines, file="p.ini"), approved=asked))
+    placed = [one for one in world.links[0].heard() if isinstance(one, messages.PublicationPlaced)]
+    assert placed[-1].wanted == wanted
