@@ -221,7 +221,7 @@ class RelayOrders:
         """Publishes a message on a topic of `publish_only`."""
         self.look = relay.taps.look
         self.stop = relay.taps.stop
-        """Lets the monitors of a topic send their safe messages, and returns their names."""
+        """Lets the monitors of a topic send their safe messages, and returns their names; None: no relay answers."""
         self.stoppers = relay.taps.stoppers
         """Returns the monitors that have a safe message for a topic; None: its relay does not answer."""
         self.test = relay.taps.test

@@ -34,9 +34,9 @@ def published_before(store: StateStore, concerns: Callable[[Address, str], bool]
 
 @dataclass(frozen=True, slots=True)
 class MotionStop:
-    """Stops the robot; `stop(topic)` returns the names of the monitors that do it."""
+    """Stops the robot; `stop(topic)` returns the names of the monitors that do it, or None if no relay answers."""
 
-    stop: Callable[[str], Awaitable[list[str]]]
+    stop: Callable[[str], Awaitable[list[str] | None]]
     trail: AuditTrail
     policy: Callable[[], Policy]
 
@@ -48,17 +48,27 @@ class MotionStop:
         wanted = sorted(topics)
         begun = dict(zip(wanted, await asyncio.gather(*map(self.stop, wanted)), strict=True))
         stopped = {topic: monitors for topic, monitors in begun.items() if monitors}
+        if unknown := [topic for topic, monitors in begun.items() if monitors is None]:
+            text = f"the relay of {', '.join(unknown)} does not answer, so its guards may not stop the robot: {why}"
+            self._record("motion not stopped", text, host, unknown)
         if stopped:
             sent = "; ".join(f"{', '.join(names)} on {topic}" for topic, names in stopped.items())
             self._record("motion stopped", f"safe messages of {sent}: {why}", host, stopped)
-        elif commanded := [topic for topic in wanted if self.policy().commanded(topic) is not None]:
+        elif commanded := [
+            topic
+            for topic, monitors in begun.items()
+            if monitors is not None and self.policy().commanded(topic) is not None
+        ]:
             text = f"no enabled guard has a safe message for {', '.join(commanded)}, so nothing stops the robot: {why}"
             self._record("motion not stopped", text, host, commanded)
 
     def of_published_before(
         self, core: Core, wanted: Callable[[], bool], concerns: Callable[[Address, str], bool]
     ) -> Callable[[], Awaitable[None]]:
-        """Return the work that stops the topics of earlier publishers, if the first policy wants it."""
+        """Return the work that stops the topics of earlier publishers, if the first policy wants it.
+
+        `concerns(host, topic)` decides at the first policy, and again when the relays have reported what they kept.
+        """
         lost: Commands = set()
 
         def find() -> None:
@@ -66,10 +76,14 @@ class MotionStop:
                 lost.update(published_before(core.store, concerns))
 
         core.policy.on_first(find)
-        return partial(self.at_start, lost, core.relay.ready, core.relay.carried_out)
+        return partial(self.at_start, lost, core.relay.ready, core.relay.carried_out, concerns)
 
     async def at_start(
-        self, lost: Commands, ready: Callable[[], bool], carried_out: Callable[[], Awaitable[None]]
+        self,
+        lost: Commands,
+        ready: Callable[[], bool],
+        carried_out: Callable[[], Awaitable[None]],
+        concerns: Callable[[Address, str], bool],
     ) -> None:
         """Stop topics whose hosts lost the right while control was away, once no relay serves these hosts."""
         while lost and not ready():
@@ -77,7 +91,10 @@ class MotionStop:
         await carried_out()
         while lost:
             host, topic = lost.pop()
-            await self.after(host, {topic}, "RVMaster started again, and the right of the host is not kept")
+            if concerns(address_of(host), topic):
+                await self.after(
+                    host, {topic}, "RVMaster started again, and the right of the host is not kept"
+                )
 
     def _record(self, event: str, reason: str, host: str, topics: Iterable[str]) -> None:
         self.trail.happened(event, reason, host=host, resource=next(iter(topics)), whole=True)

@@ -35,7 +35,8 @@ EVENTS: dict[str, str] = {
     "approval used": "A host made the one call that an operator approved.",
     "approval wanted": "A host after `ask` in the policy made a call that needs an approval; `detail.approval` is its"
     " number.",
-    "motion not stopped": "A host lost the right to command a motion, and no guard has a safe message that stops it.",
+    "motion not stopped": "A host lost the right to command a motion, and no guard has a safe message that stops it, or"
+    " its relay does not answer.",
     "motion stopped": "A host lost the right to command a motion, and guards send their safe messages.",
     "authority asked": "A host waits for a group of [Authority]; `resource` is the group.",
     "authority refused": "A host may not take a group of [Authority], or not now; `resource` is the group.",

@@ -34,7 +34,9 @@ async def begin(core: Core) -> ControlPart:
     at_start = stop.of_published_before(
         core,
         lambda: bool(policy.current().authority),
-        lambda _host, topic: policy.current().commanded(topic) is not None,
+        lambda _host, topic: (
+            (group := policy.current().commanded(topic)) is not None and ranked.forgot(group)
+        ),
     )
     policy.provide(lambda known: known.with_holders(orders.holders()))
     policy.on_change(orders.policy_changed)

@@ -103,6 +103,10 @@ class RankedGroups:
     def driver(self, group: AuthorityGroup) -> RankedDriver:
         return self._drivers.get(group.topic, RankedDriver(_UNKNOWN))
 
+    def forgot(self, group: AuthorityGroup) -> bool:
+        """Return whether no relay knows who moves the group, as after a start of the appliance."""
+        return self.driver(group).standing == "unknown"
+
     def hears(self, group: AuthorityGroup, host: Address, node: str) -> bool:
         """Return whether a node may move the group, unless one of a higher rank does: after a loss or a start, lower
         ranks wait for a person.

@@ -51,9 +51,9 @@ class TapRequests:
             send(messages.LookEnded(number))
         return seen
 
-    async def stop(self, topic: str) -> list[str]:
-        """Return the names of the monitors that have a safe message and send it."""
-        return await self._safe_messages(topic, begin=True) or []
+    async def stop(self, topic: str) -> list[str] | None:
+        """Return the names of the monitors that have a safe message and send it; None if the relay does not answer."""
+        return await self._safe_messages(topic, begin=True)
 
     async def stoppers(self, topic: str) -> list[str] | None:
         """Return the names of monitors with a safe message; None if the relay does not answer."""
