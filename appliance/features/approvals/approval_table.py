@@ -109,7 +109,7 @@ class ApprovalTable:
         return self._entries.get(number)
 
     def find(self, call: HeldCall) -> ApprovalEntry | None:
-        for one in (call._replace(digest=""), call):
+        for one in (call, call._replace(digest="")):
             if (number := self._by_call.get(one)) is not None:
                 return self._entries[number]
         return None
@@ -142,12 +142,11 @@ class ApprovalTable:
         *,
         credentials: frozenset[str],
     ) -> ApprovalEntry:
-        """Approve one call (`seconds` is None), or all calls of its key for some seconds."""
-        call = entry.call
-        if seconds is not None and call.digest:
-            call = call._replace(digest="")
-            if (other := self._by_call.get(call)) is not None:
-                self.end(self._entries[other])
+        """Approve one call (`seconds` is None), or all calls of its host and name for some seconds.
+
+        The caller has ended the entries that the latter covers.
+        """
+        call = entry.call if seconds is None else entry.call._replace(digest="")
         self._by_call.pop(entry.call, None)
         return self._put(
             replace(
@@ -161,6 +160,14 @@ class ApprovalTable:
             ),
             WAIT_SECONDS if seconds is None else seconds,
         )
+
+    def covered(self, entry: ApprovalEntry) -> list[ApprovalEntry]:
+        """Return the other entries of the same host and name."""
+        return [
+            one
+            for one in self._entries.values()
+            if one.number != entry.number and one.call.approval == entry.call.approval
+        ]
 
     def refuse(self, entry: ApprovalEntry, who: str) -> ApprovalEntry:
         return self._put(replace(entry, state=ApprovalState.REFUSED, who=who), WAIT_SECONDS)

@@ -170,6 +170,8 @@ class ApprovalOrders:
                 f"the policy no longer asks about {entry.call.resource}: there is nothing to approve"
             )
         take_effect()
+        for other in self._table.covered(entry) if seconds is not None else ():
+            self._end(other, f"approval {entry.number} covers it", who)
         credentials = frozenset(number for number, name in self._approvers().items() if name == who)
         earlier = entry.state.value
         entry = self._table.approve(entry, seconds, who, clock.now(), credentials=credentials)

@@ -1,5 +1,6 @@
 import asyncio
 import hashlib
+import itertools
 import random
 import re
 from collections.abc import Awaitable, Iterable
@@ -162,7 +163,7 @@ class Promises:
         """Return a part of the answer to its host; nothing if the call passes."""
         if not self.asks:
             return ""
-        one = wide if (wide := (*key[:3], None)) in self.held else key
+        one = key if key in self.held else (*key[:3], None)
         now = self.held.get(one)
         if now is not None and key[1] is Category.CALL and now.tokens and (over := self.over(now)):
             self.end(one, over)
@@ -195,6 +196,8 @@ class Promises:
         del self.held[key]
         once, until = seconds is None, clock.now() + (seconds or WAIT_SECONDS)
         approved = Held(number, "approved" if once else "lease", until, who, frozenset(tokens or {who}))
+        for other in [] if once else [other for other in self.held if other[:3] == key[:3]]:
+            self.end(other, f"approval {number} covers it")
         self.held[key if once else (*key[:3], None)] = approved
         self.records.append(f"{who} gave approval {number}, {'once' if once else f'for {seconds:g} s'}")
         return ""
@@ -290,6 +293,54 @@ async def test_approvals_are_as_promised_in_any_order(site: Site, seed: int) -> 
         assert site.orders.limits()[0].used == len(shown)
         texts = [row["reason"] for row in site.trail.rows if row["event"].startswith("approval")]
         assert sorted(text.partition(": ")[2] for text in texts) == sorted(promised.records)
+
+
+ANSWERS = [(call, answer) for call in "AB" for answer in ("once", "for", "refuse")]
+
+
+@pytest.mark.parametrize("answers", list(itertools.product(ANSWERS, repeat=3)), ids=str)
+async def test_the_last_answer_about_a_call_decides_it(
+    site: Site, answers: Iterable[tuple[str, str]]
+) -> None:
+    """An approval for some time is an answer about all calls of its name. Each approval that was given has an end."""
+    numbers = {call: number_in(await site.call(call.encode())) for call in ("A", "B")}
+    about = dict.fromkeys(numbers, "waits")
+    lasting = 0  # the number of the approval for some time
+    for call, answer in answers:
+        number = numbers[call]
+        try:
+            if answer == "refuse":
+                await site.orders.refuse(RefuseCall(number), "ann")
+            else:
+                await site.orders.approve(ApproveCall(number, 300.0 if answer == "for" else None), "ann")
+        except (SenselessError, UnknownThingError):
+            assert lasting, "only an approval for some time makes numbers invalid"
+        else:
+            ends = lasting == number and answer == "refuse"
+            lasting = number if answer == "for" else 0 if ends else lasting
+            over = ends or (answer == "refuse" and about[call] == "once")
+            changed = numbers if ends or answer == "for" else (call,)
+            about |= dict.fromkeys(changed, "waits" if over else answer)
+            for one in changed if over else ():
+                numbers[one] = number_in(await site.call(one.encode()))
+    for call, answer in about.items():
+        told = [await site.call(call.encode()) for _again in range(2)]
+        parts = {
+            "once": ("", "held for"),
+            "for": ("", ""),
+            "refuse": ("refused",) * 2,
+            "waits": ("held for",) * 2,
+        }
+        assert all(
+            part in text and bool(part) == bool(text) for part, text in zip(parts[answer], told, strict=True)
+        )
+    assert [one.state for one in await site.held()].count("waits") == site.orders.state().waiting
+    await site.pass_time(301)
+    given, ended = (
+        {row["approval"] for row in site.trail.rows if row["event"] in events}
+        for events in (("approval given",), ("approval ended", "approval used"))
+    )
+    assert given <= ended
 
 
 async def is_answered(order: Awaitable[object], error: str) -> None:
