@@ -574,7 +574,8 @@ _ALARMS_HEAD = """# Alarms
 
 An *alarm* needs a person now and is red, a *warning* needs one soon, a *notice* needs none. With an alarm or a warning,
 `rosrv status` exits with 1, except for `denials`, `drops`, `monitor-off` and `policy-audit-only`. A name may be
-followed by `:` and what it is about. `rosrv alarm list` has the present ones.
+followed by `:` and what it is about; an order with the name alone is for all such alarms that are present.
+`rosrv alarm list` has these.
 
 | name | severity | what a person does |
 |---|---|---|

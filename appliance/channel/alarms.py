@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 from typing import Annotated, Literal
 
 import msgspec
@@ -10,7 +11,7 @@ from msgspec import structs
 from appliance.base.counted import counted
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
-from appliance.channel.status_summary import no_relay, probe_failed
+from appliance.channel.status_summary import no_relay, probe_failed, process_names
 from appliance.features.view import AlarmKind
 from appliance.features.views import STATES, states_of
 
@@ -74,7 +75,8 @@ class AlarmList(msgspec.Struct, frozen=True):
 
 def open_alarms(status: Status) -> list[Alarm]:
     found = [*_system(status), *_policy(status), *_monitors(status)]
-    found += [("ipsec", "hosts", line) for line in status.ipsec.troubles]
+    tunnels = zip_longest(status.ipsec.trouble_names, status.ipsec.troubles, fillvalue="")
+    found += [(f"ipsec:{name}".removesuffix(":"), "hosts", line) for name, line in tunnels]
     found += _blocks(status.blocks)
     for view, state in states_of(status):
         found += [(one.kind, one.about, one.text) for one in view.alarms(state)]
@@ -136,9 +138,9 @@ def _system(status: Status) -> Iterator[_Condition]:
         yield "starting", "system", "starting: calls and messages wait"
     elif relay is not None:
         yield "relay", "system", f"{relay}, until it is back"
-    for process in status.processes:
+    for name, process in zip(process_names(status.processes), status.processes, strict=True):
         if process.failing:
-            yield "process-failing", "system", _failing(process)
+            yield f"process-failing:{name.replace(' ', '-')}", "system", _failing(process)
     if rebuilt and not status.starting:
         yield "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
     if audit.degraded is not None:
@@ -186,8 +188,9 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     for name in monitors.failing:
         text = f"monitors fail: {name}; messages at which it faults are {FAULTED}"
         yield f"monitor-failing:{name}", "monitors", text
-    for line in monitors.refused:
-        yield "monitors-refused", "monitors", f"the relay rejected the specifications: {line}"
+    if monitors.refused:
+        text = f"the relay rejected the specifications: {'; '.join(monitors.refused)}"
+        yield "monitors-refused", "monitors", text
     if monitors.confirm_by is not None:
         text = _rolls_back("the specifications roll", monitors.confirm_by, "monitor")
         yield "monitors-unconfirmed", "monitors", text

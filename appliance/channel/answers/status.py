@@ -108,6 +108,9 @@ class IpsecState(msgspec.Struct, frozen=True):
     ports: Annotated[
         dict[str, PortsSeen], doc("port checks of every host that may have nodes, by name or address")
     ]
+    trouble_names: Annotated[
+        list[str], doc("the name of each of `troubles`, which follows `ipsec:` in its alarm")
+    ] = []
 
 
 class MonitorsState(msgspec.Struct, frozen=True):

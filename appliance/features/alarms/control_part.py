@@ -1,5 +1,7 @@
 """Build the part of control for alarms."""
 
+from collections.abc import Iterable
+
 from appliance.channel.alarms import AlarmList, activity, open_alarms
 from appliance.control.core import Alarms, ControlPart, Core
 from appliance.control.errors import UnknownThingError
@@ -28,45 +30,45 @@ class AlarmOrders:
         return self._list()
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
-        self._must_be_present(request.kind)
-        kind, earlier = request.kind, self._handled.state(request.kind)
-        if not self._handled.acknowledge(kind, who, request.note):
-            return self._list()
-        text = f"{kind} is acknowledged"
-        self._record("alarm acknowledged", text, kind, who, request.note, earlier=earlier)
+        for kind in self._present(request.kind):
+            earlier = self._handled.state(kind)
+            if self._handled.acknowledge(kind, who, request.note):
+                text = f"{kind} is acknowledged"
+                self._record("alarm acknowledged", text, kind, who, request.note, earlier=earlier)
         return self._list()
 
     async def silence(self, request: AlarmSilence, who: str) -> AlarmList:
-        kind, seconds, earlier = request.kind, request.seconds, self._handled.state(request.kind)
-        if seconds is None:
-            if not self._handled.end(kind):
-                raise UnknownThingError(
-                    f"the alarm {kind[:200]} is neither silenced nor acknowledged: rosrv alarm list"
-                )
+        if (seconds := request.seconds) is None:
+            return self._sound_again(request.kind, who)
+        for kind in self._present(request.kind):
+            earlier = self._handled.state(kind)
+            until = self._handled.silence(kind, who, request.note, seconds)
+            text = f"{kind} is silenced for {seconds:.0f} s"
+            self._record("alarm silenced", text, kind, who, request.note, earlier=earlier, until=until)
+        return self._list()
+
+    def _sound_again(self, wanted: str, who: str) -> AlarmList:
+        ended = _meant(wanted, (row.kind for row in self._status().handled_alarms))
+        if not ended:
+            raise UnknownThingError(
+                f"the alarm {wanted[:200]} is neither silenced nor acknowledged: rosrv alarm list"
+            )
+        for kind in ended:
+            earlier = self._handled.state(kind)
+            self._handled.end(kind)
             self._record("alarm sounds again", f"{kind} is an alarm again", kind, who, "", earlier=earlier)
-            return self._list()
-        self._must_be_present(kind)
-        until = self._handled.silence(kind, who, request.note, seconds)
-        self._record(
-            "alarm silenced",
-            f"{kind} is silenced for {seconds:.0f} s",
-            kind,
-            who,
-            request.note,
-            earlier=earlier,
-            until=until,
-        )
         return self._list()
 
     def _list(self) -> AlarmList:
         status = self._status()
         return AlarmList([*open_alarms(status), *activity(status)], status.name)
 
-    def _must_be_present(self, kind: str) -> None:
+    def _present(self, wanted: str) -> list[str]:
         present = [alarm.kind for alarm in self._list().alarms]
-        if kind not in present:
+        if not (found := _meant(wanted, present)):
             known = f"there are: {', '.join(present)}" if present else "there is none now"
-            raise UnknownThingError(f"there is no alarm {kind[:200]!r}; {known}")
+            raise UnknownThingError(f"there is no alarm {wanted[:200]!r}; {known}")
+        return found
 
     def _record(self, event: str, text: str, kind: str, who: str, note: str, **more: object) -> None:
         self._trail.happened(
@@ -78,6 +80,11 @@ class AlarmOrders:
             whole=True,
             more=more,
         )
+
+
+def _meant(wanted: str, kinds: Iterable[str]) -> list[str]:
+    """Return the kinds that a name means: itself, and those that it begins before a colon."""
+    return [kind for kind in kinds if kind == wanted or kind.startswith(f"{wanted}:")]
 
 
 async def begin(core: Core) -> ControlPart:

@@ -55,8 +55,6 @@ def entries_of(status: Status) -> dict[str, Entry]:
             )
     for alarm in alarms[:_MAX_ALARMS]:
         level, text = _LEVELS[alarm.severity], alarm.text
-        if same := found.get(alarm.kind):  # a kind of which there are several, such as `ipsec`
-            level, text = max(level, same.level), f"{same.message}\n{text}"
         values = {"severity": alarm.severity, "about": alarm.about}
         found[alarm.kind] = Entry(level, text, values | ({"handled": alarm.handled} if alarm.handled else {}))
     if len(alarms) > _MAX_ALARMS:

@@ -102,7 +102,7 @@ class HostView:
         return PortsSeen(cast(PortsState, row.state), row.checked, row.open, row.who)
 
     def status(self, machines: Mapping[str, int]) -> IpsecState:
-        charon = self._tunnels.charon
+        charon, troubles = self._tunnels.charon, {**self._troubles(), **self._open_ports()}
         return IpsecState(
             esp=self._tunnels.esp,
             key_exchange=charon.key_exchange if charon else [],
@@ -114,8 +114,9 @@ class HostView:
             enrolled=len(self._table.enrolled()),
             awaited=len(self._awaited.rows()),
             up=len(self._tunnels.seen),
-            troubles=[*self._troubles(), *self._open_ports()],
+            troubles=[*troubles.values()],
             ports=self._known_ports(machines),
+            trouble_names=[*troubles],
         )
 
     def machines(self, machines: Mapping[str, int]) -> list[Machine]:
@@ -128,13 +129,13 @@ class HostView:
     def _known_ports(self, machines: Mapping[str, int]) -> dict[str, PortsSeen]:
         return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
 
-    def _open_ports(self) -> list[str]:
-        return [
-            f"ROS ports of {self._in_words(name)} are open to hosts other than the appliance (checked by {row.who}):"
-            " run rosrv protect there"
+    def _open_ports(self) -> dict[str, str]:
+        return {
+            f"{name}:ports": f"ROS ports of {self._in_words(name)} are open to hosts other than the appliance"
+            f" (checked by {row.who}): run rosrv protect there"
             for name, row in self._table.ports.items()
             if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)
-        ]
+        }
 
     def _state(self, name: str, row: HostRow | None, now: float, *, awaited: bool) -> State:
         if row is None:
@@ -147,37 +148,35 @@ class HostView:
             return "up"
         return "expired" if row.expires <= now else "down"
 
-    def _troubles(self) -> list[str]:
-        now, found = clock.wall(), []
+    def _troubles(self) -> dict[str, str]:
+        now, found = clock.wall(), dict[str, str]()
         if self._table.admitted() and not self._tunnels.enclosed:
-            found.append(f"enrolled hosts cannot connect: {self._tunnels.obstacle}")
+            found["firewall"] = f"enrolled hosts cannot connect: {self._tunnels.obstacle}"
         for row in self._table.enrolled():
             left = row.expires - now
             if not self._table.is_for_hosts(row.address):
-                found.append(outside_the_pool(self._table, row))
+                found[f"{row.name}:pool"] = outside_the_pool(self._table, row)
             certificate = self._table.certificates.get(row.name)
+            why = ""
             if certificate is not None and certificate.made > now + _CLOCKS_DIFFER:
-                found.append(
-                    f"the certificate of {row.name} was made while the clock was ahead, and is not valid yet:"
-                    f" rosrv host kit {row.name}"
-                )
+                why = "was made while the clock was ahead, and is not valid yet"
             elif left <= 0:
-                found.append(f"the certificate of {row.name} has expired: rosrv host kit {row.name}")
+                why = "has expired"
             elif soon(self._table, row, now):
-                found.append(
-                    f"the certificate of {row.name} expires in {span(left)} and was not renewed:"
-                    f" rosrv host kit {row.name}"
-                )
+                why = f"expires in {span(left)} and was not renewed"
+            if why:
+                text = f"the certificate of {row.name} {why}: rosrv host kit {row.name}"
+                found[f"{row.name}:certificate"] = text
         missing = self._table.missing_as_revoked()
         if missing:
-            found.append(
+            found["revoked"] = (
                 f"the list of revoked certificates is full: {missing} are not on it, and they can still open"
                 " their hosts' tunnels until they expire"
             )
         if self._table.declared.error:
-            found.append(self._table.declared.error)
+            found["hosts.yaml"] = self._table.declared.error
         if self._tunnels.waits:
-            found.append(self._tunnels.waits)
+            found["address"] = self._tunnels.waits
         return found
 
 

@@ -56,7 +56,7 @@ def test_a_healthy_appliance_has_none() -> None:
         (
             "processes",
             [{"role": "charon", "failing": "no /dev/net/tun"}],
-            "process-failing",
+            "process-failing:charon",
             "alarm",
             "system",
         ),
@@ -68,21 +68,47 @@ def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severit
     assert len(alarm.text) > 5
 
 
+def test_alarms_that_are_present_together_have_different_names() -> None:
+    """An operator handles an alarm by its name, and so never a later one of another process or host."""
+    failing = [{"role": role, "failing": "it ends"} for role in ("relay", "relay", "hook", "door", "door")]
+    ipsec = {"troubles": ["a certificate ends", "open ports"], "trouble_names": ["a:certificate", "a:ports"]}
+    found = open_alarms(changed("monitors.refused", ["a.rv: no", "b.rv: no"], processes=failing, ipsec=ipsec))
+    assert sorted(alarm.kind for alarm in found) == [
+        "ipsec:a:certificate", "ipsec:a:ports", "monitors-refused", "process-failing:door-0",
+        "process-failing:door-1", "process-failing:hook", "process-failing:relay-0", "process-failing:relay-1",
+    ]  # fmt: skip
+    assert "a.rv: no; b.rv: no" in next(alarm.text for alarm in found if alarm.kind == "monitors-refused")
+    repeated = ast.For | ast.While | ast.ListComp | ast.SetComp | ast.GeneratorExp
+    for path, tree in sources_of_conditions():
+        for loop in (node for node in ast.walk(tree) if isinstance(node, repeated)):
+            for kind in kinds_in(loop, path):
+                assert not isinstance(kind, ast.Constant), f"{path.name}:{kind.lineno}: add what it is about"
+
+
 PACKAGE = Path(alarms.__file__).parents[1]
 
 
 def kinds_in_the_source() -> Iterator[str]:
     """Yield the kind of each condition that some code makes: of each `Trouble`, and here of each tuple."""
+    for path, tree in sources_of_conditions():
+        for first in kinds_in(tree, path):
+            yield from _kind(first)
+
+
+def sources_of_conditions() -> Iterator[tuple[Path, ast.AST]]:
     for path in PACKAGE.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        if "Trouble(" not in text and path.name != "alarms.py":
-            continue
-        for node in ast.walk(ast.parse(text)):
-            match node:
-                case ast.Call(func=ast.Name("Trouble" | "_alarm"), args=[first, *_]):
-                    yield from _kind(first)
-                case ast.Yield(ast.Tuple([first, _, _])) if path.name == "alarms.py":
-                    yield from _kind(first)
+        if "Trouble(" in text or path.name == "alarms.py":
+            yield path, ast.parse(text)
+
+
+def kinds_in(tree: ast.AST, path: Path) -> Iterator[ast.expr]:
+    for node in ast.walk(tree):
+        match node:
+            case ast.Call(func=ast.Name("Trouble" | "_alarm"), args=[first, *_]):
+                yield first
+            case ast.Yield(ast.Tuple([first, _, _])) if path.name == "alarms.py":
+                yield first
 
 
 def _kind(first: ast.expr) -> Iterator[str]:

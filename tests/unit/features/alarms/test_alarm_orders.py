@@ -136,6 +136,26 @@ def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
     ]
 
 
+def test_an_order_with_the_name_alone_is_for_the_alarms_that_are_present(robot: Robot) -> None:
+    def failing(*roles: str) -> dict[str, Any]:
+        return {**GOOD, "processes": [{"role": role, "failing": "it ends"} for role in roles]}
+
+    def order(seconds: float | None = None) -> dict[str, bool]:
+        body = asyncio.run(robot.orders.silence(AlarmSilence("process-failing", seconds), "ann"))
+        return {alarm.kind.partition(":")[2]: bool(alarm.handled) for alarm in body.alarms}
+
+    robot.fields = failing("hook", "signer")
+    assert order(3600.0) == {"hook": True, "signer": True}
+    robot.fields = failing("hook", "recorder")
+    alarms = asyncio.run(robot.orders.listed(AlarmsWanted())).alarms
+    assert [(one.severity, one.kind) for one in alarms] == [
+        ("alarm", "process-failing:recorder"), ("notice", "process-failing:hook"),
+    ]  # fmt: skip
+    body = asyncio.run(robot.orders.acknowledge(AlarmAcknowledge("process-failing:recorder"), "ann"))
+    assert all(alarm.handled for alarm in body.alarms)
+    assert order() == {"hook": False, "recorder": False}
+
+
 def test_only_a_present_alarm_is_handled(robot: Robot) -> None:
     with pytest.raises(UnknownThingError, match="neither silenced"):
         robot.silence(None)

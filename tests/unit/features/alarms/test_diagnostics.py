@@ -15,7 +15,7 @@ GOOD: dict[str, Any] = {
     "name": "carrier", "probe": "passed", "relay": "connected", "rosmaster": "reachable",
     "guards": {"loaded": 2, "acting": []},
 }  # fmt: skip
-IPSEC = {"troubles": [f"problem {number}" for number in range(2)]}
+IPSEC = {"troubles": ["problem 0", "problem 1"], "trouble_names": ["a", "b"]}
 MANY = {f"m{number}": "no topic" for number in range(80)}
 
 
@@ -59,12 +59,13 @@ def test_an_alarm_has_its_level_and_text_ends_with_ok_and_leaves() -> None:
         found = desk.look(relay="away", rosmaster="being rebuilt", ipsec=IPSEC)
         assert found is not None
         assert {name: level for name, (level, _text) in found.items()} == {
-            "rosrv: alarms": 2, "rosrv: guards": 0, "rosrv: relay": 2, "rosrv: rosmaster": 1, "rosrv: ipsec": 1,
+            "rosrv: alarms": 2, "rosrv: guards": 0, "rosrv: relay": 2, "rosrv: rosmaster": 1,
+            "rosrv: ipsec:a": 1, "rosrv: ipsec:b": 1,
         }  # fmt: skip
         assert found["rosrv: alarms"][1] == found["rosrv: relay"][1]
-        assert found["rosrv: ipsec"][1] == "problem 0\nproblem 1"
+        assert found["rosrv: ipsec:b"][1] == "problem 1"
         assert desk.look() == quiet | {
-            f"rosrv: {kind}": (0, "ended") for kind in ("relay", "rosmaster", "ipsec")
+            f"rosrv: {kind}": (0, "ended") for kind in ("relay", "rosmaster", "ipsec:a", "ipsec:b")
         }
         assert desk.look() is None
         clock.advance(1.0)
