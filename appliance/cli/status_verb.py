@@ -78,11 +78,7 @@ def status(
 
 
 def _look(appliance: Appliance) -> StatusView:
-    """Return the status. Raises `NotRunningError` even for an appliance that cannot give its status now."""
-    answer = _answer(appliance)
-    if not answer.ok:
-        raise NotRunningError(answer.error)
-    return answer.given()
+    return appliance.body_now(_answer(appliance))
 
 
 def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:

@@ -152,6 +152,12 @@ class Appliance(typer.Context):
             typer.echo(f"rosrv: {printable(answer.error)}", err=True)
         raise typer.Exit(1)
 
+    def body_now(self, answer: AdminAnswer[A]) -> A:
+        """Return the body, for a verb that asks again. Raises `NotRunningError` for every rejection."""
+        if not answer.ok:
+            raise NotRunningError(answer.error)
+        return answer.given()
+
 
 class _ApplianceCommand(GroupedCommand):
     context_class = Appliance

@@ -39,11 +39,13 @@ def show_held_calls(appliance: Appliance, line: Callable[[Approval], tuple[str, 
     try:
         while True:
             try:
-                rows = appliance.body_or_exit(appliance.ask(ApprovalsWanted())).approvals
+                rows = appliance.body_now(appliance.ask(ApprovalsWanted())).approvals
                 away = False
             except AccessDeniedError:
                 raise
-            except NotRunningError as error:  # it may be restarting, which ends all approvals
+            except (
+                NotRunningError
+            ) as error:  # it may be restarting or the standby now, which ends all approvals
                 if not away:
                     note(f"{printable(str(error))}; trying again")
                 rows, away = [], True

@@ -137,9 +137,8 @@ def switch(appliance: Appliance, *, when_standing: WhenStanding = False, within:
 
 def _look(appliance: Appliance) -> StatusView:
     answer = appliance.ask(StandbyWanted())
-    if not answer.ok and answer.trouble != "unknown":
-        raise NotRunningError(answer.error)
-    return standby_view(appliance.body_or_exit(answer))
+    read = appliance.body_or_exit if answer.trouble == "unknown" else appliance.body_now
+    return standby_view(read(answer))
 
 
 def _holder(state: StandbyState) -> str:
