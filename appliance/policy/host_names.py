@@ -6,6 +6,7 @@ an enrolled host before `robot`, and of `robot` before the group with the fewest
 gives no label.
 """
 
+import contextlib
 import ipaddress
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from appliance.base.validation_messages import meant
 from appliance.policy.groups import ROBOT
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
 from appliance.policy.ini_reader import read
-from appliance.policy.model import DOOR, HOST, Address, known_name
+from appliance.policy.model import DOOR, HOST, Address, known_name, plain_address
 from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import GROUPS
 
@@ -22,11 +23,13 @@ HostInWords = Callable[[str], str]
 """Returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
 
 _MAX_NAMED = 20
+_LONGEST_NAME = 300
+_MAX_SHOWN = 5  # networks of a name
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
 
 
 class UnknownHostNameError(ValueError):
-    """No host has this name; the message has the nearest known name."""
+    """No host has this name, or not one alone; the message has the nearest known name, or its addresses."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,19 @@ class HostNames:
         if not found:
             raise UnknownHostNameError(self._unknown(text, name))
         return tuple(found)
+
+    def host(self, text: str) -> Address:
+        """Return the one host that an order names. Raises `UnknownHostNameError`, also for a network or several."""
+        with contextlib.suppress(ValueError):
+            return plain_address(str(ipaddress.ip_address(text)))
+        networks = self.networks(text[:_LONGEST_NAME])
+        if len(networks) > 1 or networks[0].num_addresses > 1:
+            some = [
+                str(network).removesuffix("/32").removesuffix("/128") for network in networks[:_MAX_SHOWN]
+            ]
+            shown = "" if "/" in text else f" ({', '.join(some)})"
+            raise UnknownHostNameError(f"{text[:80]!r} is not one host: give one address{shown}")
+        return plain_address(str(networks[0].network_address))
 
     def _unknown(self, text: str, name: str) -> str:
         if text in self.groups:

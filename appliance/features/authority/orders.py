@@ -20,8 +20,8 @@ from appliance.features.authority import requests
 from appliance.features.authority.ranked_groups import RankedGroups
 from appliance.features.authority.view import AuthorityState, NotCarried, UnheardGroup
 from appliance.master.endpoints.host_signs import HostSigns
-from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.authority import AuthorityGroup, Claim
+from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.telemetry.audit_trail import AuditTrail
@@ -465,9 +465,10 @@ class DriveOrders:
         return group
 
     def _host(self, text: str) -> Address:
+        policy = self._policy()
         try:
-            return find_host(text, self._policy())
-        except BadWordError as error:
+            return HostNames.of(policy.text, policy.enrolled, policy.robot).host(text)
+        except UnknownHostNameError as error:
             raise SenselessError(str(error)) from None
 
     def _state(self, group: AuthorityGroup) -> requests.GroupState:

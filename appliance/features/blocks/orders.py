@@ -1,7 +1,5 @@
 """Block hosts, and lift blocks on order or when their time ends. Withdrawn registrations then return."""
 
-import contextlib
-import ipaddress
 import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
@@ -32,8 +30,6 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 MAX = 1000
 _NOT_BLOCKED = "not blocked"
-_LONGEST_NAME = 300
-_MAX_NAMED = 5
 _FEW = 10  # registrations: two nodes; a robot has more
 _REGISTERED = {
     "registerPublisher": "publications",
@@ -182,21 +178,12 @@ class BlockOrders:
     # --- what may be blocked ---
 
     def _address(self, text: str) -> Address:
-        with contextlib.suppress(ValueError):
-            return plain_address(str(ipaddress.ip_address(text)))
         policy = self._policies.current
         enrolled = {name: address_of(address) for name, address in self._enrolled().items()}
         try:
-            networks = HostNames.of(policy.text, enrolled, policy.robot).networks(text[:_LONGEST_NAME])
+            return HostNames.of(policy.text, enrolled, policy.robot).host(text)
         except UnknownHostNameError as error:
             raise SenselessError(str(error)) from None
-        if len(networks) > 1 or networks[0].num_addresses > 1:
-            some = ", ".join(
-                str(network).removesuffix("/32").removesuffix("/128") for network in networks[:_MAX_NAMED]
-            )
-            shown = "" if "/" in text else f" ({some})"
-            raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time{shown}")
-        return plain_address(str(networks[0].network_address))
 
     def _require_possible(self, address: Address) -> None:
         if address.is_unspecified or address.is_multicast or str(address) == "255.255.255.255":

@@ -57,6 +57,33 @@ def test_an_unknown_name_is_an_error(text: str, said: str) -> None:
         NAMES.networks(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "host"),
+    [
+        ("10.0.0.1", "10.0.0.1"),
+        ("::ffff:10.0.0.1", "10.0.0.1"),
+        ("robot", "10.88.0.10"),
+        ("host:tablet", "10.113.0.9"),
+    ],
+)
+def test_an_order_names_one_host(text: str, host: str) -> None:
+    assert NAMES.host(text) == ip_address(host)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("10.77.0.0/24", "give one address"), ("all", "not one host: give one address (0.0.0.0/0"),
+        ("tablet", "(10.77.0.66, 10.113.0.9)"), ("guests", "(10.77.0.0/24, 10.113.0.5)"), ("nobody", "names are"),
+    ],
+)  # fmt: skip
+def test_an_order_for_a_network_or_for_several_hosts_is_an_error(text: str, said: str) -> None:
+    """An address that a network merely begins with may be that of no host."""
+    with pytest.raises(UnknownHostNameError) as refused:
+        NAMES.host(text)
+    assert said in str(refused.value)
+
+
 def test_an_address_has_the_narrowest_label() -> None:
     labels = NAMES.labels()
     addresses = (

@@ -174,6 +174,21 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
         await orders.take(DriveTake("arm", PILOT), "op")
 
 
+@pytest.mark.parametrize("host", ["ocus", "two", "10.0.0.0/24", "10.0.0.0/31"])
+async def test_no_order_takes_the_first_address_of_a_network_for_a_host(site: Site, host: str) -> None:
+    groups = f"[Groups]\nocus = 10.0.0.0/29\ntwo = {PILOT} {SECOND}\n"
+    site.policy = compile_policy(groups + TEXT.replace(BOSS, f"{BOSS} ocus two"), file="site.ini")
+    orders: list[Callable[[], Awaitable[GroupState]]] = [
+        lambda: site.orders.take(DriveTake("base", host), "op"),
+        lambda: site.orders.ask(DriveAsk("base", host), "op"),
+        lambda: site.orders.give(DriveGive("base", host), "op"),
+    ]
+    for order in orders:
+        with pytest.raises(SenselessError, match="is not one host: give one address"):
+            await order()
+    assert not site.trail.rows
+
+
 async def test_an_order_for_another_holder_than_the_present_one_is_refused(site: Site) -> None:
     orders = site.orders
     await orders.take(DriveTake("base", PILOT, holder=""), "op")
