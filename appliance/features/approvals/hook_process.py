@@ -1,7 +1,7 @@
 """Send the web hook calls that wait, as a process of the appliance.
 
-1. It only sends: control learns from it whether a call was sent, and nothing else. It reads no answer of the
-   receiver: the first byte, or the end, shows that the request arrived, and is discarded. So no redirect is followed.
+1. It only sends: control learns from it whether a call was sent, and nothing else. It reads only the status of
+   the receiver's answer: 2xx shows that the receiver took the call. So no redirect is followed.
 2. The firewall and the sandbox let it reach the receiver, and nothing else.
 3. A slow receiver delays no call and no order: the queue has a bound, and each POST a deadline.
 """
@@ -11,6 +11,7 @@ import hashlib
 import hmac
 import html
 import json
+import re
 import socket
 import ssl
 from pathlib import Path
@@ -75,6 +76,7 @@ MAX_WAITING = 64
 _AT_ONCE = 4
 _SECONDS = 5.0
 _LONGEST_SECRET = 4096
+_STATUS = re.compile(rb"HTTP/1\.[0-9] ([0-9]{3})")
 
 
 def main(lifeline_fd: int, config: Path) -> None:
@@ -125,7 +127,7 @@ class HookSender:
             return "it expired before it could be sent"
         try:
             body = body_of(call, left, self._robot, self._wanted.console)
-            await self._post(request_of(self._wanted, body, self._secret(), int(clock.wall())))
+            return await self._post(request_of(self._wanted, body, self._secret(), int(clock.wall())))
         except TimeoutError:
             return f"no answer within {_SECONDS:g} s"
         except (OSError, ValueError) as error:
@@ -133,9 +135,8 @@ class HookSender:
         except Exception as error:  # noqa: BLE001  a defect affects only this call
             _log.exception("a call was not sent")
             return f"a defect of rosrv: {type(error).__name__}"
-        return ""
 
-    async def _post(self, request: bytes) -> None:
+    async def _post(self, request: bytes) -> str:
         async with asyncio.timeout(_SECONDS):
             reader, writer = await asyncio.open_connection(
                 *self._wanted.destination,
@@ -146,9 +147,15 @@ class HookSender:
             try:
                 writer.write(request)
                 await writer.drain()
-                await reader.read(1)
+                begin = await reader.readexactly(len("HTTP/1.1 200"))
+            except asyncio.IncompleteReadError as error:
+                begin = error.partial
             finally:
                 writer.transport.abort()
+        status = _STATUS.fullmatch(begin)
+        if status is None:
+            return f"the answer of {self._wanted.host[1]} is not of HTTP: {begin!r}"
+        return "" if status[1].startswith(b"2") else f"{self._wanted.host[1]} answered {status[1].decode()}"
 
     def _context(self) -> ssl.SSLContext:
         if self._wanted.ca is None:

@@ -1,4 +1,4 @@
-"""The web hook: a real receiver with TLS, which answers with a redirect to another one."""
+"""The web hook: a real receiver with TLS, which first answers with a redirect to another one."""
 
 import contextlib
 import hashlib
@@ -30,10 +30,10 @@ default = *
 """
 
 
-def _redirect(request: Any) -> None:
+def _answer(request: Any) -> None:
     body = request.rfile.read(int(request.headers["Content-Length"]))
     request.server.got.append((request.path, dict(request.headers), body))
-    request.send_response(307)
+    request.send_response(request.server.status)
     request.send_header("Location", "/elsewhere")
     request.end_headers()
 
@@ -41,7 +41,7 @@ def _redirect(request: Any) -> None:
 _RECEIVER = type(
     "Receiver",
     (http.server.BaseHTTPRequestHandler,),
-    {"do_POST": _redirect, "log_message": lambda *_words: None},
+    {"do_POST": _answer, "log_message": lambda *_words: None},
 )
 
 
@@ -50,7 +50,7 @@ def receiver(made: Certificates) -> Iterator[Any]:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(made.certificate, made.key)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _RECEIVER) as server:
-        server.got = []  # type: ignore[attr-defined]  # the handler finds it here
+        server.got, server.status = [], 307  # type: ignore[attr-defined]  # the handler finds them here
         server.socket = context.wrap_socket(server.socket, server_side=True)
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -95,10 +95,19 @@ def test_a_waiting_call_is_sent_once_and_a_dead_receiver_is_a_warning(tmp_path: 
             [row] = appliance.rest().get("/v1/approvals").json["approvals"]
             assert (sent["number"], sent["resource"], sent["robot"]) == (row["number"], "/goal", "lift-7")
             assert sent["console"] == "https://lift-7:8443/console/robot"
-            assert appliance.status()["approvals"]["unsent"] == 0
+            eventually(lambda: appliance.status()["approvals"]["unsent"], "a redirect is no acceptance")
+            assert f"127.0.0.1:{port} answered 307" in appliance.rosrv("status", check=False).stdout
+
+            def waits_again() -> None:
+                [row] = appliance.rest().get("/v1/approvals").json["approvals"]
+                appliance.rosrv("approve", str(row["number"]), "--for", "1s")
+                eventually(lambda: "held for approval" in wants("/agent"), "it waits again")
+
+            server.status = 204
+            waits_again()
+            eventually(lambda: not appliance.status()["approvals"]["unsent"], "the receiver took it")
             server.shutdown()
             server.server_close()
-            appliance.rosrv("approve", str(row["number"]), "--for", "1s")
-            eventually(lambda: "held for approval" in wants("/agent"), "it waits again")
+            waits_again()
             eventually(lambda: appliance.status()["approvals"]["unsent"], "the failure is counted")
             assert "the web hook did not get" in appliance.rosrv("status", check=False).stdout

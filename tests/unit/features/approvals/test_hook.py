@@ -4,6 +4,7 @@ import hmac
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -130,3 +131,28 @@ async def test_a_short_secret_is_not_used(tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("short\n")
     sender = HookSender(ApprovalHook(**GIVEN | {"secret_file": tmp_path / "secret"}), "")
     assert "fewer than 16 characters" in await sender.send(CALL, clock.now() + 10)
+
+
+@pytest.mark.anyio
+async def test_only_an_answer_of_2xx_shows_that_a_call_was_sent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "secret").write_text("a secret of this site")
+    sender = HookSender(ApprovalHook(**GIVEN | {"secret_file": tmp_path / "secret"}), "")
+
+    async def trouble(answer: bytes) -> str:
+        async def connect(*_place: object, **_how: object) -> tuple[asyncio.StreamReader, Any]:
+            reader, writer = asyncio.StreamReader(), Mock(drain=AsyncMock())
+            reader.feed_data(answer)
+            reader.feed_eof()
+            return reader, writer
+
+        monkeypatch.setattr(asyncio, "open_connection", connect)
+        monkeypatch.setattr(sender, "_context", lambda: None)
+        return await sender.send(CALL, clock.now() + 10)
+
+    for status in range(100, 600):
+        told = await trouble(b"HTTP/1.%d %d Words\r\n\r\n" % (status % 2, status))
+        assert told == ("" if 200 <= status < 300 else f"chat.example.org answered {status}")
+    for answer in (b"", b"HTTP/1.1 20", b"SSH-2.0-OpenSSH_9.2", b"HTTP/2.0 200 OK\r\n"):
+        assert "is not of HTTP" in await trouble(answer)
