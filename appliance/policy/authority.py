@@ -15,7 +15,7 @@ from appliance.base.validation_messages import meant
 from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import Atom
 from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
-from appliance.policy.model import Rule
+from appliance.policy.model import Address, Rule
 from appliance.policy.policy_findings import Findings, Place, quoted
 from appliance.policy.sections import AUTHORITY
 from roswire.names import is_global_name
@@ -99,6 +99,15 @@ class AuthorityGroup:
             return Claim.TAKE if ranked else None
         claims = {claim for claim, hosts in self.hosts if not hosts.isdisjoint(atoms)}
         return next((claim for claim in (Claim.OVERRIDE, Claim.TAKE, Claim.ASK) if claim in claims), None)
+
+    def order(self, host: Address, atoms: frozenset[Atom], holder: Address | None) -> str:
+        """Return the command that gives the group to a host with a claim, or lets it wait for another holder."""
+        claim = self.claim(atoms)
+        if holder is not None and claim is not Claim.OVERRIDE:
+            return f"rosrv drive ask {self.name} --host {host}"
+        if claim is Claim.ASK:
+            return f"rosrv drive free {self.name} --to {host}"
+        return f"rosrv drive assign {self.name} --host {host}"
 
 
 def read_authority(

@@ -359,7 +359,7 @@ class Policy:
         holder = self.holder(group)
         now = "" if self.holders is None else f"; now {holder or 'no host'} holds it"
         if request.category is Category.CALL and not self.may_command(request.resource, request.host):
-            order = f"rosrv drive assign {group.name} --host {request.host}"
+            order = group.order(request.host, self.atoms_of(request.host), holder)
             told = f"{may_not} while it does not hold {group.name}: {order}"
             return Decision(False, group.rule, told + now, told=told)
         reason = f"{decision.reason}, while it holds {group.name}{now}"

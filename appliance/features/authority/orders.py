@@ -504,11 +504,8 @@ class DriveOrders:
     def _order(self, group: AuthorityGroup, host: Address) -> str:
         if group.ranks:
             return f"rosrv drive free {group.name}"
-        if self._groups.holder(group.name) is not None:
-            return ""
-        if self._claim(group, host) is Claim.ASK:
-            return f"rosrv drive free {group.name} --to {host}"
-        return f"rosrv drive assign {group.name} --host {host}"
+        held = self._groups.holder(group.name) is not None
+        return "" if held else group.order(host, self._policy().atoms_of(host), None)
 
     def unheard(self) -> AuthorityState | None:
         """Return the groups that no host commands while some would; null without groups."""

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from appliance.policy import commands
-from appliance.policy.authority import Claim
 from appliance.policy.model import Category, Decision, Request, Rule, text_for_caller
 from appliance.policy.policy import CompiledRule, Policy
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope
@@ -144,12 +143,8 @@ def _carried(policy: Policy, request: Request) -> str:
         return f"its messages are carried only while it holds {group.name}"
     if policy.may_command(request.resource, request.host):
         return f"its messages are carried now: it holds {group.name}"
-    holder, claim = policy.holder(group), group.claim(policy.atoms_of(request.host))
-    order = f"rosrv drive assign {group.name} --host {request.host}"
-    if holder is not None and claim is not Claim.OVERRIDE:
-        order = f"rosrv drive ask {group.name} --host {request.host}"
-    elif claim is Claim.ASK:
-        order = f"rosrv drive free {group.name} --to {request.host}"
+    holder = policy.holder(group)
+    order = group.order(request.host, policy.atoms_of(request.host), holder)
     why = f"{holder or 'no host'} holds {group.name}: {order}"
     return f"but none of its messages is carried now, because {why}"
 

@@ -1,6 +1,8 @@
 import asyncio
 import random
+import re
 from collections.abc import Awaitable, Callable, Iterable, Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -17,9 +19,10 @@ from appliance.features.authority.requests import (
     DriveTake,
     GroupState,
 )
+from appliance.features.policy_tools.decision_reasons import explain
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RankStates
-from appliance.policy.model import Address, address_of
+from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from tests.support.core import FakeTrail
@@ -172,6 +175,31 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
     assert site.handed_over() == handed_over
     with pytest.raises(UnknownThingError, match="its groups: base"):
         await orders.take(DriveTake("arm", PILOT), "op")
+
+
+@pytest.mark.parametrize("host", [PILOT, BOSS, AGENT])
+@pytest.mark.parametrize("holder", ["", SECOND])
+async def test_the_command_in_a_denial_does_what_the_host_needs(site: Site, host: str, holder: str) -> None:
+    """The host then holds the group, or waits for it. It is the same command for a topic and for a service."""
+    grants = f"[Clients]\n/arm = {host}\n[Publishers]\n/cmd_vel = {host}\n"
+    site.policy = compile_policy(grants + TEXT.replace("/cmd_vel", "/cmd_vel /arm"), file="site.ini")
+    if holder:
+        await site.orders.take(DriveTake("base", holder), "op")
+    policy = replace(site.policy, holders=site.orders.holders())
+    denied = policy.decide(Request(address_of(host), "/n", Category.CALL, "/arm"))
+    assert denied.told is not None
+    command = re.search(r"rosrv drive (\w+) base --(?:host|to) (\S+)", denied.told)
+    assert command is not None
+    explained = explain(policy, Request(address_of(host), "/n", Category.PUBLISH, "/cmd_vel"))
+    assert command[0] in explained.carried
+    orders = {
+        "assign": lambda: site.orders.take(DriveTake("base", command[2]), "op"),
+        "ask": lambda: site.orders.ask(DriveAsk("base", command[2]), "op"),
+        "free": lambda: site.orders.give(DriveGive("base", command[2]), "op"),
+    }
+    state = await orders[command[1]]()
+    assert host in (state.holder, *state.waiting)
+    assert holder in ("", state.holder) or host == BOSS
 
 
 @pytest.mark.parametrize("host", ["ocus", "two", "10.0.0.0/24", "10.0.0.0/31"])
