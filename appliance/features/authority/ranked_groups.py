@@ -6,7 +6,7 @@ The relays decide (`relay/ranked_topic.py`) and report. Each group has a latched
 import asyncio
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from appliance.base import clock
 from appliance.channel.messages import OwnHeaderStated, OwnPublished, RankReported
@@ -34,6 +34,7 @@ class RankedDriver:
     host: str = ""
     since: float = 0.0
     freed_by: str = ""
+    group: str = ""
 
     @property
     def standing(self) -> RankStanding:
@@ -95,7 +96,14 @@ class RankedGroups:
         """Publish the drivers of the groups that have a rank now, and forget all others."""
         groups = {group.topic: group for group in self._policy().authority.values() if group.ranks}
         self._relay.ranks.keep(groups)
-        self._drivers = {topic: one for topic, one in self._drivers.items() if topic in groups}
+        before, self._drivers = self._drivers, {}
+        for topic, driver in before.items():
+            group = groups.get(topic)
+            if group is not None:
+                self._drivers[topic] = replace(driver, group=group.name)
+            if group is None or group.name != driver.group:
+                self._record(driver, RankedDriver(_UNKNOWN, group=driver.group))
+                self._record(RankedDriver(_UNKNOWN), self._drivers.get(topic, RankedDriver(_UNKNOWN)))
         self._relay.publish_only("authority", self._headers(groups.values()) if groups else ())
         for group in groups.values():
             self._publish(group)
@@ -150,23 +158,30 @@ class RankedGroups:
             node, found = before.node, before.host
         else:
             found = "" if host is None else str(host)
-        now = RankedDriver(report, node, found, clock.now(), self._freed_by)
+        now = RankedDriver(report, node, found, clock.now(), self._freed_by, group.name)
         self._drivers[report.topic] = now
-        if before.holder != now.holder or (before.holder and before.report.key != report.key):
-            self._record(group, before, now)
+        self._record(before, now)
         if report.standing == "lost":
             self._lost.put_nowait(report)
         self._publish(group)
 
-    def _record(self, group: AuthorityGroup, before: RankedDriver, now: RankedDriver) -> None:
+    def _record(self, before: RankedDriver, now: RankedDriver) -> None:
+        """Record a change of the holder, or of its node."""
+        if before.holder == now.holder and (not before.holder or before.report.key == now.report.key):
+            return
         earlier, later = before.holder or "nobody", now.holder or "nobody"
-        reason = "moved" if now.holder else f"freed by {now.freed_by}" if now.freed_by else "let go"
+        reason = {
+            "moving": "moved",
+            "lost": "fell silent after a motion",
+            "free": f"freed by {now.freed_by}" if now.freed_by else "let go",
+            "unknown": "the policy no longer ranks the group",
+        }[now.standing]
         node = now.node or before.node
         self._trail.happened(
             "authority handed over",
-            f"{group.name}: from {earlier} to {later}: {reason}{f' ({node})' if node else ''}",
+            f"{now.group}: from {earlier} to {later}: {reason}{f' ({node})' if node else ''}",
             host=now.holder or before.holder or None,
-            resource=group.name,
+            resource=now.group,
             whole=True,
             earlier=earlier,
             holder=later,

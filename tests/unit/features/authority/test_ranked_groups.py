@@ -1,6 +1,7 @@
 """Records and messages about the drivers that relays report."""
 
 import asyncio
+import random
 from collections.abc import Collection, Iterable
 from typing import Any
 
@@ -176,4 +177,46 @@ def test_a_policy_without_the_rank_forgets_its_driver(site: Site) -> None:
     assert site.relay.topics == []
     assert site.relay.ranks.of("/cmd_vel").standing == "unknown"
     site.report("p", "free")
-    assert len(site.records) == 1
+    assert site.records[1:] == [
+        f"{OCU} -> nobody: base: from {OCU} to nobody: the policy no longer ranks the group (/pad)"
+    ]
+
+
+POLICIES = {
+    "ranked": TEXT,
+    "without": f"[Authority]\narm = /arm\ntake arm = {OCU}\n",
+    "held": f"[Authority]\nbase = /cmd_vel\ntake base = {OCU}\n",
+    "renamed": TEXT.replace("base", "legs"),
+}
+WHY = {"moving": "moved", "lost": "fell silent", "free": "let go", "unknown": "no longer ranks"}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_records_name_each_holder_of_each_ranked_group(site: Site, seed: int) -> None:
+    """After reports, changes of the policy and restarts of RVMaster, the last record of a group has its holder."""
+    chance, held = random.Random(seed), dict[str, str]()  # noqa: S311  a history by seed
+    trail, policy = site.trail, site.policy
+    for _step in range(60):
+        known, standing = trail.rows, ""
+        match chance.choice("rrrrrpps"):
+            case "r":
+                standing = chance.choice(("moving", "lost", "free"))
+                site.report(chance.choice("pq"), standing)
+            case "p":
+                site.policy = policy = compile_policy(
+                    POLICIES[chance.choice(list(POLICIES))], file="site.ini"
+                )
+                site.ranked.policy_changed()
+            case "s":
+                held.clear()  # the record of the restart says that no host holds a group
+                site = Site()
+                site.trail = site.ranked._trail = trail
+                site.policy = policy
+                site.ranked.policy_changed()
+        for row in trail.rows[len(known) :]:
+            assert held.get(row["resource"], "nobody") == row["earlier"]
+            held[row["resource"]] = row["holder"]
+            assert WHY[standing] in row["reason"] if standing else True
+        ranked = [group for group in policy.authority.values() if group.ranks]
+        holders = {group.name: holder for group in ranked if (holder := site.ranked.driver(group).holder)}
+        assert {name: holder for name, holder in held.items() if holder != "nobody"} == holders
