@@ -43,7 +43,7 @@ from appliance.control.assembly.policies import Policies
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.features.views import states_in
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import MAX_RESOURCES, OTHERS, RelayTraffic, Traffic
+from appliance.master.endpoints.traffic import MAX_RESOURCES, OTHERS, RelayTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.rosmaster import RosMaster
 from appliance.policy.live_rights import LiveRight
@@ -146,7 +146,6 @@ def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[
 
 # Collect the measurements of control. The api formats them for Prometheus.
 
-MAX_DELAYED = 200  # the most topics that have their own histogram
 
 _Labels = tuple[str, str]
 _Number = TypeVar("_Number", int, float)
@@ -165,10 +164,7 @@ def measures_of(
     hosts: list[Host],
     queued_deliveries: int,
 ) -> Measures:
-    """Return the measurements; all but `MAX_RESOURCES` topics and services are summed in `OTHERS`.
-
-    For histograms, the limit is `MAX_DELAYED`.
-    """
+    """Return the measurements, with the names of `SeriesNames`."""
     lives = Counter(one.life for one in registry.all() if not one.own and not one.gone)
     kinds = Counter(registration.kind.value for node, registration in registry.in_order() if not node.own)
     records = monitors.records
@@ -208,10 +204,15 @@ def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:
 
 
 def carried_of(carried: RelayTraffic) -> tuple[dict[str, list[int]], dict[str, list[float]]]:
-    rows: list[tuple[str, Traffic]] = [*carried.past.items()]
-    rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
-    return by_resource((name, (row.messages, row.bytes, row.dropped)) for name, row in rows), by_resource(
-        ((name, (*row.delays, row.delay_seconds)) for name, row in rows if row.delays), MAX_DELAYED
+    present = carried.traffic.values()
+    counted = (*carried.counted.past.items(), *((row.name, row) for row in present))
+    delayed = (*carried.delayed.past.items(), *((row.delay_name, row) for row in present))
+    most = MAX_RESOURCES + 1  # with `OTHERS`
+    return (
+        by_resource(((name, (row.messages, row.bytes, row.dropped)) for name, row in counted), most),
+        by_resource(
+            ((name, (*row.delays, row.delay_seconds)) for name, row in delayed if row.delays and name), most
+        ),
     )
 
 

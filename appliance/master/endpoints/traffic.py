@@ -1,7 +1,7 @@
 """Keep and record the connections and the traffic that the relays report."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 from itertools import zip_longest
 
@@ -20,6 +20,8 @@ from appliance.store.state_file import PermissionRow
 from appliance.telemetry.audit_trail import AuditTrail
 
 MAX_RESOURCES = 2000
+MAX_DELAYED = 200
+"""The most topics that have their own histogram."""
 OTHERS = "(others)"  # ROS names cannot contain brackets
 
 _STILL_SECONDS = 3.0  # after this time without a report, rates are 0
@@ -45,6 +47,8 @@ class Traffic:
     delay_seconds: float = 0.0
     delay: float = 0.0  # mean seconds per message in the last report
     md5sum: str = ""  # the publisher's md5sum; empty until a relay has seen it
+    name: str = ""  # of its metrics
+    delay_name: str = ""  # of its histogram; empty until it has delays
 
     def add(self, row: TopicTraffic, now: float, over: float) -> None:
         self.messages += row.messages
@@ -77,6 +81,36 @@ class Traffic:
         self.delay_seconds += other.delay_seconds
 
 
+class SeriesNames:
+    """Names metrics: at most `most` resources have their own, the others share `OTHERS`.
+
+    A present resource keeps its name. One that has ended gives it up if a present one needs it. A host gets no more
+    than three quarters of the names. `past` has the sums of forgotten incarnations, so that counters never decrease.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._hosts: dict[str, Address] = {}  # that got a name, by name
+        self.past: dict[str, Traffic] = {}
+
+    def name(self, resource: str, host: Address, present: Callable[[], Container[str]]) -> str:
+        if resource in self._hosts:
+            return resource
+        has_share = sum(one == host for one in self._hosts.values()) < self._most - self._most // 4
+        if not has_share or len(self._hosts) >= self._most:
+            still, owned = present(), self._hosts.items()
+            ended = next((one for one, of in owned if one not in still and (has_share or of == host)), None)
+            if ended is None:
+                return OTHERS
+            del self._hosts[ended]
+            self.end(OTHERS, self.past.pop(ended, Traffic()))
+        self._hosts[resource] = host
+        return resource
+
+    def end(self, name: str, traffic: Traffic) -> None:
+        self.past.setdefault(name, Traffic()).include(traffic)
+
+
 class RelayTraffic:
     """The connections and traffic of all relays.
 
@@ -103,11 +137,7 @@ class RelayTraffic:
         self._limited_topics: set[str] = set()
         self.memory: dict[int, dict[str, int]] = {}
         """The bytes that each relay holds, by kind."""
-        self.past: dict[str, Traffic] = {}
-        """The traffic of forgotten incarnations, by topic and service, so that counters never decrease.
-
-        At most `MAX_RESOURCES` have their own entry; `OTHERS` has the sum of the rest.
-        """
+        self.counted, self.delayed = SeriesNames(MAX_RESOURCES), SeriesNames(MAX_DELAYED)
 
     def used(self) -> set[PermissionRow]:
         return {
@@ -126,7 +156,7 @@ class RelayTraffic:
     @property
     def total(self) -> Traffic:
         total = Traffic()
-        for traffic in (*self.past.values(), *self.traffic.values()):
+        for traffic in (*self.counted.past.values(), *self.traffic.values()):
             total.include(traffic)
         return total
 
@@ -153,8 +183,10 @@ class RelayTraffic:
 
     def forgotten(self, key: str) -> None:
         for carried in [carried for carried in self.traffic if carried[0] == key]:
-            name = carried[1] if carried[1] in self.past or len(self.past) < MAX_RESOURCES else OTHERS
-            self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
+            traffic = self.traffic.pop(carried)
+            self.counted.end(traffic.name, traffic)
+            if traffic.delay_name:
+                self.delayed.end(traffic.delay_name, traffic)
 
     def received(self, relay: int, message: messages.Message) -> bool:
         """Take a report of a relay; return False for another message."""
@@ -181,8 +213,15 @@ class RelayTraffic:
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
         now = clock.now()
         for row in rows:
-            if self._registry.by_key(row.key) is not None:
-                self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)
+            if (node := self._registry.by_key(row.key)) is None:
+                continue
+            about = row.resource, node.host, lambda: {resource for _key, resource in self.traffic}
+            traffic = self.traffic.get((row.key, row.resource))
+            if traffic is None:
+                traffic = self.traffic[row.key, row.resource] = Traffic(name=self.counted.name(*about))
+            if row.delays and not traffic.delay_name:
+                traffic.delay_name = self.delayed.name(*about)
+            traffic.add(row, now, over)
 
     def unrecorded(self, connections: int) -> None:
         if connections:

@@ -1,3 +1,5 @@
+import random
+
 import pytest
 
 from appliance.channel.messages import TopicTraffic
@@ -53,9 +55,46 @@ def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPa
         assert (after[0]["/a"], after[1]) == (before[0]["/a"], before[1])
     assert (counted.total.messages, counted.total.dropped) == (44, 4)
     assert carried_of(counted) == (
-        {"/a": [40, 400, 4], "/own0": [1, 1, 0], OTHERS: [3, 3, 0]},
+        {"/a": [40, 400, 4], "/own3": [1, 1, 0], OTHERS: [3, 3, 0]},
         {"/a": [4, 8, 2.0]},
     )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_name_stays_while_its_topic_is_present_and_no_host_takes_all(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Ended topics of one host do not displace the robot's, and no counter decreases."""
+    for limit in ("MAX_RESOURCES", "MAX_DELAYED"):
+        monkeypatch.setattr(traffic, limit, 8)
+    chance, registry = random.Random(seed), Registry()  # noqa: S311  a history by seed
+    counted = RelayTraffic(FakeTrail(), registry, 1, lambda _node, _topic: None)
+    robot, live, number = incarnation("/base", host="10.0.0.1", key="robot"), list[str](), 0
+    registry.add(robot)
+    before: dict[str, float] = {}
+    for step in range(200):
+        if chance.random() < 0.6:
+            number += 1
+            live.append(f"guest{number}")
+            registry.add(incarnation(f"/guest{number}", 5000 + number, host="10.0.0.9", key=live[-1]))
+        elif live:
+            counted.forgotten(live.pop(chance.randrange(len(live))))
+        rows = [TopicTraffic(key, f"/{key}", 1, 1, 0, 1, [1], 0.1) for key in live]
+        late = [TopicTraffic("robot", "/late", 1, 1, 0, 1, [1], 0.1)] if step > 50 else []
+        counted.reported([*rows, TopicTraffic("robot", "/cmd_vel", 1, 1, 0, 1, [1], 0.1), *late])
+        relayed, delayed = carried_of(counted)
+        assert relayed["/cmd_vel"][0] == delayed["/cmd_vel"][0] == step + 1
+        assert not late or (relayed["/late"][0] == delayed["/late"][0] == step - 50)
+        for found in (relayed, delayed):
+            assert len(found) <= 9
+            assert sum(name.startswith("/guest") for name in found) <= 6
+        shown: dict[str, float] = {f"{name} 0": row[0] for name, row in relayed.items()}
+        shown |= {f"{name} 1": row[0] for name, row in delayed.items()}
+        assert all(shown[name] >= value for name, value in before.items() if name in shown)
+        gone = before.keys() - shown.keys()
+        assert all(name.partition(" ")[0].removeprefix("/") not in live for name in gone)
+        before = shown
+    assert counted.total.messages == sum(row[0] for row in carried_of(counted)[0].values())
 
 
 def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
