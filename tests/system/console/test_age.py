@@ -182,3 +182,50 @@ def test_a_request_that_fails_later_is_seen(
         answers = 0
         again.click()
     expect(page.get_by_text(re.compile(r"What is shown is of \d+ s ago"))).to_be_visible()
+
+
+def test_waiting_calls_that_no_answer_confirms_are_an_error(opened: Callable[..., Reader]) -> None:
+    """They are asked for again with the next state."""
+    reader = opened()
+    routes = _kept(reader.page, "**/v1/approvals")
+    page = reader.go("robot")
+    _held(page, routes, 1)
+    expect(page.get_by_text("No answer in 8 s.")).to_be_visible(timeout=LIMIT + 8000)
+    _held(page, routes, 2).fulfill(json={"approvals": []})
+    expect(page.get_by_text("no call waits")).to_be_visible()
+
+
+_BELL = """
+window.rings = 0;
+localStorage.setItem("rosrv.approval-sound", "on");
+const gain = { setValueAtTime() {}, exponentialRampToValueAtTime() {} };
+const part = () => ({ frequency: {}, gain, connect: (to) => to, start() {}, stop() {} });
+window.AudioContext = class {
+  state = "running"; currentTime = 0; createGain = part;
+  createOscillator() { window.rings += 1 / 2; return part(); }  // it has two tones
+};
+"""
+
+
+def test_a_bell_rings_for_each_call_that_begins_to_wait(opened: Callable[..., Reader]) -> None:
+    """Not when another one was answered; also for one with a lower number, which a repeated call keeps."""
+    reader = opened()
+    page = reader.page
+    reader.context.add_init_script(_BELL)
+    waiting: list[int] = []
+    call = {
+        "state": "waits", "host": "10.0.0.7", "caller_id": "/agent", "category": "publish", "resource": "/goal",
+        "type": "", "sha256": "", "arguments": "", "size": 0, "left_seconds": 90.0, "who": "",
+    }  # fmt: skip
+    page.route(
+        "**/v1/approvals",
+        lambda route: route.fulfill(json={"approvals": [call | {"number": one} for one in waiting]}),
+    )
+    for now, rings in (([17, 18], 1), ([17], 1), ([17, 18], 2), ([16, 17], 3), ([16], 3)):
+        waiting[:] = now
+        page = page if "/console/" in page.url else reader.go("now")
+        shown = page.locator(".waiting-call:not(.ended)")
+        for number in now:
+            expect(shown.and_(page.locator(f"[data-approval='{number}']"))).to_have_count(1)
+        expect(shown).to_have_count(len(now))
+        assert page.evaluate("window.rings") == rings, now

@@ -1,10 +1,11 @@
 /** The calls that wait for an operator, and the approvals: fetched once for all places that show them. */
 
 import { callFor } from "#console/attention.js";
-import { useEffect } from "#console/html.js";
+import { useEffect, useRef } from "#console/html.js";
 import { live } from "#console/live.js";
 import { notable } from "#console/notable.js";
 import { counted } from "#console/numbers.js";
+import { inTime } from "#console/parts/resource.js";
 import { done, failed } from "#console/parts/toast.js";
 import { ask, get } from "#console/rest.js";
 import { session } from "#console/session.js";
@@ -39,7 +40,7 @@ async function fetchAll() {
 
 async function fetchOnce() {
   try {
-    const { approvals } = await get("/v1/approvals");
+    const { approvals } = await inTime((signal) => get("/v1/approvals", undefined, signal));
     held.set({ rows: approvals, error: null, at: performance.now() });
   } catch (error) {
     held.update({ error });
@@ -55,7 +56,7 @@ export function useHeldCalls() {
     const counts = one.status?.approvals;
     if (!counts) return "";
     const some = counts.waiting + counts.leases > 0 || held.get().rows?.length || held.get().error;
-    return [one.status.since, counts.waiting, counts.leases, some ? one.heard : ""].join(" ");
+    return [one.status.since, counts.waiting, counts.leases, some ? one.heard?.steady : ""].join(" ");
   });
   const record = useStore(notable, (one) => (one.latest?.event.startsWith("approval ") ? one.latest.sequence : 0));
   const signedIn = useStore(session, ({ current }) => current !== null);
@@ -66,10 +67,12 @@ export function useHeldCalls() {
   useEffect(() => () => held.set({ rows: null, error: null, at: 0 }), []);
   useEffect(() => callFor(signedIn && waiting.length ? counted(waiting.length, "call waits", "calls wait") : ""), [signedIn, waiting.length]);
   useEffect(() => () => callFor(""), []);
-  const newest = Math.max(0, ...waiting.map((one) => one.number));
+  const numbers = waiting.map((one) => one.number);
+  const known = useRef(/** @type {number[]} */ ([]));
   useEffect(() => {
-    if (signedIn && newest) ring();
-  }, [newest]);
+    if (signedIn && numbers.some((one) => !known.current.includes(one))) ring();
+    known.current = numbers;
+  }, [numbers.join()]);
 }
 
 /** Approve a call that still waits, or refuse one or end an approval, and say so. @param {number} number @param {"approve" | "refuse"} verb @param {number} [seconds] */

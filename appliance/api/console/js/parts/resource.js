@@ -8,6 +8,28 @@ import { unlocked } from "../session.js";
 const PATIENCE = 8000; // milliseconds without an answer, after which a repeated request has failed
 
 /**
+ * The answer to a request that is repeated. Without one in 8 s the request fails, and is cut off; a locked page asks nothing.
+ * @template T @param {(signal: AbortSignal) => Promise<T>} fetching @returns {Promise<T>}
+ */
+export async function inTime(fetching, controller = new AbortController()) {
+  let late = 0;
+  const lateness = new Promise((_, fail) => {
+    const wait = () => {
+      late = setTimeout(() => {
+        fail(new Problem(0, { detail: `No answer in ${PATIENCE / 1000} s.` }));
+        controller.abort();
+      }, PATIENCE);
+    };
+    unlocked().then(wait, () => {});
+  });
+  try {
+    return await Promise.race([fetching(controller.signal), /** @type {Promise<never>} */ (lateness)]);
+  } finally {
+    clearTimeout(late);
+  }
+}
+
+/**
  * @template T
  * @param {(signal: AbortSignal) => Promise<T>} fetching
  * @param {any[]} inputs fetched again when one of them changes
@@ -22,19 +44,15 @@ export function useResource(fetching, inputs, every = 0) {
   newest.current = fetching;
   useEffect(() => {
     const controller = new AbortController();
+    let left = false;
     setState((state) => ({ ...state, loading: true }));
-    const failed = (/** @type {unknown} */ error) => controller.signal.aborted || setState((state) => ({ ...state, error, loading: false }));
-    newest.current(controller.signal).then((value) => controller.signal.aborted || set(value), failed);
-    let late = 0;
-    const wait = () => {
-      if (controller.signal.aborted) return;
-      late = setTimeout(() => {
-        failed(new Problem(0, { detail: `No answer in ${PATIENCE / 1000} s.` }));
-        controller.abort();
-      }, PATIENCE);
+    const failed = (/** @type {unknown} */ error) => left || setState((state) => ({ ...state, error, loading: false }));
+    const asked = every ? inTime(newest.current, controller) : newest.current(controller.signal);
+    asked.then((value) => left || set(value), failed);
+    return () => {
+      left = true;
+      controller.abort();
     };
-    if (every) unlocked().then(wait, () => {}); // a locked page asks nothing
-    return () => (controller.abort(), clearTimeout(late));
   }, [...inputs, round]);
   const again = useCallback(() => setRound((n) => n + 1), []);
   const set = useCallback((/** @type {T} */ value) => setState({ value, error: null, heard: mark(), loading: false }), []);
