@@ -148,7 +148,7 @@ class Placement:
     def _drivers(self, commands: set[str]) -> list[GuardedDriver]:
         graph = self._graph()
         hosts = {node.name: node.host for node in graph.nodes}
-        robots = RobotGraph(tuple(facts_of(graph)))
+        robots = RobotGraph(facts_of(graph), commands)
         return [
             GuardedDriver(topic.name, node, hosts[node])
             for topic in robots.topics if topic.name in commands

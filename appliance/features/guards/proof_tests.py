@@ -122,7 +122,7 @@ class ProofTests:
         topic = next((fact for fact in facts if fact.name == command), None)
         if topic is None:
             raise SenselessError(f"no node publishes or subscribes to {command}: there is no driver to reach")
-        robots = RobotGraph(tuple(facts))
+        robots = RobotGraph(facts, [command])
         sources = robots.sources(topic, (_ODOMETRY,)) if kind in VELOCITIES else []
         odometry = [source.name for source in sources][:_MAX_ODOMETRY]
         watched = [command, *odometry]
@@ -164,7 +164,7 @@ class ProofTests:
     def _reached(self, found: GuardTested, command: str) -> Iterator[StopReached]:
         facts = facts_of(self._graph.present())
         drivers = {
-            node for fact in facts if fact.name == command for node in RobotGraph(tuple(facts)).ends(fact)
+            node for fact in facts if fact.name == command for node in RobotGraph(facts, [command]).ends(fact)
         }
         for one in found.reached:
             yield StopReached(one.node, one.host, one.node in drivers, one.accepted, one.acknowledged)

@@ -5,11 +5,13 @@
 2. A source below the namespace of another robot never belongs to this one. A source below no robot's namespace
    belongs to the only robot, or to the one whose nodes use it.
 3. An undecided source belongs to no robot; callers report it.
-4. The work is bounded, since any host can add topics: `MAX_COMMANDS` of each kind, `_MAX_STEPS` back from a driver.
+4. The work is bounded, since any host can add topics: `MAX_TOPICS` that the hosts share, `MAX_COMMANDS` of each kind,
+   `_MAX_STEPS` back from a driver.
 """
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -32,9 +34,18 @@ DIAGNOSTICS = _ROLES["Diagnostics"]
 VALUED = tuple(kind for kind in _ROLES["Sensor"] if "/" in kind)
 """The sensors whose values are judged; of all others, only the silence is."""
 GOAL = "control_msgs/FollowJointTrajectoryActionGoal"
+JOY = "sensor_msgs/Joy"
+CLOUD = "sensor_msgs/PointCloud2"
+BOOL = "std_msgs/Bool"
+_READ = {
+    *COMMANDS, *GOALS, *RESULTS, *POSES, *SCANS, *BATTERIES, *DIAGNOSTICS, BOOL, JOY, CLOUD,
+    "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
+}  # fmt: skip
+"""The types from which a graph follows."""
 
 
 COMMAND = re.compile(r"cmd|command|setpoint|drive|ackermann", re.IGNORECASE)
+STOP = re.compile(r"e_?stop|emergency(?:_stop)?|protective_stop|run_?stop(?:ped)?", re.IGNORECASE)
 _OBSERVER = re.compile(
     r"/(?:record|rosbag|rqt|rviz|rostopic|rosapi|rosbridge|foxglove|plotjuggler|rosout)[^/]*$"
 )
@@ -54,6 +65,7 @@ _ESTIMATOR = re.compile(r"odom|ekf|ukf|locali[sz]|fusion|estimat|slam|track", re
 """In the name of a node that does not drive."""
 SIDE = re.compile(r"(?:^|[/_])(?:f|b|r|l|front|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
 
+MAX_TOPICS = 500
 MAX_COMMANDS = 20
 _MAX_STEPS = 10
 
@@ -99,11 +111,13 @@ class GraphedRobot:
         return f"/{'/'.join(self.namespace)}{'_' if self.prefixed else '/'}{leaf}"
 
 
-@dataclass(frozen=True)
 class RobotGraph:
-    """The topics of all robots on one master."""
+    """The topics of all robots on one master that say something about commands, `MAX_TOPICS` of them."""
 
-    topics: tuple[TopicFacts, ...]
+    def __init__(self, topics: Iterable[TopicFacts], named: Collection[str] = ()) -> None:
+        """Keep the topics with these names first, then those of their nodes; `complete` if none is left out."""
+        kept = [*_by_host((topic for topic in topics if topic.name in named or _is_read(topic)), named)]
+        self.topics, self.complete = kept[:MAX_TOPICS], len(kept) <= MAX_TOPICS
 
     @cached_property
     def velocities(self) -> list[TopicFacts]:
@@ -115,7 +129,8 @@ class RobotGraph:
         """
         directed = [topic for topic in self.topics if topic.type in VELOCITIES and not self._reports(topic)]
         found = [topic for topic in directed if COMMAND.search(topic.name)]
-        others = [topic for topic in directed if topic not in found and self._carrying_out(topic)]
+        names = {topic.name for topic in found}
+        others = [topic for topic in directed if topic.name not in names and self._carrying_out(topic)]
         for _step in range(_MAX_STEPS):
             takers = {node for topic in found for node in _used(topic)}
             senders = {node for topic in found if _used(topic) for node in topic.publishers}
@@ -123,14 +138,16 @@ class RobotGraph:
             more = [
                 topic
                 for topic in others
-                if not _A_MEASUREMENT.search(topic.name) and topic not in found
+                if not _A_MEASUREMENT.search(topic.name) and topic.name not in names
                 and not ((topic.type not in kinds or takers.isdisjoint(topic.publishers))
                          and (takers | senders).isdisjoint(self._carrying_out(topic)))
             ]  # fmt: skip
             found += more
+            names |= {topic.name for topic in more}
             if not more:
                 break
-        return [topic for topic in self.topics if topic in (found or self._of_drivers(others))]
+        names = names or {topic.name for topic in self._of_drivers(others)}
+        return [topic for topic in self.topics if topic.name in names]
 
     @cached_property
     def undecided(self) -> list[TopicFacts]:
@@ -431,6 +448,31 @@ class RobotGraph:
             chain = chain.union(*(topic.publishers for topic in inputs))
         prefixed = len(namespace) == 1 and namespace[0] in self._prefixes
         return GraphedRobot(namespace, tuple(group), drivers, chain, prefixed)
+
+
+def _is_read(topic: TopicFacts) -> bool:
+    name, kind = topic.name, topic.type
+    return kind in _READ or kind.endswith("Goal") or bool(COMMAND.search(name) or STOP.search(name))
+
+
+def _by_host(topics: Iterable[TopicFacts], named: Collection[str]) -> Iterator[TopicFacts]:
+    """Order topics by name, so that hosts alternate: the topics of one host crowd out none of another.
+
+    A topic of several hosts counts for the one with the fewest.
+    """
+    ordered = sorted(topics)
+    counts = Counter(host for topic in ordered for host in topic.hosts)
+    near = {
+        node for topic in ordered if topic.name in named for node in (*topic.publishers, *topic.subscribers)
+    }
+    turns, placed = Counter[tuple[int, str]](), list[tuple[int, int, TopicFacts]]()
+    for topic in ordered:
+        apart = topic.name not in named
+        rank = apart + (apart and near.isdisjoint((*topic.publishers, *topic.subscribers)))
+        host = min(topic.hosts, key=lambda one: (counts[one], one), default="")
+        turns[rank, host] += 1
+        placed.append((rank, turns[rank, host], topic))
+    return (topic for _rank, _turn, topic in sorted(placed, key=lambda row: row[:2]))
 
 
 def _used(topic: TopicFacts) -> frozenset[str]:

@@ -5,17 +5,25 @@ left out, and a sentence names the alternatives. The advice ends with what no gu
 """
 
 import re
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from appliance.base.counted import counted
 from appliance.features.guards import robot_graph as types
 from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS
-from appliance.features.guards.robot_graph import COMMAND, MAX_COMMANDS, SIDE, RobotGraph, TopicFacts
+from appliance.features.guards.robot_graph import (
+    BOOL,
+    CLOUD,
+    JOY,
+    MAX_COMMANDS,
+    MAX_TOPICS,
+    SIDE,
+    STOP,
+    RobotGraph,
+    TopicFacts,
+)
 
 _WORD = re.compile(r"[a-z]+")
-_STOP = re.compile(r"e_?stop|emergency(?:_stop)?|protective_stop|run_?stop(?:ped)?", re.IGNORECASE)
 _WORDS_OF_A_STOP = {
     "pressed", "active", "activated", "triggered", "engaged", "hit", "on", "is", "button", "soft", "software",
     "hardware", "hw", "sw", "front", "rear", "back", "left", "right", "base", "robot", "platform", "wireless", "remote",
@@ -36,20 +44,10 @@ _SCAN_OF_A_CAMERA = re.compile(r"camera|depth|rgbd", re.IGNORECASE)
 _MANUAL = re.compile(r"(?:is_|in_)?manual(?:_?mode)?(?:_active|_enabled|_on)?", re.IGNORECASE)
 _MODE = re.compile(r"manual|auto(?:nomous|matic)?(?=_|$)|(?:^|_)mode(?=_|$)", re.IGNORECASE)
 _RESET_TOPIC = "/emergency_stop_reset"  # of `estop`, whose text is read later
-_JOY = "sensor_msgs/Joy"
-_CLOUD = "sensor_msgs/PointCloud2"
-_BOOL = "std_msgs/Bool"
 _SLOWEST_HZ = 2.0
 """A base drives blind between two messages of a slower sensor."""
 _STEADY_HZ = 5.0
 """A joystick that repeats its state at least this often."""
-
-_MAX_TOPICS = 500
-_READ = {
-    *types.COMMANDS, *types.GOALS, *types.RESULTS, *types.POSES, *types.SCANS, *types.BATTERIES, *types.DIAGNOSTICS,
-    _BOOL, _JOY, _CLOUD, "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
-}  # fmt: skip
-"""The types from which the advice follows."""
 
 NOT_SUGGESTED = {
     "agree": "no name says which two velocities should be equal",
@@ -75,34 +73,11 @@ def _command_line(preset: str, name: str, topics: Mapping[str, str], values: Map
     return " ".join(words)
 
 
-def _by_host(topics: Iterable[TopicFacts]) -> list[TopicFacts]:
-    """Order topics by name, so that hosts alternate: the topics of one host crowd out none of another.
-
-    A topic of several hosts counts for the one with the fewest.
-    """
-    ordered = sorted(topics)
-    counts = Counter(host for topic in ordered for host in topic.hosts)
-    turns, placed = Counter[str](), list[tuple[int, TopicFacts]]()
-    for topic in ordered:
-        host = min(topic.hosts, key=lambda one: (counts[one], one), default="")
-        turns[host] += 1
-        placed.append((turns[host], topic))
-    return [topic for _turn, topic in sorted(placed, key=lambda row: row[0])]
-
-
 def advice(
     topics: Iterable[TopicFacts], loaded: Sequence[LoadedSuggestion] = (), names: Collection[str] = ()
 ) -> Suggestions:
     """Return guards for all topics that command a base or an arm. `names` are those of all monitors in use."""
-    read = [
-        topic
-        for topic in _by_host(topics)
-        if topic.type in _READ
-        or topic.type.endswith("Goal")
-        or COMMAND.search(topic.name)
-        or _STOP.search(topic.name)
-    ]
-    graph = RobotGraph(tuple(read[:_MAX_TOPICS]))
+    graph = RobotGraph(topics)
     writer = _Writer(graph, loaded, {*names, *(guard.name for guard in loaded)})
     for base in graph.bases:
         writer.add_base(base)
@@ -119,9 +94,9 @@ def advice(
     if unguarded and graph.robots:
         named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:_MAX_NAMED])
         writer.left_out.append(f"no preset works with these commands, which may also move the robot: {named}")
-    if len(read) > _MAX_TOPICS or MAX_COMMANDS in (len(graph.velocity_commands), len(graph.arms)):
+    if not graph.complete or MAX_COMMANDS in (len(graph.velocity_commands), len(graph.arms)):
         writer.left_out.append(
-            f"only the first {MAX_COMMANDS} commands of each kind among {_MAX_TOPICS} topics were read: others may"
+            f"only the first {MAX_COMMANDS} commands of each kind among {MAX_TOPICS} topics were read: others may"
             " need a guard"
         )
     for topic in graph.legs[:_MAX_NAMED]:
@@ -149,6 +124,7 @@ class _Writer:
             for topic in graph.topics
             if _stops(f"{topic.name.rsplit('/', 1)[0]}/{graph.leaf(topic)}")
         }
+        self._common_stops = [topic for topic in graph.shared({BOOL}) if topic.name in self._stops]
         self._alone = len([*graph.bases, *graph.arms, *graph.arm_velocities]) == 1
         self.found: list[Suggestion] = []
         self.in_use: list[LoadedSuggestion] = []
@@ -238,7 +214,7 @@ class _Writer:
             return
         sticks = [
             topic for topic in self.graph.topics
-            if topic.type == _JOY and topic.publishers and {*command.publishers} <= {*topic.subscribers}
+            if topic.type == JOY and topic.publishers and {*command.publishers} <= {*topic.subscribers}
         ]  # fmt: skip
         for stick in sticks[:1]:
             if stick.rate >= _STEADY_HZ:
@@ -252,11 +228,11 @@ class _Writer:
                 )
 
     def _add_stops(self, command: TopicFacts) -> None:
-        switches = self.graph.sources(command, {_BOOL})
+        switches = self.graph.sources(command, {BOOL})
         resets = [
             topic
             for topic in switches
-            if _STOP.search(topic.name) and _RESET.search(topic.name) and topic.name not in self._stops
+            if STOP.search(topic.name) and _RESET.search(topic.name) and topic.name not in self._stops
         ]
         stops = [topic for topic in switches if topic.name in self._stops]
         stops = [
@@ -283,27 +259,26 @@ class _Writer:
                     " stopped until a node sends true there; for another topic add --topic reset=TOPIC"
                 )
         for topic in switches:
-            if topic not in resets and _STOP.search(topic.name) and topic.name not in self._stops:
+            if topic not in resets and STOP.search(topic.name) and topic.name not in self._stops:
                 self._say(
                     f"{topic.name}: its name does not say whether true stops; {_by_hand('if it does', topic)}"
                 )
         for topic in self.graph.topics:
             if (
-                topic.type != _BOOL
+                topic.type != BOOL
                 and topic.publishers
                 and topic.name in self._stops
                 and self.graph.belongs(topic, command)
             ):
-                self._say(f"{topic.name} has the type {topic.type}: an estop works with {_BOOL} only")
-        for topic in self.graph.shared({_BOOL}):
-            if topic.name in self._stops:
-                self._say(
-                    f"{topic.name} belongs to no robot alone; {_by_hand('for each that it should stop', topic)}"
-                )
+                self._say(f"{topic.name} has the type {topic.type}: an estop works with {BOOL} only")
+        for topic in self._common_stops:
+            self._say(
+                f"{topic.name} belongs to no robot alone; {_by_hand('for each that it should stop', topic)}"
+            )
 
     def _add_mode(self, base: TopicFacts) -> None:
         switches = [
-            topic for topic in self.graph.sources(base, {_BOOL}) if _MODE.search(self.graph.leaf(topic))
+            topic for topic in self.graph.sources(base, {BOOL}) if _MODE.search(self.graph.leaf(topic))
         ]
         manual = [topic for topic in switches if _MANUAL.fullmatch(self.graph.leaf(topic))]
         if len(manual) == 1:
@@ -374,7 +349,7 @@ class _Writer:
         there = [
             topic.name
             for topic in self.graph.topics
-            if topic.type == _BOOL and topic.name in self._stops and not self.graph.is_below(topic, others)
+            if topic.type == BOOL and topic.name in self._stops and not self.graph.is_below(topic, others)
         ]
         if there:
             return f"if {there[0]} is also its button: {new}{there[0]} --shadow"
@@ -385,7 +360,7 @@ class _Writer:
     def _no_scanner(self, command: TopicFacts) -> str:
         if any(line.startswith(f"separation of {command.name} ") for line in self.left_out):
             return "the reason is above"
-        clouds = self.graph.sources(command, {_CLOUD})
+        clouds = self.graph.sources(command, {CLOUD})
         if clouds:
             return (
                 f"{clouds[0].name} is a PointCloud2, and a guard reads a LaserScan: run pointcloud_to_laserscan, and"
@@ -404,7 +379,7 @@ class _Writer:
 
     def _no_device(self, command: TopicFacts) -> str:
         stick = next(
-            (topic.name for topic in self.graph.topics if topic.type == _JOY and topic.publishers), ""
+            (topic.name for topic in self.graph.topics if topic.type == JOY and topic.publishers), ""
         )
         by = f"--by {stick} --shadow button=N" if stick else "--by TOPIC --shadow"
         return f"where a person drives by hand: rosrv guard new hold_to_run {command.name} {by}"
@@ -488,7 +463,7 @@ class _Writer:
                 )
 
     def _say_merged(self, scan: TopicFacts, watched: Sequence[TopicFacts], base: TopicFacts) -> None:
-        origins = self.graph.origins(scan, {*types.SCANS, _CLOUD})
+        origins = self.graph.origins(scan, {*types.SCANS, CLOUD})
         if len(origins) < 2:
             return
         named = ", ".join(topic.name for topic in origins)
@@ -590,7 +565,7 @@ def _stops(topic: str) -> bool:
     if _KNOWN_STOPS.search(topic):
         return True
     leaf = topic.rsplit("/", 1)[1].lower()
-    rest = _STOP.sub(" ", leaf)
+    rest = STOP.sub(" ", leaf)
     return rest != leaf and {*_WORD.findall(rest)} <= _WORDS_OF_A_STOP
 
 

@@ -20,7 +20,7 @@ from appliance.features.guards.presets import (
     works_with,
 )
 from appliance.features.guards.released import order_of, origin_of, released
-from appliance.features.guards.robot_graph import VALUED, TopicFacts
+from appliance.features.guards.robot_graph import MAX_TOPICS, VALUED, TopicFacts
 from rosmop.form.switch_words import Word
 
 # Choose topics and types for a new guard from the graph, and refuse a guard that the graph contradicts.
@@ -77,7 +77,8 @@ def _type_of(
         return known[topic]
     if given in kinds:
         return kinds[given]
-    close = get_close_matches(topic, [name for name, kind in known.items() if kind in fitting], 1, 0.5)
+    there = [name for name, kind in known.items() if kind in fitting]
+    close = get_close_matches(topic, there[:MAX_TOPICS], 1, 0.5)
     hint = f"; did you mean {close[0]}?" if close else "."
     option = f"{given}={fitting[0]}" if len(fitting) == 1 else f"{given}=TYPE, of {works_with(fitting)}"
     raise GuardError(

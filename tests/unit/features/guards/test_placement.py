@@ -1,9 +1,13 @@
 from collections.abc import Callable, Sequence
 
+import msgspec
 import pytest
 
 from appliance.channel.answers.graph_answers import Graph, Node, Topic
+from appliance.features.guards.guard_facts import facts_of
 from appliance.features.guards.guard_orders import GuardedDriver, Placement
+from appliance.features.guards.robot_graph import RobotGraph
+from appliance.features.guards.suggestions import advice
 from appliance.features.guards.view import GUARDS_VIEW, BypassedGuard, GuardsState
 from tests.support.answers import example
 from tests.unit.features.guards.test_suggestions import ROBOTS, graph_of
@@ -85,6 +89,62 @@ def test_each_node_that_carries_a_command_out_is_asked_however_many_there_are() 
     graph, connections = Graph(nodes, [topic], []), Connections()
     place = Placement(lambda: ["/arm/goal"], lambda: graph, connections, connections.reported.append)
     assert {driver.node for driver in place.look()} == {*names}
+
+
+class Name(str):
+    """A name that counts how often names are compared."""
+
+    compared = 0
+
+    def __eq__(self, other: object) -> bool:
+        Name.compared += 1
+        assert Name.compared < 100 * MANY, "the work grows with the square of the topics"
+        return str.__eq__(self, other)
+
+    __hash__ = str.__hash__
+
+
+MANY = 12_500
+"""The registrations that one host may have."""
+
+
+def looked(place: Placement, _graph: Graph) -> None:
+    assert place.look() == [GuardedDriver("/cmd_vel", "/turtlebot3_core", "10.0.0.5")]
+
+
+def warned(place: Placement, _graph: Graph) -> None:
+    assert len(place.sentences("/cmd_vel")) == 1
+
+
+def suggested(_place: Placement, graph: Graph) -> None:
+    assert any(" deadman /cmd_vel " in each.command for each in advice(facts_of(graph)).suggestions)
+
+
+def watched_by_a_test(_place: Placement, graph: Graph) -> None:
+    facts = facts_of(graph)
+    robots = RobotGraph(facts, ["/cmd_vel"])
+    [command] = [topic for topic in facts if topic.name == "/cmd_vel"]
+    assert [source.name for source in robots.sources(command, ["nav_msgs/Odometry"])] == ["/odom"]
+
+
+@pytest.mark.parametrize("both_ends", [False, True])
+@pytest.mark.parametrize("use", [looked, warned, suggested, watched_by_a_test])
+def test_topics_of_one_host_neither_slow_down_nor_hide_what_is_read_from_the_graph(
+    use: Callable[[Placement, Graph], None], both_ends: bool
+) -> None:
+    place, _ = placed("turtlebot3", "10.0.0.5", "/cmd_vel")
+    graph = place._graph()
+    graph.nodes.append(example(Node, name="/h", host="10.0.0.66"))
+    theirs = example(
+        Topic, name="", type="geometry_msgs/Twist", subscribers=["/h"] if both_ends else [],
+        publishers=[{"node": "/h", "messages_per_second": 1.0}],
+    )  # fmt: skip
+    graph.topics[:0] = [
+        msgspec.structs.replace(theirs, name=Name(f"/a/{'cmd' if number % 2 else 'x'}{number}"))
+        for number in range(MANY // (1 + both_ends))
+    ]
+    Name.compared = 0
+    use(place, graph)
 
 
 async def test_an_unknown_publisher_is_reported_when_it_is_there_twice_and_until_it_is_gone() -> None:
