@@ -55,7 +55,7 @@ from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.limit_use import OwnUses
 from appliance.control.operators.new_state import StateAge
 from appliance.control.operators.node_connections import NodeConnections
-from appliance.control.operators.queries import Queries, graph_of, hosts_connected
+from appliance.control.operators.queries import Queries, graph_of, hosts_connected, topic_of
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import Sessions, TokenOrders
@@ -558,6 +558,7 @@ class Control:
             hosts=self.hosts,
             graph=GraphFacts(
                 present=partial(graph_of, registry, self.relay),
+                topic=partial(topic_of, registry, self.relay),
                 host_of=host_of,
                 name_of=name_of,
                 machines=registry.machines,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import reduce
 
 from appliance.channel import messages
-from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.graph_answers import Graph, Topic
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.channel.answers.token_answers import SignedOn
@@ -189,6 +189,8 @@ class GraphFacts:
     """The nodes of the robot, with their topics, services and connections."""
 
     present: Callable[[], Graph]
+    topic: Callable[[str], Topic]
+    """Returns a topic by its name, or raises `UnknownThingError`; cheap, however many topics there are."""
     host_of: Callable[[str], Address | None]
     """Returns the host of the node with a name."""
     name_of: Callable[[str], str]

@@ -3,7 +3,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.audit.log.log import AuditLog
-from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.graph_answers import Graph, Topic
 from appliance.channel.answers.status import Status
 from appliance.configuration.config_sources import read
 from appliance.control.assembly.active_role import ActiveRole
@@ -46,6 +46,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 from appliance.specifications.specification_revisions import NOTHING
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.answers import example
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.idle import idle
@@ -83,6 +84,7 @@ def idle_core(state: Path) -> Core:
         ),
         graph=GraphFacts(
             present=lambda: Graph([], [], []),
+            topic=lambda name: example(Topic, name=name),
             host_of=lambda _node: None,
             name_of=str,
             machines=dict,

@@ -11,6 +11,7 @@ from msgspec.structs import asdict
 
 import appliance
 from appliance.base.clock import now, wall
+from appliance.base.validation_messages import meant
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import (
     Connection,
@@ -40,11 +41,12 @@ from appliance.configuration.inventory import inventory as product_inventory
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
 from appliance.control.assembly.policies import Policies
+from appliance.control.errors import UnknownThingError
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.features.views import states_in
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import MAX_RESOURCES, OTHERS, RelayTraffic
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.graph.registry import OF_TOPICS, Incarnation, Kind, Life, Registry
 from appliance.master.rosmaster import RosMaster
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Category
@@ -94,29 +96,46 @@ def _topics(
     registry: Registry, relay: RelayControl, live: list[Incarnation], names: dict[str, str]
 ) -> list[Topic]:
     connections = _connections(relay, TOPIC, names)
-    publishers: dict[str, list[Publisher]] = {}
-    subscribers: dict[str, list[str]] = {}
-    for incarnation in live:
-        for registration in incarnation.registrations.values():
-            topic = registration.resource
-            if registration.kind is Kind.PUBLICATION:
-                publisher = Publisher(
-                    **asdict(relay.carried.flow(incarnation.key, topic)), node=incarnation.name
-                )
-                publishers.setdefault(topic, []).append(publisher)
-            elif registration.kind is Kind.SUBSCRIPTION:
-                subscribers.setdefault(topic, []).append(incarnation.name)
-    return [
-        Topic(
-            name,
-            registry.type_of(name),
-            mediated=relay.carries_topic(name),
-            publishers=publishers.get(name, []),
-            subscribers=subscribers.get(name, []),
-            connections=connections.get(name, []),
-        )
-        for name in sorted(publishers.keys() | subscribers.keys())
-    ]
+    topics = {
+        registration.resource
+        for incarnation in live
+        for registration in incarnation.registrations.values()
+        if registration.kind in OF_TOPICS
+    }
+    return [_topic(registry, relay, name, connections.get(name, [])) for name in sorted(topics)]
+
+
+def topic_of(registry: Registry, relay: RelayControl, name: str) -> Topic:
+    """Return a topic without its connections. Raises `UnknownThingError`."""
+    found = _topic(registry, relay, name, [])
+    if found.publishers or found.subscribers:
+        return found
+    names = {
+        resource
+        for kind, resource, holders in registry.resources()
+        if kind in OF_TOPICS and any(not node.own for node in holders)
+    }
+    near = meant(name, names) or ": rosrv topic list shows all topics"
+    raise UnknownThingError(f"no node publishes or subscribes to {name[:200]}{near}")
+
+
+def _topic(registry: Registry, relay: RelayControl, name: str, connections: list[Connection]) -> Topic:
+    publishing, subscribing = (
+        registry.registered(Kind.PUBLICATION, name),
+        registry.registered(Kind.SUBSCRIPTION, name),
+    )
+    return Topic(
+        name,
+        registry.type_of(name),
+        mediated=relay.carries_topic(name),
+        publishers=[
+            Publisher(**asdict(relay.carried.flow(node.key, name)), node=node.name)
+            for node in publishing
+            if not node.own
+        ],
+        subscribers=[node.name for node in subscribing if not node.own],
+        connections=connections,
+    )
 
 
 def _services(relay: RelayControl, live: list[Incarnation], names: dict[str, str]) -> list[Service]:

@@ -1,9 +1,8 @@
 """Build the part of control for topics."""
 
 from appliance.base.clock import now
-from appliance.base.validation_messages import meant
 from appliance.control.core import ControlPart, Core, GraphFacts, RelayOrders
-from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.control.errors import SenselessError, UnavailableError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.topics.requests import TopicLook, TopicMessage, TopicMessages
 from appliance.telemetry.audit_trail import AuditTrail
@@ -24,11 +23,7 @@ class TopicLooks:
         self._shown: dict[tuple[str, str], float] = {}
 
     async def messages(self, request: TopicLook, who: str) -> TopicMessages:
-        topics = {topic.name: topic for topic in self._graph.present().topics}
-        topic = topics.get(request.topic)
-        if topic is None:
-            near = meant(request.topic, topics) or ": rosrv topic list shows all topics"
-            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}{near}")
+        topic = self._graph.topic(request.topic)
         if not topic.mediated:
             raise SenselessError(
                 f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"

@@ -42,7 +42,7 @@ class Kind(enum.StrEnum):
     PARAMETER = "parameter"
 
 
-_OF_TOPICS = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
+OF_TOPICS = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
 class Life(enum.StrEnum):
@@ -413,7 +413,7 @@ class Registry:
 
     def _note_type(self, registration: NodeRegistration) -> None:
         kind, topic, told = registration.kind, registration.resource, registration.detail
-        if kind not in _OF_TOPICS:
+        if kind not in OF_TOPICS:
             return
         self._unused_types.pop(topic, None)
         publishes, known = kind is Kind.PUBLICATION, topic in self._types
@@ -442,7 +442,7 @@ class Registry:
             self._types.pop(oldest, None)
 
     def _has_topic(self, topic: str) -> bool:
-        return any((kind, topic) in self._topics for kind in _OF_TOPICS)
+        return any((kind, topic) in self._topics for kind in OF_TOPICS)
 
     def _unindex(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
         holders = self._topics.get((kind, resource))
@@ -450,7 +450,7 @@ class Registry:
             holders.pop(incarnation.key, None)
             if not holders:
                 del self._topics[kind, resource]
-                if kind in _OF_TOPICS and not self._has_topic(resource):
+                if kind in OF_TOPICS and not self._has_topic(resource):
                     self._remember_unused(resource)
                 if kind is Kind.PARAMETER:
                     del self._subscribed_keys[bisect_left(self._subscribed_keys, resource)]

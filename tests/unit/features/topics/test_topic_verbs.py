@@ -1,18 +1,24 @@
+import ipaddress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import typer
 
-from appliance.channel.answers.graph_answers import Graph, Topic
-from appliance.control.errors import UnavailableError
+from appliance.channel.answers.graph_answers import Flow, Topic
+from appliance.control.errors import UnavailableError, UnknownThingError
+from appliance.control.operators.queries import graph_of, topic_of
 from appliance.features.topics.control_part import TopicLooks
 from appliance.features.topics.requests import TopicLook
 from appliance.features.topics.verbs import part_of
+from appliance.master.graph.registry import Incarnation, Kind, Registry
 from roswire.definitions import Definitions
 from roswire.message_view import CUT, read_fields
+from roswire.uris import parse_node_uri
 from tests.support.answers import example
 from tests.support.core import FakeTrail
 
+HOST = ipaddress.ip_address("10.0.0.1")
 DEFINITIONS = Definitions.from_files(
     {"a/Scan.msg": "float32[] ranges\nuint8[] data\nPose pose\nuint8 last\n", "a/Pose.msg": "float32 x\n"}
 )
@@ -46,12 +52,28 @@ class Robot:
 
     looks = 0
 
-    def present(self) -> Graph:
-        return Graph([], [example(Topic, name="/odom", type="nav_msgs/Odometry", mediated=True)], [])
+    def topic(self, name: str) -> Topic:
+        return example(Topic, name=name, type="nav_msgs/Odometry", mediated=True)
 
     async def look(self, *_asked: object, **_named: object) -> list[object]:
         self.looks += 1
         return []
+
+
+def test_one_topic_is_read_as_in_the_graph() -> None:
+    registry, carried = Registry(), SimpleNamespace(connections={}, flow=lambda *_of: example(Flow))
+    relay: Any = SimpleNamespace(carried=carried, carries_topic=lambda _name: True)
+    for number, kind in enumerate((Kind.PUBLICATION, Kind.SUBSCRIPTION, Kind.SUBSCRIPTION, Kind.PUBLICATION)):
+        api = f"http://h:{number + 1}/"
+        node = Incarnation(
+            f"k{number}", f"/n{number}", HOST, parse_node_uri(api), api, "h", 1, 2, own=number == 3
+        )
+        registry.add(node)
+        registry.register(node, kind, "/odom" if number < 3 else "/own", "nav_msgs/Odometry")
+    assert [topic_of(registry, relay, "/odom")] == graph_of(registry, relay).topics
+    for name, hint in (("/odo", "did you mean /odom"), ("/own", "rosrv topic list")):
+        with pytest.raises(UnknownThingError, match=hint):
+            topic_of(registry, relay, name)
 
 
 @pytest.mark.anyio
