@@ -17,9 +17,8 @@ from asyncio import _enter_task, _leave_task, _register_task  # documented, for 
 from collections import deque
 from collections.abc import Callable, Coroutine, Hashable
 from operator import itemgetter
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
 
 TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
@@ -97,13 +96,13 @@ class ProcessorTime:
 
     def __init__(
         self,
-        kind: Callable[[Address], Hashable],
+        kind: Callable[[Any], Hashable],
         clock: Callable[[], float] = time.thread_time,
     ) -> None:
         self._kind = kind
         self._clock = clock
         self._classes: Line[Hashable, None] = Line()  # one item for each piece of work
-        self._hosts: dict[Hashable, Line[Address, Work]] = {}  # the hosts of each waiting class
+        self._hosts: dict[Hashable, Line[Hashable, Work]] = {}  # the hosts of each waiting class
         self._spent = 0.0  # seconds in this turn of the loop
         self._since: float | None = None  # the start of the running piece
         self._turn_ends = False  # whether the end of this turn is scheduled
@@ -116,7 +115,7 @@ class ProcessorTime:
     def running(self) -> bool:
         return self._since is not None
 
-    def run(self, host: Address, work: Work) -> bool:
+    def run(self, host: Hashable, work: Work) -> bool:
         """Run work of a host now, or queue it for the host's turn and return False.
 
         Exceptions of the work are reported to the event loop.
@@ -128,12 +127,12 @@ class ProcessorTime:
         self._queue(host, work)
         return False
 
-    def charge(self, host: Address, seconds: float) -> None:
+    def charge(self, host: Hashable, seconds: float) -> None:
         self._spent += seconds
         self.charge_beside(host, seconds)
         self._end_turn_later()
 
-    def charge_beside(self, host: Address, seconds: float) -> None:
+    def charge_beside(self, host: Hashable, seconds: float) -> None:
         kind = self._kind(host)
         self._classes.charge(kind, seconds)
         if (hosts := self._hosts.get(kind)) is not None:
@@ -145,12 +144,12 @@ class ProcessorTime:
         self._since = self._clock()
         return True
 
-    def end(self, host: Address) -> None:
+    def end(self, host: Hashable) -> None:
         assert self._since is not None  # noqa: S101  by `begin`
         seconds, self._since = self._clock() - self._since, None
         self.charge(host, seconds)
 
-    def _do(self, host: Address, work: Work) -> None:
+    def _do(self, host: Hashable, work: Work) -> None:
         outermost = self.begin()
         try:
             work()
@@ -162,7 +161,7 @@ class ProcessorTime:
             if outermost:
                 self.end(host)
 
-    def _queue(self, host: Address, work: Work) -> None:
+    def _queue(self, host: Hashable, work: Work) -> None:
         kind = self._kind(host)
         self._classes.put(kind, None)
         hosts = self._hosts.get(kind)
@@ -198,7 +197,7 @@ class HostTask(asyncio.Future[T]):
     The first step runs at once, because most requests wait for nothing; asyncio would start a task in a later turn.
     """
 
-    def __init__(self, time: ProcessorTime, host: Address, work: Coroutine[_Awaited, None, T]) -> None:
+    def __init__(self, time: ProcessorTime, host: Hashable, work: Coroutine[_Awaited, None, T]) -> None:
         super().__init__()
         self._time = time
         self._host = host

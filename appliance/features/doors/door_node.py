@@ -41,6 +41,7 @@ from appliance.features.doors.lookout import HostsOf
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.node_hosts import ROBOT
 from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES, DOOR_TOPICS
+from appliance.rpc.processor_time import ProcessorTime
 from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
 from roswire.node import (
     MasterDenialError,
@@ -198,6 +199,7 @@ class DoorNode:
         hosts: HostsOf,
     ) -> None:
         self.node = node
+        self.time = ProcessorTime(lambda host: host)
         self._hosts = hosts
         self._topics = DOOR_TOPICS.bounds.sized(most_topics)
         self._calls = calls

@@ -11,13 +11,15 @@
    not take.
 6. A client that holds memory which all clients share (`door_memory.py`) must take frames: `_LEAST_TAKEN` bytes in
    `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages for other clients may find no space.
-7. A client must finish what it has begun (`door_memory.py`), even if it answers pings. Its handshake takes at most
+7. The hosts of the clients share the processor: a host waits for one frame of the others, not for all that have come.
+8. A client must finish what it has begun (`door_memory.py`), even if it answers pings. Its handshake takes at most
    `handshake_seconds`.
 """
 
 import asyncio
 import contextlib
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -51,6 +53,7 @@ from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
+from appliance.rpc.processor_time import TURN_SECONDS, HostTask
 from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.tcpros import Body
 from roswire.xmlrpc import Value
@@ -95,7 +98,6 @@ _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
 _BATCH_BYTES = 1 << 15
 _COPIES = 2  # of a frame while it is carried out: itself, and its operation
-_TURN = 64  # frames after which frames for clients are sent, although more have come
 _TAKING_SECONDS = 5.0
 _LEAST_TAKEN = 1 << 19
 _CLOSING_SECONDS = 2.0
@@ -264,9 +266,10 @@ class DoorSession:
         return True
 
     async def _serve(self) -> None:
-        tasks = [asyncio.ensure_future(work) for work in (self._send(), self._receive(), self._leave())]
+        parts = [self._send(), self._receive(), self._leave()]
         if self._protocol.wants_surroundings:
-            tasks.append(asyncio.ensure_future(self._watch()))
+            parts.append(self._watch())
+        tasks = [HostTask(self._door.time, self.memory.host, part) for part in parts]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -318,11 +321,13 @@ class DoorSession:
                 break
             self.received_bytes += len(data)
             self._socket.receive_data(data)
-            for number, event in enumerate(self._socket.events_received(), 1):
+            until = time.thread_time() + TURN_SECONDS
+            for event in self._socket.events_received():
                 if isinstance(event, WebSocketFrame):
                     await self._take(event)
-                if number % _TURN == 0:
+                if time.thread_time() >= until:
                     await asyncio.sleep(0)
+                    until = time.thread_time() + TURN_SECONDS
             self._charge_unfinished()
             self._wake.set()  # for the answer to a ping
             if self._pings > _MAX_PINGS:

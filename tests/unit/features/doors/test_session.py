@@ -1,11 +1,14 @@
 import asyncio
 import json
 import struct
+import time
 import tracemalloc
 from typing import Any
 
+import cbor2
 import pytest
 from websockets.datastructures import Headers
+from websockets.frames import Frame, Opcode
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.door_memory import DoorMemory
@@ -644,6 +647,46 @@ async def test_a_denial_of_the_policy_before_is_asked_about_again() -> None:
         del world.master.denials["registerSubscriber"]
         await asyncio.sleep(2)
         assert [channel["topic"] for channel in (await client.next())["channels"]] == ["/load"]
+
+
+NUMBERS = 20_000
+LOAD = {"op": "publish", "topic": "/load", "msg": {"data": [0.0] * NUMBERS}}
+TYPED = LOAD | {"msg": {"data": cbor2.CBORTag(86, bytes(8 * NUMBERS))}}
+HOSTILE: dict[str, tuple[Opcode, bytes, int]] = {
+    "json": (Opcode.TEXT, json.dumps(LOAD).encode(), 5),
+    "cbor": (Opcode.BINARY, cbor2.dumps(LOAD), 3),
+    "typed array": (Opcode.BINARY, cbor2.dumps(TYPED), 5),
+    "refused": (Opcode.TEXT, b'{"op":"x"}', 200),
+    "ping": (Opcode.PING, b"", 2000),
+}
+"""By kind: the frames that each of 24 clients sends, and their number."""
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+async def test_frames_of_one_host_do_not_delay_those_of_another(kind: str) -> None:
+    opcode, data, count = HOSTILE[kind]
+    async with door_world() as world:
+        robot, heard = await world.robot("10.0.0.3", "/robot"), list[float]()
+        await robot.subscribe("/cmd", lambda *_message: heard.append(time.thread_time()))
+        hostile = [await world.client("10.0.0.66", deflate=True) for _number in range(24)]
+        for one in hostile:
+            one.send({"op": "advertise", "topic": "/load", "type": "std_msgs/Float64MultiArray"})
+        client = await world.client()
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
+        await asyncio.sleep(10)
+        for one in hostile:
+            one.stop_reading()
+            for _number in range(count):
+                one.socket.send_frame(Frame(opcode, data))
+        for one in hostile:
+            one.flush()
+        client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "stop"}})
+        began = time.thread_time()
+        await asyncio.sleep(10)
+        whole = time.thread_time() - began
+        assert heard[0] - began < whole / 3
+        for one in hostile:
+            one.read_on()
 
 
 async def test_names_of_parameters_whose_reads_wait_are_bounded() -> None:
