@@ -132,7 +132,6 @@ BY_HAND = {
     "appliance/features/doors/message_reader.py::_made": TEXT,
     "appliance/features/doors/message_writer.py::made": TEXT,
     "appliance/features/doors/rosbridge.py::_advertised": "_check_room(self._advertised, ",
-    "appliance/features/doors/rosbridge.py::_subscriptions": "_check_room(self._subscriptions, ",
     "appliance/features/fleet/connection.py::_known": OURS_ONLY,
     "appliance/features/fleet/bundle_gate.py::_lost": TEXT,
     "appliance/features/recorder/recording.py::_numbers": ANSWER,
@@ -219,7 +218,6 @@ KEYED = {
     "appliance/features/doors/known_types.py::_kept": WHOLE,  # as `_failed`, or the message itself
     "appliance/features/doors/known_types.py::_read": WHOLE,  # as `_failed`
     "appliance/features/doors/rosbridge.py::_advertised": CLIENT,
-    "appliance/features/doors/rosbridge.py::_subscriptions": CLIENT,
     "appliance/features/recorder/recording_plan.py::_begun": HOST,
     "appliance/features/recorder/recording_plan.py::_open": HOST,
     "appliance/features/topics/control_part.py::_shown": COUNTED,

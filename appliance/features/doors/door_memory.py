@@ -9,6 +9,7 @@ messages from other nodes have a memory of their own until they are complete, so
    take it (`session.py`).
 """
 
+import sys
 from collections import Counter
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
@@ -59,6 +60,15 @@ class Unfinished:
         return f"the client sent {sent} bytes in {_SECONDS:g} s of what it has begun; at least {least}"
 
 
+_REPLY_BYTES = 1 << 16  # that have room beside what is kept
+_ENTRY_BYTES = 400  # of a table, with its objects
+
+
+def kept_bytes(*texts: object) -> int:
+    """Return about the bytes of an entry of a table that keeps these texts of a client."""
+    return _ENTRY_BYTES + sum(map(sys.getsizeof, texts))
+
+
 class DoorMemory:
     """The memory of one door with at most this many connections."""
 
@@ -83,7 +93,7 @@ class ClientMemory:
         self._door = door
         self.host = host
         self._shared = 0  # of the bytes that it holds, those of the shared half
-        self._leaving = 0
+        self._leaving = self._kept = 0
 
     def add(self, size: int) -> None:
         if self.closed:
@@ -125,6 +135,15 @@ class ClientMemory:
         if of_host > HOST_SHARE * left:
             return f"the clients of one host would hold {of_host} bytes of a door and leave {left} for all others"
         return ""
+
+    def keep(self, size: int) -> None:
+        """Charge bytes of what the client named, such as topics; a negative size gives them back."""
+        self._kept += size
+        self.add(size)
+
+    def refusal_to_keep(self) -> str:
+        """Return why nothing more is kept. Waiting frames take nothing of `least`: a stop may advertise its topic."""
+        return self.refusal(_REPLY_BYTES) if self._kept > self._door.least else ""
 
     def try_take(self, size: int) -> bool:
         """Charge `size` bytes if this client may hold them; return whether it may."""

@@ -27,6 +27,7 @@ from appliance.features.doors.client_requests import (
     UnsubscribeTopic,
     WriteParameter,
 )
+from appliance.features.doors.door_memory import kept_bytes
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
     FoxgloveAdvertise,
@@ -91,7 +92,9 @@ class Foxglove:
         self._services: dict[int, SeenService] = {}
         self._subscriptions: dict[int, int] = {}  # the channel, by the client's number
         self._by_topic: dict[str, set[int]] = {}
-        self._channels: dict[int, tuple[str, str]] = {}  # of the client: topic and encoding
+        self._channels: dict[
+            int, tuple[str, str, int]
+        ] = {}  # of the client: topic, encoding, bytes as charged
         # Channels whose advertisement was refused. A message repeats it, because viewers advertise only once.
         self._refused: dict[int, AdvertiseTopic] = {}
         self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
@@ -154,6 +157,8 @@ class Foxglove:
                 self._refuse(
                     f"{len(self._subscriptions)} subscriptions; at most {self._limits.subscriptions}"
                 )
+            elif reason := self.queue.memory.refusal_to_keep():
+                self._refuse(reason)
             else:
                 self._subscriptions[subscription.id] = subscription.channelId
                 self._by_topic.setdefault(seen.topic, set()).add(subscription.id)
@@ -194,14 +199,19 @@ class Foxglove:
             raise _FoxgloveError(
                 f"{len(self._channels)} channels of this client; at most {self._limits.channels}"
             )
-        topic = resolve(one.topic, self._node)
-        self._channels[one.id] = topic, one.encoding
-        return AdvertiseTopic(topic, one.schemaName.replace("/msg/", "/"), reply_to=one.id)
+        if reason := self.queue.memory.refusal_to_keep():
+            raise _FoxgloveError(reason)
+        topic, kind = resolve(one.topic, self._node), one.schemaName.replace("/msg/", "/")
+        self._channels[one.id] = topic, one.encoding, kept_bytes(topic, kind)
+        self.queue.memory.keep(kept_bytes(topic, kind))
+        return AdvertiseTopic(topic, kind, reply_to=one.id)
 
     def _unadvertise(self, operation: FoxgloveUnadvertise) -> list[DoorRequest]:
-        topics = {self._channels.pop(one)[0] for one in operation.channelIds if one in self._channels}
+        ended = [self._channels.pop(one) for one in operation.channelIds if one in self._channels]
+        topics = {channel[0] for channel in ended}
+        self.queue.memory.keep(-sum(channel[2] for channel in ended))
         self._refused = {one: request for one, request in self._refused.items() if one in self._channels}
-        used = {topic for topic, _encoding in self._channels.values()}
+        used = {channel[0] for channel in self._channels.values()}
         return [UnadvertiseTopic(topic) for topic in sorted(topics - used)]
 
     def _binary(self, frame: bytes) -> list[DoorRequest]:
@@ -209,7 +219,7 @@ class Foxglove:
             _opcode, number = _CLIENT_DATA.unpack_from(frame)
             if number not in self._channels:
                 raise _FoxgloveError(f"the channel {number} is not advertised by this client")
-            topic, encoding = self._channels[number]
+            topic, encoding, _charged = self._channels[number]
             publish = PublishMessage(topic, _values(encoding, frame[_CLIENT_DATA.size :]))
             again = self._refused.pop(number, None)
             return [publish] if again is None else [replace(again, repeated=True), publish]
@@ -260,6 +270,9 @@ class Foxglove:
                 self._refuse(
                     f"{name}: {len(self._parameters)} subscribed parameters; at most {self._limits.parameters}"
                 )
+                break
+            if reason := self.queue.memory.refusal_to_keep():
+                self._refuse(reason)
                 break
             self._parameters[name] = None
             self.queue.configure(name, depth=None, interval=0.0)

@@ -29,8 +29,8 @@ DOOR_CONNECTIONS = QuotaRow(
 )
 
 DOOR_BYTES = QuotaRow(
-    thing="bytes that clients of one door hold: frames until they are carried out, replies and messages until they are"
-    " sent to a client or another node",
+    thing="bytes that clients of one door hold: names and ids, frames until they are carried out, replies and"
+    " messages until they are sent to a client or another node",
     bounds=Bounds(whole=256 << 20, host=56 << 20, unknown=0, kept=0),
     at_limit="the oldest messages are dropped; a client with too large a frame, or that does not read its replies, is"
     " disconnected with the reason; values that take too much are refused in words",
@@ -49,6 +49,7 @@ DOOR_BYTES = QuotaRow(
     shown_by=(
         "unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",
         "unit/features/doors/test_door_memory.py::test_the_clients_of_one_host_leave_memory_for_other_hosts",
+        "unit/features/doors/test_session.py::test_a_protocol_charges_a_client_for_what_it_keeps",
         "unit/features/doors/test_session.py::test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds",
         "unit/features/doors/test_unfinished.py::test_a_client_that_holds_memory_of_others_must_send_the_rest_faster",
     ),

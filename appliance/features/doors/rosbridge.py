@@ -3,12 +3,12 @@
 1. Every refusal has its reason: a `status` of level error with the id of the operation, also one without an id when
    the reason is new, or a failed `service_response`. Nothing else is sent without a request.
 2. Frames repeat the client's own spelling of a name; requests have the canonical name.
-3. Everything that a client can make grow has a limit.
+3. Everything that a client can make grow has a limit, and is charged to the client's share of its door's memory.
 4. No fragments and no images of texts (`png`) are sent or read. A subscription that asks for them gets plain JSON,
    and a `status` of level warning.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,6 +29,7 @@ from appliance.features.doors.client_requests import (
     UnsubscribeTopic,
     WithdrawService,
 )
+from appliance.features.doors.door_memory import kept_bytes
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.rosbridge_frames import (
     AdvertiseOp,
@@ -82,12 +83,15 @@ class _Subscription:
     type: str | None = None  # as the first client with a type named it
     clients: dict[ClientId, tuple[float, int, Compression]] = field(default_factory=dict)
     compression: Compression = "none"  # the strongest of all clients
+    charged: int = 0
 
 
 @dataclass(slots=True)
 class _Advertisement:
-    type: str | None
+    type: str | None = None
     clients: set[ClientId] = field(default_factory=set)
+    will_bytes: int = 0
+    charged: int = 0
     refused: AdvertiseTopic | None = None
     """The last advertisement if the door refused it. A message repeats it: most clients advertise only once."""
 
@@ -114,7 +118,7 @@ class Rosbridge:
         self._services: dict[str, str] = {}  # the client's spelling, by canonical name
         self._calls: dict[int, _Call] = {}
         self._asked: dict[str, str] = {}  # calls to the client: their service, by id
-        self._told: set[str] = set()
+        self._told: dict[str, str] = {}
         self._number = 0
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
             AdvertiseOp: self._advertise,
@@ -149,31 +153,37 @@ class Rosbridge:
         if size > self._limits.will_bytes:
             raise OperationError(f"the will has {size} bytes; at most {self._limits.will_bytes}")
         kind = type_name(operation.type)
-        self._add_advertisement(topic, kind, operation.id)
+        known = self._add_advertisement(topic, kind, operation.id)
+        self._charge(known, size - known.will_bytes)
+        known.will_bytes = size
         will = operation.will.copy() if size else None  # not the whole frame
         return [AdvertiseTopic(topic, kind, operation.latch, operation.queue_size or 1, operation.id, will)]
 
-    def _add_advertisement(self, topic: str, kind: str | None, client: ClientId) -> None:
-        _check_room(self._advertised, topic, self._limits.topics, "topics are advertised")
-        known = self._advertised.setdefault(topic, _Advertisement(kind))
+    def _add_advertisement(self, topic: str, kind: str | None, client: ClientId) -> _Advertisement:
+        self._check_room(self._advertised, topic, self._limits.topics, "topics are advertised")
+        known = self._advertised.setdefault(topic, _Advertisement())
         if known.refused is not None:
-            known = self._advertised[topic] = _Advertisement(kind)
-        known.type = _one_type(topic, "advertised", known.type, kind)
-        if client not in known.clients and len(known.clients) >= self._limits.ids:
-            raise OperationError(
-                f"{topic} has {len(known.clients)} advertisements; at most {self._limits.ids}"
-            )
-        known.clients.add(client)
+            self._charge(known, -known.charged)
+            known = self._advertised[topic] = _Advertisement()
+        self._name(known, topic, "advertised", kind)
+        self._check_room(known.clients, client, self._limits.ids, "advertisements", topic)
+        if client not in known.clients:
+            known.clients.add(client)
+            self._charge(known, kept_bytes(client))
+        return known
 
     def _unadvertise(self, operation: UnadvertiseOp) -> list[DoorRequest]:
         topic = self._resolve_name(operation.topic)
         known = self._advertised.get(topic)
         if known is None:
             return []
-        known.clients.discard(operation.id)
+        if operation.id in known.clients:
+            known.clients.remove(operation.id)
+            self._charge(known, -kept_bytes(operation.id))
         if known.clients and operation.id is not None:
             return []
         del self._advertised[topic]
+        self._charge(known, -known.charged)
         return [UnadvertiseTopic(topic, operation.id)]
 
     def _publish(self, operation: PublishOp) -> list[DoorRequest]:
@@ -192,13 +202,12 @@ class Rosbridge:
     def _subscribe(self, operation: SubscribeOp) -> list[DoorRequest]:
         topic = self._resolve_name(operation.topic)
         kind = None if operation.type is None else type_name(operation.type)
-        _check_room(self._subscriptions, operation.topic, self._limits.topics, "topics are subscribed")
+        self._check_room(self._subscriptions, operation.topic, self._limits.topics, "topics are subscribed")
         subscription = self._subscriptions.setdefault(operation.topic, _Subscription(topic))
-        subscription.type = _one_type(topic, "subscribed", subscription.type, kind)
-        if operation.id not in subscription.clients and len(subscription.clients) >= self._limits.ids:
-            raise OperationError(
-                f"{topic} has {len(subscription.clients)} subscriptions, the limit for a client: unsubscribe one first"
-            )
+        self._name(subscription, topic, "subscribed", kind)
+        self._check_room(subscription.clients, operation.id, self._limits.ids, "subscriptions", topic)
+        if operation.id not in subscription.clients:
+            self._charge(subscription, kept_bytes(operation.id))
         self._spellings.setdefault(topic, set()).add(operation.topic)
         seconds, length = (operation.throttle_rate or 0) / 1000, operation.queue_length or 0
         compression = "none" if operation.compression == "png" else operation.compression
@@ -224,14 +233,17 @@ class Rosbridge:
         subscription = self._subscriptions.get(operation.topic)
         if subscription is None:
             return []
-        subscription.clients.pop(operation.id, None)
+        if subscription.clients.pop(operation.id, None) is not None:
+            self._charge(subscription, -kept_bytes(operation.id))
         if subscription.clients and operation.id is not None:
             self._configure(operation.topic, subscription)
             return []
         return self._forget_subscription(operation.topic, operation.id)
 
     def _forget_subscription(self, spelling: str, reply_to: ClientId) -> list[DoorRequest]:
-        topic = self._subscriptions.pop(spelling).topic
+        subscription = self._subscriptions.pop(spelling)
+        topic = subscription.topic
+        self._charge(subscription, -subscription.charged)
         self.queue.remove(spelling)
         self._spellings[topic].discard(spelling)
         if self._spellings[topic]:
@@ -254,6 +266,7 @@ class Rosbridge:
             self._fail_call(call, str(error))
             return []
         self._calls[self._number] = call
+        self.queue.memory.keep(kept_bytes(call.service, call.reply_to))
         wished = max(operation.timeout or 0.0, 0.0) or self._limits.call_seconds
         seconds = min(wished, self._limits.longest_call_seconds)
         values = Raw(b"{}") if bytes(operation.args) == b"null" else operation.args
@@ -261,20 +274,22 @@ class Rosbridge:
 
     def _offer(self, operation: AdvertiseServiceOp) -> list[DoorRequest]:
         service, kind = self._resolve_name(operation.service), type_name(operation.type)
-        _check_room(self._services, service, self._limits.services, "services are offered")
-        self._services[service] = operation.service
+        self._check_room(self._services, service, self._limits.services, "services are offered")
+        self._forget_text(self._services, service)
+        self._keep_text(self._services, service, operation.service)
         return [OfferService(service, kind, operation.id)]
 
     def _withdraw(self, operation: UnadvertiseServiceOp) -> list[DoorRequest]:
         service = self._resolve_name(operation.service)
-        if self._services.pop(service, None) is None:
+        if self._forget_text(self._services, service) is None:
             raise OperationError(f"this client does not offer the service {quoted(operation.service)}")
-        self._asked = {call: name for call, name in self._asked.items() if name != service}
+        for call in [call for call, name in self._asked.items() if name == service]:
+            self.give_up(call)
         return [WithdrawService(service, operation.id)]
 
     def _answer(self, operation: ServiceResponseOp) -> list[DoorRequest]:
         call = operation.id
-        service = self._asked.pop(call, None) if isinstance(call, str) else None
+        service = self._forget_text(self._asked, call) if isinstance(call, str) else None
         if service is None or not isinstance(call, str):
             raise OperationError(f"no call of {quoted(operation.service)} has this id")
         return [AnswerCall(service, call, operation.result, operation.values, operation.id)]
@@ -282,6 +297,46 @@ class Rosbridge:
     def _set_level(self, operation: SetLevelOp) -> list[DoorRequest]:
         self._level = _LEVELS.index(operation.level)
         return []
+
+    # --- tables ---
+
+    def _check_room(self, table: Collection[Any], key: object, most: int, what: str, topic: str = "") -> None:
+        if key in table:
+            return
+        if len(table) >= most:
+            used = f"{topic} has {len(table)} {what}" if topic else f"{len(table)} {what} by this client"
+            raise OperationError(f"{used}; at most {most}")
+        if reason := self.queue.memory.refusal_to_keep():
+            raise OperationError(reason)
+
+    def _name(self, known: _Subscription | _Advertisement, topic: str, use: str, kind: str | None) -> None:
+        if None not in (known.type, kind) and known.type != kind:
+            raise OperationError(f"{topic} is {use} as {known.type}, not {kind}")
+        if not known.charged:
+            self._charge(known, kept_bytes(topic))
+        if known.type is None and kind is not None:
+            known.type = kind
+            self._charge(known, kept_bytes(kind))
+
+    def _charge(self, known: _Subscription | _Advertisement, size: int) -> None:
+        known.charged += size
+        self.queue.memory.keep(size)
+
+    def _keep_text(self, table: dict[str, str], key: str, text: str) -> None:
+        table[key] = text
+        self.queue.memory.keep(kept_bytes(key, text))
+
+    def _forget_text(self, table: dict[str, str], key: str) -> str | None:
+        text = table.pop(key, None)
+        if text is not None:
+            self.queue.memory.keep(-kept_bytes(key, text))
+        return text
+
+    def _end_call(self, number: int) -> _Call | None:
+        call = self._calls.pop(number, None)
+        if call is not None:
+            self.queue.memory.keep(-kept_bytes(call.service, call.reply_to))
+        return call
 
     def _resolve_name(self, name: str) -> str:
         return resolve(name, self._node)
@@ -291,8 +346,7 @@ class Rosbridge:
     def failed(self, request: DoorRequest, reason: str) -> None:
         match request:
             case CallOfService():
-                call = self._calls.pop(request.call, None)
-                if call is not None:
+                if call := self._end_call(request.call):
                     self._fail_call(call, reason)
                 return
             case AdvertiseTopic():
@@ -304,7 +358,7 @@ class Rosbridge:
                 ]:
                     self._forget_subscription(spelling, None)
             case OfferService():
-                self._services.pop(request.service, None)
+                self._forget_text(self._services, request.service)
         if isinstance(request, AdvertiseTopic | PublishMessage | SubscribeTopic):
             self._tell(request.topic, "error", reason, request.reply_to)
         else:
@@ -315,7 +369,7 @@ class Rosbridge:
         # roslib shows a program only statuses without an id. Once for each topic and reason, it gets this one too.
         told = f"{topic} {reason.translate(_WITHOUT_DIGITS)}"
         if reply_to is not None and told not in self._told and len(self._told) < _MAX_TOLD:
-            self._told.add(told)
+            self._keep_text(self._told, told, "")
             self.status(level, reason)
 
     def _fail_call(self, call: _Call, reason: str) -> None:
@@ -329,8 +383,7 @@ class Rosbridge:
         self.queue.reply(json_frame(fields, call.reply_to))
 
     def answered(self, number: int, values: Raw | bytes) -> None:
-        call = self._calls.pop(number, None)
-        if call is not None:
+        if call := self._end_call(number):
             fields = {"op": "service_response", "service": call.service, "values": values, "result": True}
             self.queue.reply(json_frame(fields, call.reply_to))
 
@@ -352,12 +405,12 @@ class Rosbridge:
             raise OperationError(f"the client has not answered {counted(len(self._asked), 'call')}")
         self._number += 1
         call = f"service_request:{spelling}:{self._number}"
-        self._asked[call] = service
+        self._keep_text(self._asked, call, service)
         self.queue.reply(json_frame({"op": "call_service", "service": spelling, "args": values}, call))
         return call
 
     def give_up(self, call: str) -> None:
-        self._asked.pop(call, None)
+        self._forget_text(self._asked, call)
 
     def status(self, level: str, text: str, reply_to: ClientId = None) -> None:
         if _LEVELS.index(level) <= self._level:
@@ -388,14 +441,3 @@ class Rosbridge:
 
     def next_time(self) -> float | None:
         return self.queue.next_time()
-
-
-def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:
-    if None not in (known, given) and known != given:
-        raise OperationError(f"{topic} is {use} as {known}, not {given}")
-    return known or given
-
-
-def _check_room(table: dict[str, Any], key: str, most: int, what: str) -> None:
-    if key not in table and len(table) >= most:
-        raise OperationError(f"{len(table)} {what} by this client; at most {most}")

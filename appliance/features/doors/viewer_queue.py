@@ -4,9 +4,9 @@ A client that reads slowly loses the oldest messages of its topics, never a repl
 
 1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
 2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
-3. Frames that wait, or are taken but not sent, are charged to the client's share of its door's memory. If it is full,
-   the client's oldest messages are dropped, or the new one if that is not enough. A reply without room ends the
-   connection.
+3. Topics, and frames that wait, or are taken but not sent, are charged to the client's share of its door's memory. If
+   it is full, the client's oldest messages are dropped, or the new one if that is not enough. A reply without room ends
+   the connection.
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from appliance.features.doors.client_frames import ClientFrame, frame_size
-from appliance.features.doors.door_memory import ClientMemory, DoorMemory
+from appliance.features.doors.door_memory import ClientMemory, DoorMemory, kept_bytes
 
 _BURST = 1000
 _BURST_BYTES = 256 << 10
@@ -24,6 +24,9 @@ _BURST_BYTES = 256 << 10
 
 _OVERHEAD = 300
 """The bytes that a waiting frame takes besides its own."""
+
+_TOPIC_BYTES = 1000
+"""The bytes that a topic takes besides its name and its messages."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -83,7 +86,10 @@ class ViewerQueue(Generic[Key]):
         Without a depth, only a few messages wait, and a large message only until the next one comes.
         """
         most, most_bytes = (_BURST, _BURST_BYTES) if depth is None else (depth, self._most_message_bytes)
-        topic = self._topics.setdefault(key, _Waiting(most, most_bytes, interval))
+        if key not in self._topics:
+            self._topics[key] = _Waiting(most, most_bytes, interval)
+            self.memory.keep(_TOPIC_BYTES + kept_bytes(key))
+        topic = self._topics[key]
         topic.next_time += interval - topic.interval
         topic.depth, topic.most_bytes, topic.interval, topic.queued = (
             most,
@@ -99,6 +105,7 @@ class ViewerQueue(Generic[Key]):
         if topic is not None:
             self._message_bytes -= topic.bytes
             self.memory.add(-topic.bytes - _OVERHEAD * len(topic.items))
+            self.memory.keep(-_TOPIC_BYTES - kept_bytes(key))
 
     def put(self, key: Key, item: object, size: int, now: float) -> None:
         topic = self._topics.get(key)

@@ -12,6 +12,7 @@ from websockets.frames import Frame, Opcode
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.door_memory import DoorMemory
+from appliance.features.doors.foxglove import Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import DoorMessage, KnownTypes
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.quotas import DOOR_BYTES
@@ -727,3 +728,80 @@ def test_a_raw_message_that_waited_is_sent_although_other_clients_took_memory() 
         other.add(size)
     frame = rosbridge.next_frame(0.0)
     assert isinstance(frame, tuple) and frame[1] is body
+
+
+LONG = "\U0001f600" * 1000  # four bytes a character
+NAME, KIND = f"/{'t' * 1000}", f"a/{'T' * 1000}"
+CAMERA = ["/" * slashes + "camera" for slashes in range(1, 201)]
+Frames = list[dict[str, Any]]
+TABLES: dict[str, tuple[Frames, Frames]] = {
+    "ids of spellings": (
+        [{"op": "subscribe", "topic": topic, "id": f"{LONG}{one}"} for topic in CAMERA for one in range(100)],
+        [{"op": "unsubscribe", "topic": topic} for topic in CAMERA],
+    ),
+    "ids of advertisements": (
+        [{"op": "advertise", "topic": "/t", "type": KIND, "id": f"{LONG}{one}"} for one in range(100)],
+        [{"op": "unadvertise", "topic": "/t", "id": f"{LONG}{one}"} for one in range(100)],
+    ),
+    "topics": (
+        [{"op": "subscribe", "topic": f"{NAME}{number}", "type": KIND} for number in range(1000)],
+        [{"op": "unsubscribe", "topic": f"{NAME}{number}"} for number in range(1000)],
+    ),
+    "advertisements": (
+        [{"op": "advertise", "topic": f"{NAME}{number}", "type": KIND, "will": "w" * 4000} for number in range(1000)],
+        [{"op": "unadvertise", "topic": f"{NAME}{number}"} for number in range(1000)],
+    ),
+    "services": (
+        [{"op": "advertise_service", "service": f"{NAME}{number}", "type": KIND} for number in range(100)],
+        [{"op": "unadvertise_service", "service": f"{NAME}{number}"} for number in range(100)],
+    ),
+    "calls": ([{"op": "call_service", "service": NAME, "id": f"{LONG}{one}"} for one in range(100)], []),
+    "channels": (
+        [{"op": "advertise", "channels": [{"id": one, "topic": NAME, "encoding": "ros1", "schemaName": KIND}]}
+         for one in range(200)],
+        [{"op": "unadvertise", "channelIds": [*range(200)]}],
+    ),
+    "parameters": (
+        [{"op": "subscribeParameterUpdates", "parameterNames": [f"{NAME}{number}"]} for number in range(1000)],
+        [{"op": "unsubscribeParameterUpdates", "parameterNames": []}],
+    ),
+}  # fmt: skip
+"""By table of a protocol: frames that fill it to its limit, and frames that empty it."""
+
+
+@pytest.mark.parametrize("refused", [False, True])
+@pytest.mark.parametrize("table", TABLES)
+def test_a_protocol_charges_a_client_for_what_it_keeps(table: str, refused: bool) -> None:
+    queue = ViewerQueue[Any]()
+    protocol: Any = Rosbridge("/door", RosbridgeLimits(), queue)
+    if table in {"channels", "parameters"}:
+        protocol = Foxglove("/door", FoxgloveLimits(), queue)
+    filling, emptying = (
+        [json.dumps(frame, ensure_ascii=False).encode() for frame in frames] for frames in TABLES[table]
+    )
+
+    def read() -> None:
+        while queue.take(0.0) is not None:
+            pass
+        queue.memory.sent()
+
+    def carry_out(frame: bytes) -> None:
+        for request in protocol.receive(frame, is_text=True):
+            if refused:
+                protocol.failed(request, "no")
+        read()
+
+    tracemalloc.start()
+    for frame in filling:
+        carry_out(frame)
+    taken, _peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert taken < 1.5 * queue.memory.held + 100_000
+    assert queue.memory.held < DOOR_BYTES.bounds.host
+    for frame in emptying:
+        carry_out(frame)
+    if table == "calls":
+        for number in range(1, 101):
+            protocol.answered(number, b"{}")
+    read()
+    assert queue.memory.held < 10_000 if refused else queue.memory.held == 0  # the reasons that it got
