@@ -13,8 +13,6 @@ from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 
 PEER_CERTIFICATE = "peer_certificate"
 """The key in the ASGI scope's `state` with the verified client certificate (DER)."""
-IS_ROBOT = "is_robot"
-"""The key in `state` that is true if this certificate belongs to an enrolled robot."""
 COOKIE = "__Host-rosrv-fleet"
 """The console's cookie: sent only over TLS and to this host, and hidden from scripts."""
 

@@ -7,6 +7,7 @@ import asyncio
 import hashlib
 import socket
 import ssl
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from appliance.base.atomic_files import write_whole
 from appliance.base.log_output import keep_from_blocking
 from appliance.signing.own_certificate import make_own_certificate
-from rosrv_fleet.access import IS_ROBOT, PEER_CERTIFICATE, token_of
+from rosrv_fleet.access import PEER_CERTIFICATE, certificate_of, token_of
 from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.config import FleetConfig
@@ -115,16 +116,21 @@ class Door:
     """An ASGI application that passes on the requests within the limits of `ClientConnections` to a name of its own."""
 
     def __init__(
-        self, app: ASGIApp, table: ClientConnections, tokens: OperatorTokens, names: CollectorNames
+        self,
+        app: ASGIApp,
+        table: ClientConnections,
+        tokens: OperatorTokens,
+        names: CollectorNames,
+        robot: Callable[[bytes | None], str | None],
     ) -> None:
-        self._app, self._table, self._tokens, self._names = app, table, tokens, names
+        """`robot` returns the robot of a certificate, at each request: a robot may be removed while it is connected."""
+        self._app, self._table, self._tokens, self._names, self._robot = app, table, tokens, names, robot
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer 429 above the limit, and 421 to another name. The address of a request with a valid token counts as
         proven.
         """
-        if scope["type"] == "http" and not scope.get("state", {}).get(IS_ROBOT):
-            request = Request(scope)
+        if scope["type"] == "http" and self._robot(certificate_of(request := Request(scope))) is None:
             owner = owner_of(request.client.host if request.client else "127.0.0.1")
             token, proven = token_of(request), self._table.is_proven(owner)
             # Verifying a token costs as much as an answer, so an unproven address pays for it first.
@@ -169,7 +175,6 @@ class ServerTls:
         )  # a robot's certificate is its own authority
         self._robots = robots
         self._trusted: set[str] = set()
-        self._fingerprints: set[str] = set()
 
     def reload(self) -> None:
         """Trust new robots. A removed robot stays trusted by TLS, but each of its requests is rejected."""
@@ -177,12 +182,17 @@ class ServerTls:
             for appliance in robot.connecting.values():
                 if appliance.certificate not in self._trusted:
                     self._trusted.add(appliance.certificate)
-                    self._fingerprints.add(appliance.fingerprint)
                     self._trust(robot.name, appliance)
 
     def owner(self, certificate: bytes | None) -> str | None:
-        found = None if certificate is None else hashlib.sha256(certificate).hexdigest()
-        return found if found in self._fingerprints else None
+        """Return the fingerprint of a certificate of a robot that may connect now, or None."""
+        if certificate is None:
+            return None
+        try:
+            known = self._robots.with_certificate(certificate) is not None
+        except OSError:  # the routes report it
+            return None
+        return hashlib.sha256(certificate).hexdigest() if known else None
 
     def _trust(self, robot: str, appliance: RobotAppliance) -> None:
         try:
@@ -198,7 +208,7 @@ def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -
             secured = transport.get_extra_info("ssl_object")
             certificate = None if secured is None else secured.getpeercert(binary_form=True)
             robot = tls.owner(certificate)
-            self.app_state = {**self.app_state, PEER_CERTIFICATE: certificate, IS_ROBOT: robot is not None}
+            self.app_state = {**self.app_state, PEER_CERTIFICATE: certificate}
             self._wait_for_headers()
             number = transport.get_extra_info("socket").fileno()
             if number < 0 or not table.established(number, robot):
@@ -279,6 +289,7 @@ def serve(collector: Collector) -> None:
             table,
             collector.tokens,
             CollectorNames([*config.names, *names_of(config.certificate)]),
+            tls.owner,
         ),
         loop="asyncio",  # the connections are counted by its sockets
         http=_protocol(config.limits.header_seconds, table, tls),

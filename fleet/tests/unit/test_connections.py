@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from rosrv_fleet import connections
-from rosrv_fleet.access import IS_ROBOT
+from rosrv_fleet.access import PEER_CERTIFICATE
 from rosrv_fleet.config import Limits
 from rosrv_fleet.connections import ClientConnections, CountedSocket
 from rosrv_fleet.host_names import CollectorNames
@@ -132,7 +132,7 @@ async def _status(
     headers += [(b"authorization", f"Bearer {token}".encode())] if token else []
     scope: Any = {
         "type": "http", "method": "POST", "path": "/login", "headers": headers, "client": (address, 1),
-        "state": {IS_ROBOT: robot}, "query_string": b"",
+        "state": {PEER_CERTIFICATE: b"robot" if robot else None}, "query_string": b"",
     }  # fmt: skip
     sent: list[Any] = []
 
@@ -150,7 +150,8 @@ async def test_requests_without_a_token_have_a_share(table: ClientConnections, t
 
     tokens = OperatorTokens(tmp_path / "tokens.json")
     token = tokens.add("alice", FleetRole.VIEWER)
-    door = Door(app, table, tokens, CollectorNames([]))
+    robots = {b"robot"}
+    door = Door(app, table, tokens, CollectorNames([]), lambda shown: "arm1" if shown in robots else None)
 
     for word in ("", "wrong"):
         found = [await _status(door, f"203.0.113.{len(word)}", word) for _ in range(100)]
@@ -161,3 +162,5 @@ async def test_requests_without_a_token_have_a_share(table: ClientConnections, t
     assert behind_it.count(429) > 0
     assert await _status(door, "203.0.113.77", name="evil.example.org") == 421
     assert await _status(door, "203.0.113.77", robot=True, name="evil.example.org") == 200
+    robots.clear()  # the robot is removed while its connection is open
+    assert 429 in {await _status(door, "203.0.113.78", robot=True) for _ in range(100)}

@@ -39,3 +39,6 @@ def test_certificates_that_a_robot_signed_count_for_no_robot(tmp_path: Path) -> 
     own = ssl.PEM_cert_to_DER_cert(robot.ca.read_text())
     assert tls.owner(own) == hashlib.sha256(own).hexdigest()
     assert tls.owner(None) is None
+    robots.remove("arm1")
+    tls.reload()
+    assert tls.owner(own) is None
