@@ -115,10 +115,20 @@ class TokenAuthenticator:
     def _lasts(self, token: str) -> bool:
         return clock.since_boot() < self._ends.get(token, (0.0, 0.0))[1]
 
+    def recognised(self, authorization: str | None) -> str:
+        """Return the id of a valid token that needs no costly check, or an empty text."""
+        text = _token_in(authorization)
+        parsed = parse_token(text)
+        kept = self._tokens.get(parsed[0] if parsed is not None else reading_id(text) or "")
+        if kept is None or not self._lasts(kept.id):
+            return ""
+        if parsed is None:
+            return kept.id if is_hash_of(text, kept.reading) else ""
+        return self._recognised.get(self._digest(text), "")
+
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the bearer. Raises `ProblemError` (401, 429, 503)."""
-        scheme, _space, text = (authorization or "").partition(" ")
-        text = text.strip() if scheme.lower() == "bearer" else ""
+        text = _token_in(authorization)
         if not text:
             raise self._refusal("no token: send it (or its reading key) as `Authorization: Bearer TOKEN`")
         if not self._stated:
@@ -141,7 +151,7 @@ class TokenAuthenticator:
         raise self._refusal("the token is wrong or revoked")
 
     async def _matches(self, text: str, secret: str, kept: TokenKept, host: str) -> bool:
-        digest = hmac.digest(self._key, text.encode("ascii"), hashlib.sha256)
+        digest = self._digest(text)
         if self._recognised.get(digest) == kept.id:
             return True
         _require_patience(self._wrong, host)
@@ -155,6 +165,9 @@ class TokenAuthenticator:
         if kept.id in self._tokens:
             self._recognised[digest] = kept.id
         return True
+
+    def _digest(self, text: str) -> bytes:
+        return hmac.digest(self._key, text.encode("ascii"), hashlib.sha256)
 
     def require_patience(self, host: str) -> None:
         """Raise `ProblemError` (429) if a peer sent too many wrong secrets."""
@@ -182,6 +195,11 @@ class TokenAuthenticator:
         return ProblemError(
             401, "not-recognised", detail, headers={"WWW-Authenticate": 'Bearer realm="rosrv"'}
         )
+
+
+def _token_in(authorization: str | None) -> str:
+    scheme, _space, text = (authorization or "").partition(" ")
+    return text.strip() if scheme.lower() == "bearer" else ""
 
 
 def _require_patience(failures: Buckets, host: str) -> None:

@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from appliance.api.front.access import Bearer, TokenAuthenticator
 from appliance.api.front.journal import Journal
 from appliance.api.front.problems import REASON, ProblemError, defect, too_many
-from appliance.api.front.rates import Buckets
+from appliance.api.front.rates import Buckets, peer_key
 from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest, LongRequest
 from appliance.channel.operations import OPERATIONS
@@ -131,22 +131,20 @@ class RequestGate:
         )
         return [LongRequest(*caller, count) for caller, count in rows.most_common(_MAX_LONG)]
 
-    def admit_websocket(self, host: str, path: str) -> None:
+    def admit_websocket(self, host: str, path: str, credential: str = "") -> None:
         """Check the rate and the tunnel of a WebSocket's request. Raises `ProblemError`."""
-        wait = self._rate.take(host, clock.now())
-        if wait:
-            raise too_many("too-many-requests", "too many requests from this host", wait)
+        _pay(self._rate, host, credential)
         self.doorkeeper.require_unblocked(host)
         self._check_tunnel(host, path, renewal=False)
 
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
         host = scope["client"][0]
-        rate = self._page_rate if is_console(scope["path"]) else self._rate
-        wait = rate.take(host, clock.now())
-        if wait:
-            raise too_many("too-many-requests", "too many requests from this host", wait)
-        self.doorkeeper.require_unblocked(host)
         headers = Headers(scope=scope)
+        if is_console(scope["path"]):
+            _pay(self._page_rate, host)
+        else:
+            _pay(self._rate, host, self.doorkeeper.recognised(headers.get("authorization")))
+        self.doorkeeper.require_unblocked(host)
         self._check_host(headers)
         _check_origin(scope, headers)
         path, bearer = scope["path"], None
@@ -186,6 +184,13 @@ class RequestGate:
                 "wrong-host",
                 "the appliance does not answer to this host name: use its address, or add the name to api_names",
             )
+
+
+def _pay(rate: Buckets, host: str, credential: str = "") -> None:
+    """Take from the bucket of a known credential at this host, or else from the host's, which its neighbours empty."""
+    wait = rate.take(f"{credential} {peer_key(host)}" if credential else host, clock.now())
+    if wait:
+        raise too_many("too-many-requests", "too many requests from this host", wait)
 
 
 def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:

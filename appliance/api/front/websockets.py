@@ -12,6 +12,7 @@ import secrets
 import socket
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import cast
 from urllib.parse import parse_qs, urlsplit
@@ -43,6 +44,13 @@ class ShownTickets:
         self._key = secrets.token_bytes(32)
         self._right: OrderedDict[bytes, float] = OrderedDict()
         self._wrong: OrderedDict[bytes, float] = OrderedDict()
+
+    def shown(self, target: bytes) -> str:
+        """Return a digest of the ticket in a URL if it was valid before, or an empty text."""
+        with suppress(ProblemError):
+            digest = self._digest(*_entry_of(target))
+            return digest.hex() if digest in self._right else ""
+        return ""
 
     def require(self, peer: str, name: str, ticket: str) -> None:
         """Raise `ProblemError` (401, 429) if control need not be asked about this ticket now."""
@@ -155,7 +163,7 @@ class WebSocketHandover:
         """Pass a WebSocket on, or answer with the reason of the refusal."""
         host = passage.peer
         try:
-            self._gate.admit_websocket(host, PREFIX.decode())
+            self._gate.admit_websocket(host, PREFIX.decode(), self._tickets.shown(passage.target))
             name, ticket = _entry_of(passage.target)
             self._tickets.require(host, name, ticket)
             here, there = socket.socketpair()

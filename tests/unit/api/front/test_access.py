@@ -1,15 +1,23 @@
 import asyncio
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.api.front.access import Bearer, TokenAuthenticator
+from appliance.api.front.journal import Journal
 from appliance.api.front.problems import ProblemError
+from appliance.api.front.request_gate import RequestGate
+from appliance.api.front.websockets import ShownTickets
 from appliance.base import clock
 from appliance.base.clock import using
 from appliance.channel.messages.api import TokenKept
+from appliance.configuration.settings import ApiLimits
+from appliance.signing.bearer_secrets import hash_of
+from appliance.signing.request_signing import reading_key
 from appliance.store import access_tokens
 from appliance.store.access_tokens import TokenRow, make_token
+from tests.support.asgi import requested
 from tests.support.inline_loop import run
 from tests.support.virtual_clock import VirtualClock
 
@@ -183,3 +191,41 @@ def test_a_stream_ends_with_the_grace_time_of_its_token() -> None:
     assert not door.end_of(bearer, "10.0.0.9")
     door.state([kept(row._replace(expires=clock.wall() - 1))])
     assert door.end_of(bearer, "10.0.0.9")
+
+
+def test_a_neighbour_without_a_token_keeps_no_known_credential_out() -> None:
+    """A program at the operator's address, as behind NAT, sends as much as it can."""
+
+    async def app(_scope: Any, _receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+    with using(VirtualClock()):
+        row, text = make_token("alice", "viewer", now=clock.wall(), seconds=600)
+        door = TokenAuthenticator(10, lambda _token: None)
+        door.state([msgspec.structs.replace(kept(row), reading=hash_of(reading_key(text)))])
+        gate = RequestGate(
+            app, limits=ApiLimits(), doorkeeper=door, journal=Journal(lambda _call: None), names=["api"]
+        )
+
+        def status(shown: str) -> int:
+            return requested(
+                gate, "GET", "/v1/status", headers={"Authorization": f"Bearer {shown}"}
+            ).status_code
+
+        def opened(ticket: str) -> int:
+            target = f"/door/pad?ticket={ticket}".encode()
+            try:
+                gate.admit_websocket("10.0.0.1", "/door/", tickets.shown(target))
+            except ProblemError as problem:
+                return problem.status
+            return 101
+
+        tickets = ShownTickets(door)
+        tickets.answered("10.0.0.1", "pad", "right", valid=True)
+        assert status(text) == 200
+        while status("wrong") != 429 or opened("wrong") != 429:
+            ...
+        assert [status(text), status(reading_key(text)), opened("right")] == [200, 200, 101]
+        assert 429 in {status(text) for _ in range(200)}  # it has a limit of its own
+        assert 429 in {opened("right") for _ in range(200)}
