@@ -511,7 +511,8 @@ class Isolation:
     def _clear_leftovers(self) -> None:
         try:
             record = json.loads(self._record.read_text(encoding="utf-8"))
-            leftover, link = Namespace(record["namespace"]), str(record["link"])
+            name, link = str(record["namespace"]), str(record["link"])
+            leftover = self.namespace if name == self.settings.name else Namespace(name)
             settings = {str(key): str(value) for key, value in record["settings"].items()}
         except FileNotFoundError:
             return

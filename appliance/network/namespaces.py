@@ -13,6 +13,7 @@ import select
 import signal
 import subprocess
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
@@ -74,7 +75,7 @@ def require_privileges(what: str) -> None:
 
 
 class Namespace:
-    """A namespace by its name, which may not exist."""
+    """A namespace by its name, which may not exist; one that `create` made stays in use if its name is deleted."""
 
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):
@@ -82,10 +83,12 @@ class Namespace:
                 f"{name!r} is not a valid name for a network namespace: letters, digits and _ . - only"
             )
         self.name = name
-        self.path = DIRECTORY / name
+        self.path = self._handle = DIRECTORY / name
+        self._let_go: Callable[[], object] = lambda: None
 
     @classmethod
     def own(cls) -> "Namespace":
+        """Return the calling thread's namespace of now, wherever the threads of this process are later."""
         return _OwnNamespace()
 
     def __repr__(self) -> str:
@@ -117,6 +120,7 @@ class Namespace:
             except BaseException:
                 self.path.unlink(missing_ok=True)
                 raise
+        self._keep(self.path)
         return self
 
     def _unshare_and_mount(self) -> None:
@@ -132,6 +136,13 @@ class Namespace:
             if _libc().umount2(os.fsencode(self.path), _MNT_DETACH) != 0:
                 raise _os_failure("umount", self.name)
         self.path.unlink(missing_ok=True)
+        self._handle = self.path
+        self._let_go()
+
+    def _keep(self, path: Path) -> None:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._handle = Path(f"/proc/self/fd/{descriptor}")
+        self._let_go = weakref.finalize(self, os.close, descriptor)
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
@@ -180,10 +191,11 @@ class Namespace:
 
     def processes(self) -> list[int]:
         """Return the other processes in the namespace."""
-        if not self.exists():
-            return []
-        mark = self.path.stat()
-        found = []
+        found: list[int] = []
+        try:
+            mark = self._handle.stat()
+        except OSError:
+            return found
         for entry in Path("/proc").iterdir():
             if entry.name.isdecimal() and int(entry.name) != os.getpid():
                 with contextlib.suppress(OSError):
@@ -195,7 +207,7 @@ class Namespace:
     def open(self) -> int:
         """Return a descriptor of the namespace, which the caller closes."""
         try:
-            return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
+            return os.open(self._handle, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
             raise NetworkError(
                 f"the network namespace {self.name} does not exist ({self.path}: {error.strerror})"
@@ -212,14 +224,15 @@ class Namespace:
 class _OwnNamespace(Namespace):
     def __init__(self) -> None:
         self.name = "(own)"
-        self.path = Path(f"/proc/{os.getpid()}/ns/net")
+        self._keep(_HERE)  # a path of the process would lead to the present namespace of its main thread
+        self.path = self._handle.readlink()  # equal for the same namespace
 
     def exists(self) -> bool:
         return True
 
     def _enter(self) -> None:
         """Do nothing if the thread is there, because containers may not call setns."""
-        if not os.path.samestat(_HERE.stat(), self.path.stat()):
+        if not os.path.samestat(_HERE.stat(), self._handle.stat()):
             super()._enter()
 
     def create(self) -> Namespace:

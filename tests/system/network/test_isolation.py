@@ -5,15 +5,17 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from appliance.network import interfaces
 from appliance.network.firewall.firewall_rules import PortRange
-from appliance.network.isolation import Isolation, IsolationSettings
+from appliance.network.isolation import INSIDE, Isolation, IsolationSettings
 from appliance.network.listening_sockets import listening_ports
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.port_holders import PortsInUseError
@@ -60,6 +62,18 @@ def serving(namespace: Namespace, port: int) -> Iterator[socket.socket]:
         yield server
 
 
+def beside(function: Callable[[], Any], main_in: Namespace) -> Any:
+    """Return what a thread finds that began before the main thread entered a namespace."""
+    found: list[Any] = []
+    entered = threading.Event()
+    thread = threading.Thread(target=lambda: entered.wait(10) and found.append(function()))
+    thread.start()
+    with main_in.entered():
+        entered.set()
+        thread.join()
+    return found[0]
+
+
 def source_seen(server: socket.socket, host: Host, address: str, port: int) -> str:
     with host.entered(), socket.create_connection((address, port), timeout=10) as client:
         peer, (seen, *_) = server.accept()
@@ -97,6 +111,51 @@ def test_source_addresses_are_preserved_in_the_namespace(bare: Host, node: Host,
         assert not any(rule.in_force for rule in isolation.rules())
         isolation.put_rules_back()
         assert source_seen(server, node, bare.address, MASTER) == node.address
+
+
+def test_threads_work_on_the_host_while_the_main_thread_starts_a_process(bare: Host, tmp_path: Path) -> None:
+    with bare.entered():
+        own = Namespace.own()
+        isolation = Isolation(own, replace(settings(tmp_path), master=MASTER + 1))
+        isolation.up()
+    link = ["readlink", "/proc/self/ns/net"]
+    uses: dict[str, Callable[[], Any]] = {
+        "run": lambda: own.run(lambda: Path("/proc/thread-self/ns/net").readlink()),
+        "popen": lambda: own.popen(link, stdout=subprocess.PIPE).communicate()[0],
+        "sysctl": lambda: own.sysctl(f"net/ipv4/conf/{isolation.settings.link}/route_localnet"),
+        "processes": own.processes,
+        "interfaces": lambda: interfaces.links(own),
+        "machine_addresses": isolation.machine_addresses,
+        "host_address_for": lambda: isolation.host_address_for("10.77.0.30"),
+        "obstacles": isolation.obstacles,
+        "translations": isolation.translations,
+        "forward_master": isolation.forward_master,
+        "put_rules_back": isolation.put_rules_back,
+        "rules": lambda: {rule.purpose for rule in isolation.rules() if rule.in_force},
+        "end_connections": isolation.end_connections,
+    }
+    try:
+        with bare.entered(), serving(isolation.namespace, MASTER + 1):
+            assert own == Namespace.own()
+            expected = {name: use() for name, use in uses.items()}
+            found = {name: beside(use, isolation.namespace) for name, use in uses.items()}
+            assert found == expected
+            with isolation.namespace.entered():
+                assert own != Namespace.own()
+                assert {name: use() for name, use in uses.items()} == expected
+    finally:
+        isolation.down()
+
+
+def test_a_namespace_stays_in_use_without_its_name(bare: Host, tmp_path: Path) -> None:
+    with isolated(bare, tmp_path) as isolation:
+        subprocess.run(["ip", "netns", "delete", isolation.namespace.name], check=True)
+        assert not isolation.namespace.exists()
+        assert INSIDE in interfaces.links(isolation.namespace)
+        with serving(isolation.namespace, MASTER) as server:
+            assert source_seen(server, bare, bare.address, MASTER) == bare.address
+    with pytest.raises(NetworkError, match="does not exist"):
+        isolation.namespace.open()
 
 
 def test_the_master_is_forwarded_only_when_it_answers_and_no_other_listens(
@@ -249,7 +308,7 @@ CRASHER = """
 import signal, sys
 from pathlib import Path
 from appliance.network.firewall.firewall_rules import PortRange
-from appliance.network.isolation import Isolation, IsolationSettings
+from appliance.network.isolation import INSIDE, Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace
 isolation = Isolation(Namespace(sys.argv[1]), IsolationSettings(
     ports=(PortRange(11311, 11311), PortRange(20000, 20009)), name=sys.argv[2], directory=Path(sys.argv[3])))
