@@ -286,17 +286,15 @@ class Isolation:
 
     def forward_tunnels(self) -> None:
         """Forward IKE and ESP to the appliance. Raises `NetworkError` if the host uses UDP 500 or 4500."""
-        if self._udp == _TUNNELS:
-            return
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
-        if used:
+        if used and self._udp != _TUNNELS:
             raise NetworkError(
                 f"a program of the host uses UDP {', '.join(map(str, sorted(used)))}, needed by the appliance's"
                 " tunnels: stop it (strongSwan's own service: systemctl mask --now strongswan), or run the appliance"
                 " in a container"
             )
         self._udp = _TUNNELS
-        self._install(self._wanted())
+        self._bring()
 
     def require_free(self, ports: Iterable[int]) -> None:
         """Raise `NetworkError` if a program of the host listens on a port that is not forwarded."""
@@ -308,17 +306,15 @@ class Isolation:
             )
 
     def forward_also(self, ports: tuple[PortRange, ...]) -> None:
-        if self._tcp != ports:
-            self._tcp = ports
-            self._install(self._wanted())
+        self._tcp = ports
+        self._bring()
 
     def forward_master(self) -> None:
         """Forward the port of RVMaster, which answers now. Raises `PortsInUseError`."""
-        if self.settings.master is None or self._serves_nodes:
-            return
-        self._refuse_listeners(self._own_master())
+        if not self._serves_nodes:
+            self._refuse_listeners(self._own_master())
         self._serves_nodes = True
-        self._install(self._wanted())
+        self._bring()
 
     def _close_master(self) -> None:
         """Refuse the robot's own master while there are no rules, if a crash or a failure left its graph taken over."""
@@ -335,10 +331,9 @@ class Isolation:
 
     def withdraw_master(self) -> None:
         """End what `forward_master` began: the port is again that of the robot's own master."""
-        if self._serves_nodes:
-            self._serves_nodes = False
-            self.removed_at = -math.inf
-            self._install(self._wanted())
+        self._serves_nodes = False
+        self.removed_at = -math.inf
+        self._bring()
 
     def _own_master(self) -> tuple[PortRange, ...]:
         """Return RVMaster's port if no other master may listen on it."""
@@ -366,7 +361,8 @@ class Isolation:
             self._missing += [purpose for purpose in absent if purpose not in self._missing]
             if absent:
                 self.removed_at = clock.now()
-                self._put(self._wanted())
+            if absent or (self._rules and self._rules != self._wanted()):
+                self._put()
             protection = self._host.run(close_ports.applied) if self._rules else ""
             if self._protection and not protection and (self._missing or self.unprotected):
                 self._protect_again()
@@ -409,12 +405,15 @@ class Isolation:
     def rules(self) -> tuple[FirewallRule, ...]:
         return statuses(self._rules, self._backend.counters())
 
-    def _install(self, rules: tuple[PacketRule, ...]) -> None:
+    def _bring(self) -> None:
+        """Install the wanted rules unless they are installed: an earlier call may have failed at any step."""
         with self._turn:
-            self._put(rules)
+            if self._rules != self._wanted():
+                self._put()
         self._forget_tunnels()
 
-    def _put(self, rules: tuple[PacketRule, ...]) -> None:
+    def _put(self) -> None:
+        rules = self._wanted()
         self._backend.install(rules)
         self._rules, self.installed_at = rules, clock.now()
         if self.settings.takes_over():
@@ -440,7 +439,7 @@ class Isolation:
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
         self._routers = routers
         self._serves_nodes = settings.holds()
-        self._install(self._wanted())  # before forwarding is enabled
+        self._bring()  # before forwarding is enabled
         self._forwarding.enable(tuple(self.ends))
         open_port(self._host)
 

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -106,18 +107,21 @@ class Kernel:
         self.rules: tuple[PacketRule, ...] = ()
         self.protection = "table inet rosrv_protect {}"
         self.failing = ""  # the step that fails
-        self.isolation = Isolation(Namespace.own(), SETTINGS)
+        self.forgotten: list[tuple[PacketRule, ...]] = []  # the rules when the connection tracker forgot
+        self.isolation = Isolation(Namespace.own(), replace(SETTINGS, master=11312))
         for owner, name, step in (
             (NftBackend, "install", lambda _backend, rules: self._set(rules)),
             (NftBackend, "counters", lambda _backend: tuple(map(self._counter, self.rules))),
             (Namespace, "run", lambda _namespace, work: work()),
             (close_ports, "applied", lambda: self.protection),
             (isolation, "run_nft", lambda _namespace, text: setattr(self, "protection", text)),
-            (isolation, "forget_tracked", lambda _namespace, _ports: 0),
+            (isolation, "forget_tracked", lambda _namespace, _ports: self.forgotten.append(self.rules)),
+            (isolation, "listening_ports", set),
+            (isolation, "udp_ports_in_use", set),
         ):
             monkeypatch.setattr(owner, name, self._step(name, step))
-        self.isolation._put(isolation_rules(SETTINGS, ENDS, ()))
         self.isolation.ends = ENDS
+        self.isolation._bring()
         assert self.isolation.put_rules_back() == []
 
     def _step(self, name: str, step: Callable[..., object]) -> Callable[..., object]:
@@ -164,6 +168,40 @@ def test_a_step_of_the_restoration_that_fails_for_a_time_loses_nothing(
     told_once = [purpose for one in told for purpose in one if purpose != _OPEN]
     assert sorted(told_once) == sorted([*rules, "rosrv protect"])
     assert (kernel.restored(), kernel.isolation.unprotected) == ([], "")
+
+
+CHANGES: dict[str, Callable[[Isolation], object]] = {
+    "forward_tunnels": Isolation.forward_tunnels,
+    "forward_also": lambda one: one.forward_also((PortRange.one(9091),)),
+    "forward_master": Isolation.forward_master,
+    "withdraw_master": Isolation.withdraw_master,
+}
+
+
+@pytest.mark.parametrize("step", ["install", "forget_tracked"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_that_failed_is_made_by_the_next_call(name: str, step: str, kernel: Kernel) -> None:
+    if name == "withdraw_master":
+        kernel.isolation.forward_master()
+    before, kernel.failing = kernel.rules, step
+    with pytest.raises(NetworkError):
+        CHANGES[name](kernel.isolation)
+    kernel.failing = ""
+    CHANGES[name](kernel.isolation)
+    assert kernel.rules == kernel.isolation._wanted() != before
+    assert kernel.forgotten[-1] == kernel.rules
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_that_failed_is_made_by_the_next_check(name: str, kernel: Kernel) -> None:
+    if name == "withdraw_master":
+        kernel.isolation.forward_master()
+    kernel.failing = "install"
+    with pytest.raises(NetworkError):
+        CHANGES[name](kernel.isolation)
+    kernel.failing = ""
+    assert kernel.restored() == []
+    assert kernel.rules == kernel.isolation._wanted()
 
 
 def test_closed_ports_that_cannot_be_closed_again_are_reported_until_they_are(kernel: Kernel) -> None:
