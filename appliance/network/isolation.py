@@ -34,7 +34,7 @@ from appliance.channel.answers.status import FirewallRule
 from appliance.network import close_ports, interfaces, vendor_masters
 from appliance.network.cut import DisturbedConnections, close_port, open_port, refuse_no_port, run_nft
 from appliance.network.firewall import iptables
-from appliance.network.firewall.firewall import statuses
+from appliance.network.firewall.firewall import installing_again, statuses
 from appliance.network.firewall.firewall_rules import (
     LOOPBACK,
     Chain,
@@ -362,7 +362,8 @@ class Isolation:
             if absent:
                 self.removed_at = clock.now()
             if absent or (self._rules and self._rules != self._wanted()):
-                self._put()
+                with installing_again():
+                    self._put()
             protection = self._host.run(close_ports.applied) if self._rules else ""
             if self._protection and not protection and (self._missing or self.unprotected):
                 self._protect_again()

@@ -38,6 +38,7 @@ REMOVED_SECONDS = 3600.0
 _REMEMBER_SECONDS = 1.0
 _LATER_SECONDS = (0.5, 2.0)
 _ROUTES_AT_ONCE = 4
+_UNKNOWN = "the firewall may not be in force"
 
 T = TypeVar("T")
 
@@ -70,7 +71,8 @@ class IsolationWatchdog:
         self._changes: list[tuple[float, str]] = []  # the times of changes, and their programs
         self._intact_at = clock.now()
         self._removed = -math.inf, ""
-        self._ending: set[asyncio.Task[None]] = set()
+        self._unrestored = False  # whether the last restoration failed
+        self._ending: set[asyncio.Task[object]] = set()
 
     def news(self) -> list[messages.Message]:
         return [self._report] if self._probe is None else [self._report, self._probe]
@@ -127,8 +129,8 @@ class IsolationWatchdog:
         if reason is not None:
             log.critical("the appliance must not serve", reason=reason)
             self._probe = messages.ProbeFailed(reason)
-        elif self.isolation.probes:
-            self._probe = messages.ProbePassed()
+        else:
+            self._probe = messages.ProbePassed() if self.isolation.probes else None
         for message in self.news():
             self._tell(message)
 
@@ -248,11 +250,14 @@ class IsolationWatchdog:
         try:
             missing, restored_at = await in_thread(self.isolation.restore)
         except Exception as error:  # noqa: BLE001  see the invariant
-            self._changes = changes + self._changes
-            self._found(f"removed rules of the firewall cannot be installed again: {_words(error)}")
+            self._changes, self._unrestored = changes + self._changes, True
+            self._found(f"{_UNKNOWN}: {_words(error)}")
             await asyncio.sleep(_REMEMBER_SECONDS)
             self._changed.set()
             return
+        if self._unrestored:  # the regular check comes late, and nodes are refused until a check passes
+            self._unrestored = False
+            self._begin(self.look())
         began, self._intact_at = self._intact_at, restored_at
         if missing:
             at, by = changes[0] if changes else (began, "")
@@ -262,9 +267,9 @@ class IsolationWatchdog:
             ):  # the failure may have been a short one: do not wait for the regular check
                 asyncio.get_running_loop().call_later(_REMEMBER_SECONDS, self._changed.set)
 
-    def _begin(self, work: Coroutine[None, None, None]) -> None:
-        """End connections while the rules are watched, or the next removal would wait for that."""
-        task = asyncio.create_task(work)
+    def _begin(self, work: Coroutine[None, None, object]) -> None:
+        """Work while the rules are watched, or the next removal would wait for that."""
+        task: asyncio.Task[object] = asyncio.create_task(work)
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
 
@@ -301,7 +306,7 @@ class IsolationWatchdog:
             self._reported(await in_thread(self.isolation.report))
             return await in_thread(self.isolation.probe)
         except Exception as error:  # noqa: BLE001  see the invariant
-            return f"the state of the firewall is unknown: {_words(error)}"
+            return f"{_UNKNOWN}: {_words(error)}"
 
 
 def _words(error: Exception) -> str:

@@ -1,6 +1,8 @@
 """Run the firewall of the appliance's namespace with a back end that works."""
 
+import contextlib
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,7 +68,8 @@ class Firewall:
             found = statuses(self._rules, self._backend.counters(), self._backend.families)
             missing = [rule.purpose for rule in found if not rule.in_force]
             if missing:
-                self._backend.install(self._rules)
+                with installing_again():
+                    self._backend.install(self._rules)
             return missing
 
     def remove(self) -> None:
@@ -115,6 +118,15 @@ class Firewall:
             reason = f"{backend.name}: {error}"
             if reason not in self._not_used:
                 self._not_used.append(reason)
+
+
+@contextlib.contextmanager
+def installing_again() -> Iterator[None]:
+    """Let a failure say more than one of listing the rules does."""
+    try:
+        yield
+    except FirewallError as error:
+        raise FirewallError(f"removed rules cannot be installed again: {error}") from error
 
 
 def statuses(

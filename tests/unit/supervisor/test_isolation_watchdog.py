@@ -329,6 +329,28 @@ async def test_a_restoration_that_fails_is_a_finding_and_is_repeated(
 
 
 @pytest.mark.usefixtures("guard_in_loop")
+@pytest.mark.parametrize("failures", [1, 3])
+async def test_nodes_are_refused_only_until_a_restoration_succeeds(
+    failures: int, kernel: tuple[Flushed, Callable[[str], None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    isolation, change = kernel
+    monkeypatch.setattr(isolation, "probes", True)
+    isolation.broken = [NetworkError("nft hangs") for _second in range(failures)]
+    told: list[tuple[float, type[Message]]] = []
+    watching = asyncio.create_task(
+        IsolationWatchdog(isolation, lambda one: told.append((clock.now(), type(one)))).watch()
+    )
+    await asyncio.sleep(0.5)
+    change("rosrv")
+    began = clock.now()
+    await asyncio.sleep(failures + 3)
+    watching.cancel()
+    probed = [(when - began, kind) for when, kind in told if kind in (ProbeFailed, ProbePassed)]
+    assert [kind for _, kind in probed] == [*failures * [ProbeFailed], ProbePassed]
+    assert probed[-1][0] == pytest.approx(failures, abs=0.3)
+
+
+@pytest.mark.usefixtures("guard_in_loop")
 async def test_a_regular_check_restores_what_the_kernel_does_not_report(
     kernel: tuple[Flushed, Callable[[str], None]],
 ) -> None:
