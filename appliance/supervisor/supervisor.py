@@ -17,7 +17,7 @@ import signal
 import socket
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 
@@ -26,6 +26,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.counted import counted
+from appliance.base.user_errors import UserError
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.ipsec.strongswan import PROGRAM as CHARON
@@ -282,24 +283,14 @@ class Supervisor:
         slot.wanted = False
         if self.stopping.is_set() or not self._may_start(slot):
             return
-        here, there = socket.socketpair()
-        lender = lend_inputs(slot.role.inputs(self._facts))
         try:
-            with self._watchdog.isolation.inside():
-                plan = slot.plan(self._facts, there.fileno(), lender.fileno() if lender is not None else None)
-                child = ChildProcess(slot.role.name, plan)
-            lifeline = Channel(here, messages.Lifeline, longest=1 << 20)
-            slot.process = ProcessHandle(slot.role.name, slot.index, child, lifeline, self.reports)
-        except OSError as error:
-            here.close()
+            slot.process = self._process_for(slot)
+        except Exception as error:  # else no event would ever start it
             slot.short_runs += 1
-            log.error("process cannot be started", role=slot.role.name, error=str(error))
+            defect = None if isinstance(error, OSError | UserError) else error
+            log.error("process cannot be started", role=slot.role.name, error=str(error), exc_info=defect)
             self._start_later(slot)
             return
-        finally:
-            there.close()
-            if lender is not None:
-                lender.close()
         slot.starts += 1
         log.info("process started", role=slot.role.name, pid=slot.process.pid, restarts=slot.starts - 1)
         if slot.role.name == "control":
@@ -319,6 +310,19 @@ class Supervisor:
             slot.process.send(memory, (descriptor,))
         self._link(slot)
         self._tell_processes()
+
+    def _process_for(self, slot: ProcessSlot) -> ProcessHandle:
+        here, there = socket.socketpair()
+        with ExitStack() as unused, there:
+            unused.callback(here.close)
+            with lend_inputs(slot.role.inputs(self._facts)) or nullcontext() as lender:
+                with self._watchdog.isolation.inside():
+                    plan = slot.plan(self._facts, there.fileno(), lender.fileno() if lender else None)
+                    child = ChildProcess(slot.role.name, plan)
+                lifeline = Channel(here, messages.Lifeline, longest=1 << 20)
+                process = ProcessHandle(slot.role.name, slot.index, child, lifeline, self.reports)
+            unused.pop_all()
+            return process
 
     def _may_start(self, slot: ProcessSlot) -> bool:
         return self._gate.active or slot.role.after is None or slot.role.stands_by

@@ -20,8 +20,10 @@ from appliance.channel.messages import (
     Ready,
     RouteWanted,
 )
+from appliance.network.namespaces import NetworkError
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.machine_work import NoMachineWork
 from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.role import Facts, Role
@@ -89,14 +91,30 @@ async def test_a_first_token_that_cannot_be_saved_ends_the_start(made: Make) -> 
     assert Announced() not in control.told
 
 
-async def test_a_machine_without_processes_causes_no_tight_loop(
-    made: Make, monkeypatch: pytest.MonkeyPatch
+STEPS: dict[str, tuple[object, str]] = {
+    "socket": (socket, "socketpair"),
+    "inputs": (module, "lend_inputs"),
+    "isolation": (NoIsolation, "inside"),
+    "plan": (ProcessSlot, "plan"),
+    "spawn": (module, "ChildProcess"),
+    "lifeline": (module, "Channel"),
+    "handle": (module, "ProcessHandle"),
+}
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.EAGAIN, "no process can be made"), NetworkError("no namespace"), KeyError("role")]
+)
+@pytest.mark.parametrize("step", STEPS)
+async def test_a_start_that_fails_is_repeated_without_a_tight_loop(
+    step: str, error: Exception, made: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none_left(*_arguments: object) -> Never:
-        raise OSError(errno.EAGAIN, "no process can be made")
+    def fails(*_arguments: object) -> Never:
+        raise error
 
     supervisor = made(CONTROL)
-    monkeypatch.setattr(module, "ChildProcess", none_left)
+    monkeypatch.setattr(module, "ChildProcess", lambda *_arguments: None)
+    monkeypatch.setattr(*STEPS[step], fails)
     (slot,), loop = supervisor.slots, asyncio.get_running_loop()
     for delay in (0.0, 0.2, 0.5, 1.0, 1.0):
         supervisor.start(slot)
