@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
-from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.namespaces import Namespace, NetworkError, privilege_hint
 
 
 def netlink_library() -> ModuleType:
@@ -276,8 +276,8 @@ def _netlink(namespace: Namespace, what: str, work: Callable[[Netlink], T]) -> T
     try:
         return namespace.run(inside)
     except pyroute2.NetlinkError as error:
-        hint = ": needs root (CAP_NET_ADMIN); run it with sudo" if error.code in (1, 13) else ""
-        raise NetworkError(f"{what} in {namespace.name}: {os.strerror(error.code)}{hint}") from error
+        reason = f"{os.strerror(error.code)}{privilege_hint(error.code)}"
+        raise NetworkError(f"{what} in {namespace.name}: {reason}") from error
 
 
 def _names(route: Netlink) -> dict[int, str]:

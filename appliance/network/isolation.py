@@ -429,6 +429,9 @@ class Isolation:
         interfaces.set_link(inside, "lo", up=True)
         interfaces.create_veth(self._host, settings.link, inside, INSIDE)
         for family, ends in self.ends.items():
+            if family == 6:  # a new interface takes `default`, which hardened machines set
+                self._host.sysctl(f"net/ipv6/conf/{settings.link}/disable_ipv6", "0")
+                inside.sysctl(f"net/ipv6/conf/{INSIDE}/disable_ipv6", "0")
             interfaces.add_address(self._host, settings.link, f"{ends.host}/{ends.length}")
             interfaces.add_address(inside, INSIDE, f"{ends.appliance}/{ends.length}")
             interfaces.add_near_route(

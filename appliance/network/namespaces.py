@@ -6,6 +6,7 @@ Each call gets its own thread, which ends in the namespace, because a return cou
 
 import contextlib
 import ctypes
+import errno
 import fcntl
 import os
 import re
@@ -301,8 +302,14 @@ def _setns(descriptor: int, name: str) -> None:
 
 def _os_failure(call: str, name: str) -> NetworkError:
     number = ctypes.get_errno()
-    hint = ": needs root (CAP_SYS_ADMIN); run it with sudo" if number in (1, 13) else ""
-    return NetworkError(f"network namespace {name}: {call}: {os.strerror(number)}{hint}")
+    return NetworkError(f"network namespace {name}: {call}: {os.strerror(number)}{privilege_hint(number)}")
+
+
+def privilege_hint(number: int) -> str:
+    """Return advice on an error that a lack of privileges can cause, unless this process has them."""
+    if number not in (errno.EPERM, errno.EACCES) or has_privileges():
+        return ""
+    return ": needs root (CAP_NET_ADMIN, CAP_SYS_ADMIN); run it with sudo"
 
 
 def lives_on_the_machines_network(proc: Path = Path("/proc")) -> bool:

@@ -147,6 +147,16 @@ def test_threads_work_on_the_host_while_the_main_thread_starts_a_process(bare: H
         isolation.down()
 
 
+@pytest.mark.parametrize("scope", ["default", "all"])
+def test_a_machine_that_disables_ipv6_gets_an_appliance(
+    scope: str, bare: Host, node: Host, tmp_path: Path
+) -> None:
+    bare.namespace.sysctl(f"net/ipv6/conf/{scope}/disable_ipv6", "1")
+    with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
+        assert source_seen(server, node, bare.address, MASTER) == node.address
+        assert [*isolation.ends] == ([4] if scope == "all" else [4, 6])
+
+
 def test_a_namespace_stays_in_use_without_its_name(bare: Host, tmp_path: Path) -> None:
     with isolated(bare, tmp_path) as isolation:
         subprocess.run(["ip", "netns", "delete", isolation.namespace.name], check=True)
