@@ -249,7 +249,7 @@ def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
             f"{counted(len(translating), 'chain')} translating addresses, none towards the appliance"
         )
     if dropping:
-        words.append(f"{counted(len(dropping), 'chain')} dropping forwarded packets")
+        words.append(f"{counted(len(dropping), 'obstacle')} to connections")
     if words:
         yield "others' rules", f"{'; '.join(words)}: --json"
 

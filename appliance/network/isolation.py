@@ -272,14 +272,29 @@ class Isolation:
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
-        """Return chains of other programs that drop forwarded packets: their owner must accept the appliance's
-        link.
-        """
+        """Return what keeps connections from their end on this machine, with a remedy for each."""
         link = self.settings.link
-        return tuple(
+        found = [
             f"{chain} drops forwarded packets by default: let interface {link} pass in it, both ways"
             for chain in (*self._backend.foreign_forward_drops(), *iptables.foreign_forward_drops(self._host))
-        )
+        ]
+        if taken := self._listened((*self.settings.ports, *self._tcp)):
+            holder = self._host.run(lambda: described(taken))
+            found.append(f"{holder}, which leads to the appliance: give it another port")
+        no_router = {_no_router(family): _GLOBAL[family].replace("/", ".") for family in self.ends}
+        found += [
+            f"{rule.purpose}, and drops packets: if containers, virtual machines or a hotspot send them, write"
+            f" `{no_router[rule.purpose]} = 1` into /etc/sysctl.d, and boot again"
+            for rule in self.rules()
+            if rule.purpose in no_router and rule.packets
+        ]
+        return tuple(found)
+
+    def forward_again(self) -> tuple[Family, ...]:
+        """Enable the forwarding that another program has ended; return its families. Raises `NetworkError`."""
+        ended = tuple(family for family in self.ends if not self._forwarding.before(family))
+        self._forwarding.enable(ended)
+        return ended
 
     def translations(self) -> tuple[str, ...]:
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
@@ -468,13 +483,15 @@ class Isolation:
 
     def _refuse_listeners(self, ranges: tuple[PortRange, ...]) -> None:
         """Raise `PortsInUseError` if a program of the host listens in `ranges`; it is named by the first of them."""
-        in_use = sorted(self._host.run(listening_ports))
-        clashes = [port for span in ranges for port in in_use if span.first <= port <= span.last]
-        if clashes:
+        if clashes := self._listened(ranges):
             remedy = "stop it, or give the appliance other ports"
             if clashes[0] == self.settings.master:
                 remedy = "`sudo rosrv adopt` takes its graph over, or stop it"
             raise PortsInUseError(f"{self._host.run(lambda: described(clashes))}; {remedy}")
+
+    def _listened(self, ranges: tuple[PortRange, ...]) -> list[int]:
+        in_use = sorted(self._host.run(listening_ports))
+        return [port for span in ranges for port in in_use if span.first <= port <= span.last]
 
     def _take_lock(self) -> None:
         if self._lock is not None:
@@ -581,7 +598,7 @@ def isolation_rules(
     for family, end in ends.items():
         if family not in routers:
             no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)
-            rules.append(no_router(f"the host is not an IPv{family} router", PacketVerdict.DROP))
+            rules.append(no_router(_no_router(family), PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in (*settings.ports, *tcp)]
         # A node's old connection to its own master may be new to the connection tracker: its packets stay there, so
@@ -591,6 +608,10 @@ def isolation_rules(
         masqueraded = partial(PacketRule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
         rules.append(masqueraded(f"the appliance's own connections, IPv{family}", PacketVerdict.MASQUERADE))
     return tuple(rules)
+
+
+def _no_router(family: Family) -> str:
+    return f"the host is not an IPv{family} router"
 
 
 def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tuple[PacketRule, ...]:

@@ -605,6 +605,8 @@ class NetnsIsolation(ContainerIsolation):
             if gone:
                 log.critical("rules on the host were missing and are installed again", rules=gone)
                 self._found += gone
+            if ended := self._isolation.forward_again():
+                log.critical("another program had ended IP forwarding, now enabled again", families=ended)
             rules = self._isolation.rules()
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 

@@ -45,8 +45,7 @@ class FirewallRule(msgspec.Struct, frozen=True):
 class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
     """The firewall; fields that this isolation does not use are left out.
 
-    `translations` and `obstacles` are chains of other programs on the host, which translate or drop forwarded
-    packets.
+    `translations` are chains of other programs on the host; `obstacles` have a remedy each.
     """
 
     backend: Annotated[str | None, doc("nft or iptables")] = None
@@ -56,7 +55,7 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
         list[FirewallRule] | None, doc("on the host, towards the appliance's namespace")
     ] = None
     translations: Annotated[list[str] | None, doc("chains of other programs that translate addresses")] = None
-    obstacles: Annotated[list[str] | None, doc("chains of other programs that drop what is forwarded")] = None
+    obstacles: Annotated[list[str] | None, doc("what keeps connections from their end, with a remedy")] = None
     hold_lapsed: Annotated[
         str | None,
         doc(

@@ -66,7 +66,12 @@ def beside(function: Callable[[], Any], main_in: Namespace) -> Any:
     """Return what a thread finds that began before the main thread entered a namespace."""
     found: list[Any] = []
     entered = threading.Event()
-    thread = threading.Thread(target=lambda: entered.wait(10) and found.append(function()))
+
+    def work() -> None:
+        entered.wait(10)
+        found.append(function())
+
+    thread = threading.Thread(target=work)
     thread.start()
     with main_in.entered():
         entered.set()
@@ -240,6 +245,24 @@ def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> 
         with serving(node.namespace, 34568) as remote:
             assert source_seen(remote, inside, node.address, 34568) == bare.address
             assert source_seen(remote, inside, node.address6, 34568) == bare.address6
+
+
+def test_obstacles_that_appear_later_are_named(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
+    """A listener in the forwarded ports, a program that needs a router, and one that ends forwarding."""
+    far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
+    interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
+    with isolated(bare, tmp_path) as isolation:
+        assert (isolation.obstacles(), isolation.forward_again()) == ((), ())
+        with serving(bare.namespace, LAST):
+            assert f"holds TCP {LAST}, which leads to the appliance" in isolation.obstacles()[0]
+        interfaces.add_route(node.namespace, "10.99.0.0/24", bare.address)
+        with node.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            one.sendto(b"?", (far.address, 9))
+        assert "`net.ipv4.ip_forward = 1` into /etc/sysctl.d" in isolation.obstacles()[0]
+        bare.namespace.sysctl("net.ipv4.ip_forward", "0")
+        assert isolation.forward_again() == (4,)
+        with serving(isolation.namespace, MASTER) as server:
+            assert source_seen(server, node, bare.address, MASTER) == node.address
 
 
 def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path) -> None:
