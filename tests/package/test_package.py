@@ -132,6 +132,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     denies_a_visitor(machine)
     machine.run("rosrv", "audit", "verify")
 
+    machine.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "rosrv")
     machine.run("dpkg", "--remove", "rosrv", seconds=SLOW_SECONDS)
     after = state_of(machine)
     assert {name: text for name, text in after.items() if text != before[name]} == {}
