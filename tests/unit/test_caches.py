@@ -166,7 +166,7 @@ BY_HAND = {
     "appliance/rpc/fair_queue.py::_taken": OPEN,
     "appliance/rpc/fair_queue.py::_taken_as": OPEN,
     "appliance/specifications/records.py::_going": TEXT,  # monitors and topics in force
-    "appliance/specifications/records.py::_known": "len(self._known) < _MAX else",
+    "appliance/specifications/records.py::_known": "known < 2 * _MAX else",
     "fleet/src/rosrv_fleet/bundles/repository.py::_signers": OURS_ONLY,
     "fleet/src/rosrv_fleet/connections.py::_owners": OPEN,
     "fleet/src/rosrv_fleet/indexer.py::_killed": OURS_ONLY,

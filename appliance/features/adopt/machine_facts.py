@@ -13,8 +13,8 @@ FIRST_PORT = 1024
 """The first port that is cut: smaller ones belong to the machine, whatever a node says."""
 
 STAND_IN_UNIT = "rosrv-left-master"
-_TRANSIENT = re.compile(rf".+\.scope|{STAND_IN_UNIT}\.service|run-(?:u?\d+|r[0-9a-f]+)\.service")
-"""Units without a file, of which a login, a release or `systemd-run` makes another one each time."""
+_TRANSIENT = re.compile(rf"{STAND_IN_UNIT}\.service|run-[ru]?[0-9a-f]{{1,40}}\.service")
+"""Units without a file, of which a release or `systemd-run` makes another one each time, as a login of scopes."""
 
 
 class RobotMaster(msgspec.Struct, frozen=True):
@@ -53,7 +53,7 @@ class MachineFacts(msgspec.Struct, frozen=True):
         adopted = record.wanted or record.phase is not Phase.FREE
         if found is None or not adopted or not record.program or found.pid == record.stand_in:
             return ""
-        lasts = record.unit and not _TRANSIENT.fullmatch(record.unit)
+        lasts = record.unit and not record.unit.endswith(".scope") and not _TRANSIENT.fullmatch(record.unit)
         same = found.unit == record.unit if lasts else found.program == record.program
         if same and found.user == record.user:
             return ""

@@ -1,7 +1,7 @@
 """Keep and record the connections and the traffic that the relays report."""
 
 from collections import Counter
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import zip_longest
 
@@ -91,24 +91,33 @@ class SeriesNames:
     def __init__(self, most: int) -> None:
         self._most = most
         self._hosts: dict[str, Address] = {}  # that got a name, by name
+        self._named: Counter[Address] = Counter()
+        self._present: Counter[str] = Counter()
+        self._ended: dict[str, None] = {}  # names without a present resource, the earliest first
         self.past: dict[str, Traffic] = {}
 
-    def name(self, resource: str, host: Address, present: Callable[[], Container[str]]) -> str:
-        if resource in self._hosts:
-            return resource
-        has_share = sum(one == host for one in self._hosts.values()) < self._most - self._most // 4
-        if not has_share or len(self._hosts) >= self._most:
-            still, owned = present(), self._hosts.items()
-            ended = next((one for one, of in owned if one not in still and (has_share or of == host)), None)
-            if ended is None:
-                return OTHERS
-            del self._hosts[ended]
-            self.end(OTHERS, self.past.pop(ended, Traffic()))
-        self._hosts[resource] = host
+    def name(self, resource: str, host: Address) -> str:
+        if resource not in self._hosts:
+            has_share = self._named[host] < self._most - self._most // 4
+            if not has_share or len(self._hosts) >= self._most:
+                ended = next((one for one in self._ended if has_share or self._hosts[one] == host), None)
+                if ended is None:
+                    return OTHERS
+                self._named[self._hosts.pop(ended)] -= 1
+                del self._ended[ended]
+                self.end(OTHERS, self.past.pop(ended))
+            self._hosts[resource] = host
+            self._named[host] += 1
+        self._present[resource] += 1
+        self._ended.pop(resource, None)
         return resource
 
     def end(self, name: str, traffic: Traffic) -> None:
         self.past.setdefault(name, Traffic()).include(traffic)
+        if name in self._hosts:
+            self._present[name] -= 1
+            if not self._present[name]:
+                self._ended[name] = None
 
 
 class RelayTraffic:
@@ -215,7 +224,7 @@ class RelayTraffic:
         for row in rows:
             if (node := self._registry.by_key(row.key)) is None:
                 continue
-            about = row.resource, node.host, lambda: {resource for _key, resource in self.traffic}
+            about = row.resource, node.host
             traffic = self.traffic.get((row.key, row.resource))
             if traffic is None:
                 traffic = self.traffic[row.key, row.resource] = Traffic(name=self.counted.name(*about))
