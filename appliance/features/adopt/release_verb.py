@@ -14,6 +14,7 @@ import structlog
 import typer
 
 from appliance.base.counted import counted
+from appliance.base.user_errors import with_remedy
 from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_here
@@ -312,7 +313,7 @@ def end_hold() -> None:
     try:
         hold.arm(None)
     except OSError as error:
-        raise NetworkError(f"the boot hold stays: {error}") from None
+        raise NetworkError(f"the boot hold stays: {with_remedy(error)}") from None
     hold.lift()
 
 

@@ -170,6 +170,22 @@ class Newcomers:
         self.members = dict.fromkeys(self.members, following)
 
 
+class Silence:
+    """The silence of a publication, if its host loses a right by it (`watched`)."""
+
+    def __init__(self) -> None:
+        self.watched = False
+        self._since = 0.0  # the time of the last report, or since when the publication has been open
+
+    def begin(self, now: float) -> None:
+        self._since = now
+
+    def take(self, now: float, *, is_open: bool) -> float:
+        """Return the seconds since the last report in which a message would have been heard."""
+        since, self._since = self._since, now
+        return now - since if self.watched and is_open else 0.0
+
+
 class Upstream:
     """The connection to the publisher, as its topic uses it. The methods of this base class do nothing."""
 
@@ -315,8 +331,7 @@ class RelayedTopic:
         self._superseded = False  # whether a guard's stop is the last message
         self._is_command = topic.endswith("/goal")  # no monitor can declare what stops an action
         self._rank: RankedPublication | None = None
-        self._kept = False
-        self._listened = 0.0  # the time of the last report, or since when it has been open
+        self._silence = Silence()
         self._newcomers = Newcomers()
 
     @property
@@ -396,14 +411,14 @@ class RelayedTopic:
 
     @property
     def _is_wanted(self) -> bool:
-        if self._kept or self._rank is not None:  # its motions count even without a subscriber
+        if self._silence.watched or self._rank is not None:  # its motions count even without a subscriber
             return True
         return bool(self._waiting or self._served or self._monitoring.wanted or self._taps)
 
     def keep_open(self, *, kept: bool) -> None:
         """Stay connected without a subscriber, and report silence, if `kept`."""
-        if kept != self._kept:
-            self._kept = kept
+        if kept != self._silence.watched:
+            self._silence.watched = kept
             if kept:
                 self.upstream.connect()
             self._spare_unwanted()
@@ -470,7 +485,8 @@ class RelayedTopic:
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
         self.latch.is_latching = header.get("latching", "0") == "1"
-        self._state, self._listened = TopicState.OPEN, self._clock()
+        self._state = TopicState.OPEN
+        self._silence.begin(self._clock())
         self._newcomers.reset()
         if self._rank is not None:
             self._rank.opened(header, self._clock())
@@ -481,7 +497,7 @@ class RelayedTopic:
         self._end_stream()
         if self._sink is not None:
             self._stream = self._sink.open(self.topic, self.host, header)
-        watched = self._monitoring.wanted or self._kept or self._rank is not None
+        watched = self._monitoring.wanted or self._silence.watched or self._rank is not None
         alone = watched and not (self.latch.is_latching or self._waiting or self._served)
         self._startup_replay.opened(self._clock(), alone=alone)
         if before is not None and _identity(before) != _identity(header):
@@ -710,8 +726,7 @@ class RelayedTopic:
         return self.delays.take(self.counters)
 
     def traffic(self) -> TopicTraffic | None:
-        before, self._listened = self._listened, self._clock()
-        silent = self._listened - before if self._kept and self._state is TopicState.OPEN else 0.0
+        silent = self._silence.take(self._clock(), is_open=self._state is TopicState.OPEN)
         if self._reported and not self.counters.messages and not self._served.dropped and not silent:
             return None
         messages, size, counts, seconds = self.counters.take()
