@@ -56,17 +56,13 @@ _PUBLIC = ("kty", "crv", "n", "e", "x", "y")
 
 @dataclass(frozen=True)
 class Expected:
-    """The values that an ID token must have; `skew` is in seconds.
-
-    `signed_in_after`: the person must have signed in at the provider since this time, in seconds since the epoch.
-    """
+    """The values that an ID token must have; `skew` is in seconds."""
 
     issuer: str
     client_id: str
     nonce: str
     algorithms: Sequence[str]
     skew: float
-    signed_in_after: float | None = None
 
 
 def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: float) -> dict[str, Any]:
@@ -101,19 +97,12 @@ def _check_rest(claims: dict[str, Any], expected: Expected, now: float) -> None:
         claims.get("azp", expected.client_id) != expected.client_id
     ):
         raise _refused("it was issued to another client (azp)")
-    for name in ("exp", "iat", "nbf", "auth_time"):
+    for name in ("exp", "iat", "nbf"):
         value = claims.get(name, 0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _LATEST:
             raise _refused(f"{name} is not a time")
     if now - claims["iat"] > _OLDEST_SECONDS + expected.skew:
         raise _refused(f"it was issued more than {_OLDEST_SECONDS:g} s ago{_CLOCKS}")
-    after = expected.signed_in_after
-    if after is not None and "auth_time" not in claims:
-        raise _refused(
-            f"{expected.issuer} does not confirm the new sign-in: let it put auth_time into the token"
-        )
-    if after is not None and claims["auth_time"] < int(after) - expected.skew:
-        raise _refused(f"{expected.issuer} did not let the person sign in again (auth_time){_CLOCKS}")
     subject = claims["sub"]
     if not 0 < len(subject) <= _LONGEST_SUBJECT:
         raise _refused("sub is not 1 to 255 characters")
@@ -195,7 +184,6 @@ class _Pending(NamedTuple):
     nonce: str
     verifier: str
     until: float
-    signed_in_after: float | None
 
 
 class SignOns:
@@ -211,8 +199,7 @@ class SignOns:
         endpoints = await self._provider.endpoints()
         state, nonce, verifier = (secrets.token_urlsafe(32) for _ in range(3))
         self._make_room(address)
-        since = clock.wall() if again else None
-        self._pending[state] = _Pending(keys, address, nonce, verifier, clock.now() + PENDING_SECONDS, since)
+        self._pending[state] = _Pending(keys, address, nonce, verifier, clock.now() + PENDING_SECONDS)
         asked = {
             "response_type": "code",
             "client_id": self._wanted.client_id,
@@ -222,7 +209,7 @@ class SignOns:
             "nonce": nonce,
             "code_challenge": _text(hashlib.sha256(verifier.encode()).digest()),
             "code_challenge_method": "S256",
-            **({"prompt": "login", "max_age": "0"} if again else {}),  # the latter requires `auth_time`
+            **({"prompt": "login"} if again else {}),
         }
         url = endpoints.authorization_endpoint
         return f"{url}{'&' if '?' in url else '?'}{urlencode(asked, quote_via=quote)}", state
@@ -253,7 +240,6 @@ class SignOns:
             pending.nonce,
             self._wanted.algorithms,
             self._wanted.clock_skew_seconds,
-            pending.signed_in_after,
         )
         now = clock.wall()
         return (

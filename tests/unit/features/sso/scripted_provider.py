@@ -111,9 +111,7 @@ class ScriptedProvider:
         challenge = part(hashlib.sha256(self.form["code_verifier"].encode()).digest())
         if challenge != self.asked["code_challenge"]:
             return ProviderAnswer(400, b'{"error": "invalid_grant"}')
-        confirmed = {"auth_time": int(clock.wall())} if "max_age" in self.asked else {}
-        payload = {"nonce": self.asked["nonce"], **confirmed, **self.payload}
-        signed = token(claims(**payload), self.key, self.header)
+        signed = token(claims(nonce=self.asked["nonce"], **self.payload), self.key, self.header)
         return ProviderAnswer(200, json.dumps({"id_token": signed}).encode())
 
     async def begin(self, address: str = "10.0.0.9", *, again: bool = False) -> str:

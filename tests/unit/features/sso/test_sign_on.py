@@ -34,30 +34,6 @@ async def test_a_person_is_identified_with_role_and_groups_of_doors() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ago", "refused"),
-    [
-        (0, ""), (59, ""), (62, "did not let the person sign in again"), (HOUR, "did not let the person sign in again"),
-        (None, "does not confirm the new sign-in"), ("now", "auth_time is not a time"),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("again", [True, False])
-async def test_a_new_sign_in_is_one_only_if_the_provider_confirms_it(
-    again: bool, ago: float | str | None, refused: str
-) -> None:
-    """A provider may ignore `prompt`, and sign the person in who is still signed in there."""
-    provider = ScriptedProvider()
-    state = await provider.begin(again=again)
-    assert ("max_age" in provider.asked) == again
-    provider.payload = {"auth_time": clock.wall() - ago if isinstance(ago, int | float) else ago}
-    if refused and (again or ago == "now"):
-        with pytest.raises(SignOnRefusedError, match=refused) as error:
-            await provider.sign_ons.finish(state, "code", "")
-        assert ago == "now" or ISSUER in str(error.value)
-    else:
-        await provider.sign_ons.finish(state, "code", "")
-
-
-@pytest.mark.parametrize(
     ("methods", "secret", "sent"),
     [(["client_secret_post"], "s", {"client_id", "client_secret"}), (["none"], None, {"client_id"})],
     ids=["in the form", "a public client"],
