@@ -325,7 +325,7 @@ def control_part(world: RobotWorld) -> AdoptPart:
     part = object.__new__(AdoptPart)
     part._operation, part._one, part._settled, part._facts = world.operation, asyncio.Lock(), False, None
     part._core, part._obstacle = cast(Core, MagicMock(trail=world.parts.records)), ""
-    part._save = lambda: None  # type: ignore[method-assign]
+    part._save = lambda: None  # type: ignore[method-assign]  # nothing is stored here
     return part
 
 
@@ -403,7 +403,7 @@ def test_an_ordered_end_between_two_registrations_loses_nothing(registrations: i
                 await asyncio.sleep(0.1)
             return await ask(method, *params, **more)
 
-        world.parts.ask = slow  # type: ignore[method-assign]
+        world.parts.ask = slow  # type: ignore[method-assign]  # the only way into a step
         await settle_once(part)
         await asyncio.wait(ends)
         require_given(world)
