@@ -61,7 +61,7 @@ def build_app(services: Services) -> FastAPI:
         return Response(text, headers=console.HEADERS, media_type="text/html")
 
     app.add_api_route("/v1/openapi.json", contract, include_in_schema=False)
-    app.add_api_route(PATH, page, methods=["GET", "HEAD"], include_in_schema=False)
+    app.add_api_route(PATH, page, include_in_schema=False)
     return app
 
 

@@ -31,6 +31,7 @@ from appliance.api.front.services import Services
 from appliance.api.front.websockets import WebSocketHandover
 from appliance.base import clock
 from appliance.base.background import run_always
+from appliance.base.head_requests import AnswersHead
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import ApiLink
@@ -103,7 +104,7 @@ class _Api:
             networks=map(ip_network, self._settings.api_networks),
         )
         handover = WebSocketHandover(self._control, self._doorkeeper, gate)
-        listener = Listener(gate, self._settings.api_limits, self._doorkeeper.quota_class, handover)
+        listener = Listener(AnswersHead(gate), self._settings.api_limits, self._doorkeeper.quota_class, handover)
         await self._given.wait()
         if self._socket is None:
             return

@@ -71,13 +71,12 @@ def routes(settings: Settings) -> APIRouter:
             raise ProblemError(404, "unknown-path", "the console has no such file")
         return _answer(request, found)
 
-    methods = ["GET", "HEAD"]
-    router.add_api_route(_PREFIX + "{name:path}", file, methods=methods)
+    router.add_api_route(_PREFIX + "{name:path}", file)
     for path in ("/", "/console", "/console/"):
-        router.add_api_route(path, index, methods=methods)
+        router.add_api_route(path, index)
     for view in views():
-        router.add_api_route(f"/console/{view}", index, methods=methods)
-        router.add_api_route(f"/console/{view}/{{rest:path}}", index, methods=methods)
+        router.add_api_route(f"/console/{view}", index)
+        router.add_api_route(f"/console/{view}/{{rest:path}}", index)
     return router
 
 

@@ -1,6 +1,6 @@
 """Report all REST calls to control, which records them; equal reads and rejections are folded.
 
-Changes (any call with a valid token except GET and HEAD) are never folded.
+Changes (any call with a valid token except GET) are never folded.
 """
 
 from collections import Counter
@@ -9,8 +9,7 @@ from collections.abc import Callable
 from appliance.channel.messages.api import RestCalled
 
 FOLD_SECONDS = 10.0
-_READS = frozenset({"GET", "HEAD"})
-_METHODS = _READS | {"POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+_METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _Kind = tuple[str, str, str, str, int, str]
 
 
@@ -38,7 +37,7 @@ class Journal:
         # A client may send invalid text (JSON's \ud800), which cannot be encoded for control.
         path, reason = _text(path), _text(reason)
         self.calls[method if method in _METHODS else "other", str(status)] += 1
-        if who and method not in _READS:
+        if who and method != "GET":
             self._tell(RestCalled(host, who, method, path, status, reason, duration_us, dry=dry))
             return
         kind = (host, who, method, path, status, reason)

@@ -41,7 +41,6 @@ PUBLIC = _OF_FEATURES | {
 BEARER = "rosrv.bearer"  # the key of the bearer in a request's scope
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
 _QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})  # queries with a body
-_LOOKS = frozenset({"GET", "HEAD"})
 _BODY_SECONDS = 30.0
 _LONGEST_ANONYMOUS_BODY = 1024  # bytes of a body without a token
 _LARGER = ": raise api_limits.body_bytes (appliance.yaml) and restart, or load it with rosrv on the appliance's machine"
@@ -158,7 +157,7 @@ class RequestGate:
         if renewal or path == "/v1/enrol" or path in _OF_FEATURES:
             limit, advice = _REQUEST_BODY, ""
         body = await _read(headers, receive, limit, advice)
-        if bearer is not None and scope["method"] not in _LOOKS:
+        if bearer is not None and scope["method"] != "GET":
             bearer = replace(bearer, asked=asked_of(scope, headers, body))
         return bearer, body
 

@@ -21,6 +21,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from appliance.base.atomic_files import write_whole
+from appliance.base.head_requests import AnswersHead
 from appliance.base.log_output import keep_from_blocking
 from appliance.signing.own_certificate import make_own_certificate
 from rosrv_fleet.access import PEER_CERTIFICATE, certificate_of, token_of
@@ -284,12 +285,14 @@ def serve(collector: Collector) -> None:
     listener = listen(*config.address, table)
     options: dict[str, Any] = {"log_config": None, "access_log": False, "server_header": False}
     settings = uvicorn.Config(
-        Door(
-            make_app(collector),
-            table,
-            collector.tokens,
-            CollectorNames([*config.names, *names_of(config.certificate)]),
-            tls.owner,
+        AnswersHead(
+            Door(
+                make_app(collector),
+                table,
+                collector.tokens,
+                CollectorNames([*config.names, *names_of(config.certificate)]),
+                tls.owner,
+            )
         ),
         loop="asyncio",  # the connections are counted by its sockets
         http=_protocol(config.limits.header_seconds, table, tls),

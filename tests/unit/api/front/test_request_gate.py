@@ -1,8 +1,14 @@
+import asyncio
 import re
+from collections.abc import AsyncIterator
+from functools import partial
 
 import httpx
 import pytest
+from starlette.responses import StreamingResponse
 
+from appliance.base.head_requests import AnswersHead
+from tests.support.asgi import requested
 from tests.support.asgi import sent as sent_to
 from tests.unit.api.routes.test_operation_routes import BY_HAND, routes, world
 
@@ -93,3 +99,25 @@ def test_probes_are_not_recorded() -> None:
     world().trail.records.clear()
     assert sent("GET", "/healthz", {}).status_code == 200
     assert world().trail.records == []
+
+
+@pytest.mark.parametrize("path", ["/v1/status", "/console", "/healthz", "/v1/openapi.json", "/v1/nothing"])
+def test_head_is_answered_like_get_without_the_body(path: str) -> None:
+    token = {"Authorization": f"Bearer {world().tokens.texts['viewer']}"}
+    whole, head = (
+        world().play(partial(sent_to, AnswersHead(world().gate), method, path, headers=token))
+        for method in ("GET", "HEAD")
+    )
+    assert whole.content
+    assert (head.status_code, head.headers, head.content) == (whole.status_code, whole.headers, b"")
+
+
+def test_head_of_an_answer_that_never_ends_ends() -> None:
+    async def endless() -> AsyncIterator[bytes]:
+        while True:
+            await asyncio.sleep(0)
+            yield b"a record\n"
+
+    app = AnswersHead(StreamingResponse(endless(), media_type="application/x-ndjson"))
+    head = requested(app, "HEAD", "/v1/audit/follow")
+    assert (head.status_code, head.content) == (200, b"")
