@@ -119,25 +119,29 @@ REMARKS = {
 """Remarks on first words. In braces are the keys of `_service`."""
 
 _STOPS = "stop halt freeze brake panic emergency estop e-stop emergency-stop pause"
-IN_GROUPS = {
-    "approval": ("list ls show approve grant accept allow", "approve", ""),
-    "config": (
+IN_GROUPS = (
+    ("approval", "list ls show approve grant accept allow", "approve", ""),
+    (
+        "config",
         "set edit reset",
         "config check",
         "Change appliance.yaml, and restart the appliance: {restart}.",
     ),
-    "drive": (_STOPS, "", "{estop}"),
-    "fleet": ("list ls status info show", "status", ""),
-    "guard": (_STOPS, "", "{estop}"),
-    "report": ("list show generate create print", "report interventions", ""),
-    "topic": ("pub publish", "", "This program sends no message: rostopic pub."),
-    "node": ("kill stop cleanup", "", "{kill}"),
-    "policy": (
+    ("drive", _STOPS, "", "{estop}"),
+    ("fleet", "list ls status info show", "status", ""),
+    ("guard", _STOPS, "", "{estop}"),
+    ("guard", "disable off deactivate shadow", "monitor disable", ""),
+    ("guard", "enable on activate", "guard enforce, monitor enable", ""),
+    ("report", "list show generate create print", "report interventions", ""),
+    ("topic", "pub publish", "", "This program sends no message: rostopic pub."),
+    ("node", "kill stop cleanup", "", "{kill}"),
+    (
+        "policy",
         "set edit deny revoke remove rm delete",
         "policy check, policy reload",
         "Edit the policy's file first.",
     ),
-}
+)
 """Words of a group that the synonyms do not give, with commands and a remark."""
 
 SYNONYMS = (
@@ -174,7 +178,7 @@ SYNONYMS = (
     "export save dump create collect",
     "verify check validate lint syntax",
     "join pair connect",
-    "leave disconnect quit remove disable",
+    "leave disconnect quit remove",
     "info hz bw delay type find rate",
 )
 """Words of one meaning; in a group, they mean those of them that the group has."""
@@ -229,9 +233,9 @@ def _meant(word: str, group: str, verbs: Verbs) -> _Meant:
 
 
 def _in_group(word: str, group: str, verbs: Verbs) -> _Meant | None:
-    words, commands, remark = IN_GROUPS.get(group, ("", "", ""))
-    if word in words.split():
-        return _said(commands, remark)
+    for name, words, commands, remark in IN_GROUPS:
+        if name == group and word in words.split():
+            return _said(commands, remark)
     same = {other for synonyms in SYNONYMS if word in synonyms.split() for other in synonyms.split()}
     if named := [f"{group} {name}" for name in verbs if name in same]:
         return named, ""
