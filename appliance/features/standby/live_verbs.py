@@ -19,7 +19,7 @@ from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
-from appliance.features.standby.summary import present_troubles
+from appliance.features.standby.summary import CHECKING, present_troubles
 from appliance.features.standby.view import answer_in_words, connection, lag_in_words
 from rosmop.tool.terminal import printable, say
 
@@ -50,6 +50,8 @@ class StandbyScreen:
         seen = lag_in_words(other) if state.role == "active" else connection(other)
         holder = f", {witness.holder or 'no appliance'} holds the lease" if not witness.refusal else ""
         grid.add_row("other appliance", f"{other.name} ({other.address}): {seen}")
+        if state.obstacle == CHECKING:
+            grid.add_row("standby", CHECKING)
         grid.add_row("witness", f"{witness.address}: {answer_in_words(witness)}{holder}")
         grid.add_row("robot's address", f"{state.fixed}, for the active appliance")
         if state.role == "active":

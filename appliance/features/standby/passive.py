@@ -53,7 +53,7 @@ from appliance.features.standby.replication import (
 )
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
-from appliance.features.standby.summary import UNCHECKED
+from appliance.features.standby.summary import CHECKING, CHECKS, UNCHECKED
 from appliance.features.standby.tunnels import StandbyTunnels
 from appliance.signing.request_signing import TokenKeys
 from appliance.specifications.compiler_link import SpecificationCompiler
@@ -98,15 +98,15 @@ class TakeoverCheck:
 
     def note_news(self) -> None:
         """Check again, because the policy or the specifications of the active appliance have changed."""
-        self.scarce = self.scarce or UNCHECKED
+        self.scarce = self.scarce or CHECKING
         self._news.set()
 
     async def run(self, changed: Callable[[], None]) -> None:
         while True:
             self._news.clear()
             obstacle = await self._find_obstacle()
-            scarce = "" if obstacle else self._find_scarce() or (UNCHECKED if self._news.is_set() else "")
-            if self.scarce == UNCHECKED or (obstacle, bool(scarce)) != (self.obstacle, bool(self.scarce)):
+            scarce = "" if obstacle else self._find_scarce() or (CHECKING if self._news.is_set() else "")
+            if self.scarce == CHECKING or (obstacle, bool(scarce)) != (self.obstacle, bool(self.scarce)):
                 self.scarce = scarce
                 if self.obstacle not in ("", UNCHECKED):
                     _log.info("the reason why this appliance cannot take over is gone", reason=self.obstacle)
@@ -424,7 +424,7 @@ class PassiveControl:
 
     async def hand_over(self) -> None:
         troubles = self.state().troubles
-        if troubles and self.obstacle != UNCHECKED and (self._connected or self.obstacle):
+        if troubles and self.obstacle not in CHECKS and (self._connected or self.obstacle):
             raise HandOverError(troubles[0])
         try:
             refusal = await self._receiver.want_switchover()

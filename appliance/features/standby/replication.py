@@ -31,7 +31,7 @@ from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_sender import ReplicationSender
-from appliance.features.standby.summary import UNCHECKED, takeover_obstacles
+from appliance.features.standby.summary import CHECKS, takeover_obstacles
 from appliance.features.standby.tunnels import StandbyTunnels
 from appliance.features.standby.witness.protocol import EXPIRY
 from appliance.store.writer_thread import Database, StoreError
@@ -368,10 +368,10 @@ class Replication:
             )
 
     def _is_checking(self) -> bool:
-        return self.sender.lag().obstacle == UNCHECKED
+        return self.sender.lag().obstacle in CHECKS
 
     def _require_no_trouble(self) -> None:
-        if troubles := self.state().troubles:
+        if troubles := self.state().troubles or [*filter(None, [self.sender.lag().obstacle])]:
             raise HandOverError(troubles[0])
 
     async def hand_over(self) -> None:

@@ -21,7 +21,15 @@ UNCHECKED = (
     "since its start or the last change of the policy or the monitors, it still checks whether it could serve, which"
     " takes some seconds: try again then"
 )
-"""The obstacle of a standby before its check ends, which takes as long as its specifications need."""
+"""The obstacle of a standby before its first check ends. Earlier versions report it after each change as well."""
+
+CHECKING = (
+    "it still checks the last change of the policy or the monitors, which takes some seconds; until then it takes over"
+    " only if the active appliance is away"
+)
+"""The obstacle of a standby that has passed a check before."""
+
+CHECKS = frozenset({UNCHECKED, CHECKING})
 
 MISFIT = "a change does not fit"
 """The beginning of a refusal of a standby whose tables are others, as those of an earlier version are."""
@@ -29,9 +37,10 @@ MISFIT = "a change does not fit"
 
 def takeover_obstacles(state: StandbyState, lease: str) -> list[str]:
     """Return why the standby could not take over now. `lease` is the judgement of the process `lease`, which notices
-    a silent appliance sooner.
+    a silent appliance sooner, but does not distinguish a standby that checks a change.
     """
-    return [trouble.text for trouble in standby_troubles(state)] or ([lease] if lease else [])
+    found = [trouble.text for trouble in standby_troubles(state)]
+    return found or ([lease] if lease and state.obstacle != CHECKING else [])
 
 
 def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Trouble]:
@@ -43,7 +52,7 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
             f" only {holder}; stop this appliance, then start it again"
         )
         yield Trouble("both-active", text)
-    if state.obstacle and (state.obstacle != UNCHECKED or seconds >= patience):
+    if state.obstacle and seconds >= {UNCHECKED: patience, CHECKING: PATIENCE_SECONDS}.get(state.obstacle, 0.0):
         yield _unready(state)
     if other.refusal and seconds >= patience:
         yield _refusing(state)
@@ -132,7 +141,7 @@ def _unready(state: StandbyState) -> Trouble:
     active = state.role == "active"
     name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
     text = f"the standby {name} ({address}) cannot take over: {state.obstacle}"
-    if state.obstacle == UNCHECKED:
+    if state.obstacle in CHECKS:
         return Trouble("standby-unchecked", text)
     text += f"; once this is corrected, {name} notices it within seconds"
     return Trouble("standby-unready", text)

@@ -8,7 +8,7 @@ from rich.console import Console
 from appliance.channel.alarms import open_alarms
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.live_verbs import standby_view
-from appliance.features.standby.summary import UNCHECKED, standby_troubles, takeover_obstacles
+from appliance.features.standby.summary import CHECKING, UNCHECKED, standby_troubles, takeover_obstacles
 from appliance.features.standby.view import samples_of
 from tests.support.answers import example
 from tests.unit.channel.test_alarms import changed
@@ -143,7 +143,20 @@ def test_a_lease_of_another_time_is_not_taken_for_two_active_appliances() -> Non
     assert trouble.kind == "witness-refuses"
 
 
+@pytest.mark.parametrize("of", [ACTIVE, STANDBY])
+def test_a_standby_that_checks_a_change_could_take_over(of: dict[str, Any]) -> None:
+    """It does so at once if the active appliance is away: only an order waits."""
+    checking = state(of, {"obstacle": CHECKING, "other": {"trouble_seconds": 59.0}})
+    assert takeover_obstacles(checking, "b could not serve after a takeover") == []
+    view, console = standby_view(checking), Console(width=400)
+    with console.capture() as shown:
+        console.print(view.screen)
+    assert (view.exit_status, CHECKING in shown.get()) == (0, True)
+    assert [*samples_of(checking)["rosrv_standby_can_take_over"]] == [((), True)]
+
+
+@pytest.mark.parametrize("obstacle", [UNCHECKED, CHECKING])
 @pytest.mark.parametrize(("seconds", "kinds"), [(59.0, []), (60.0, ["standby-unchecked"])])
-def test_a_check_that_never_ends_becomes_an_alarm(seconds: float, kinds: list[str]) -> None:
-    more = {"obstacle": UNCHECKED, "other": ACTIVE["other"] | {"trouble_seconds": seconds}}
+def test_a_check_that_never_ends_becomes_an_alarm(obstacle: str, seconds: float, kinds: list[str]) -> None:
+    more = {"obstacle": obstacle, "other": ACTIVE["other"] | {"trouble_seconds": seconds}}
     assert [alarm.kind for alarm in open_alarms(changed("standby", ACTIVE | more))] == kinds

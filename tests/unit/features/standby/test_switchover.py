@@ -15,7 +15,7 @@ from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.orders import ActiveAppliance
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.replication_sender import ReplicationLag
-from appliance.features.standby.summary import UNCHECKED
+from appliance.features.standby.summary import CHECKING, UNCHECKED
 from tests.unit.features.standby.parts import MEMBERSHIP, CountedDatabase
 
 pytestmark = pytest.mark.anyio
@@ -161,13 +161,17 @@ async def test_the_order_waits_until_the_standby_has_checked_a_change(active: Ac
     assert active.steps() == ["rehearse", "pause", "give up"]
 
 
+@pytest.mark.parametrize(
+    ("obstacle", "text"),
+    [(UNCHECKED, f"the standby b (10.0.0.3) cannot take over: {UNCHECKED}"), (CHECKING, CHECKING)],
+)
 @pytest.mark.parametrize("after", [0.0, 0.05])
-async def test_a_change_that_the_standby_still_checks_refuses_the_order(active: Active, after: float) -> None:
-    asyncio.get_running_loop().call_later(after, setattr, active, "obstacle", UNCHECKED)
+async def test_a_change_that_the_standby_still_checks_refuses_the_order(
+    active: Active, after: float, obstacle: str, text: str
+) -> None:
+    asyncio.get_running_loop().call_later(after, setattr, active, "obstacle", obstacle)
     asyncio.get_running_loop().call_later(CHECKED_SECONDS, active.report)  # the witness goes on answering
-    assert f"the standby b (10.0.0.3) cannot take over: {UNCHECKED}" in await active.refused(
-        CHECKED_SECONDS + 0.5
-    )
+    assert text in await active.refused(CHECKED_SECONDS + 0.5)
     assert active.steps() == ["rehearse"]
 
 

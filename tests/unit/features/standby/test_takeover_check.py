@@ -17,7 +17,7 @@ from appliance.channel import messages
 from appliance.configuration.settings import Audit, Settings
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.passive import TakeoverCheck
-from appliance.features.standby.summary import UNCHECKED
+from appliance.features.standby.summary import CHECKING, UNCHECKED
 from appliance.specifications.checking import contents_at_start
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import CheckedSpecifications, Sources
@@ -159,9 +159,9 @@ async def test_a_change_keeps_the_lease_from_it_until_a_check_that_began_later_h
         assert (await checked.next_obstacle(), checked.check.scarce) == ("", "")
         for _ in range(2):
             await checked.replicate()
-            assert (checked.check.obstacle, checked.check.scarce) == ("", UNCHECKED)
+            assert (checked.check.obstacle, checked.check.scarce) == ("", CHECKING)
             await begun.get()
-        for left in (UNCHECKED, ""):
+        for left in (CHECKING, ""):
             goes_on.release()
             assert (await checked.next_obstacle(), checked.check.scarce) == ("", left)
 
