@@ -5,7 +5,8 @@ A flooded or compromised api cannot block RVMaster:
 1. At most `_MAX_WAITING` requests wait; the rest are answered `busy` at once. Between two requests, the event loop
    serves nodes.
 2. Questions that wait for another process (`WaitingRequest`) and orders, which wait for the audit log and may wait for
-   relays or the compiler, do not delay other requests, at most `_MAX_SLOW`. An order beyond these is served in turn.
+   relays or the compiler, do not delay other requests, at most `_MAX_SLOW` of each, so that questions keep no order
+   waiting. An order beyond these is served in turn.
 3. The link ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
 5. A request needs a token whose role allows it, and a change also the client's own HTTP request, with a proof if the
@@ -15,7 +16,7 @@ A flooded or compromised api cannot block RVMaster:
 import asyncio
 import os
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 import structlog
@@ -141,7 +142,10 @@ class RestLink:
         self._waiting: deque[RequestMade] = deque()
         self._withdrawn: dict[int, bool] = {}  # unanswered requests of the present link, by number
         self._worker: asyncio.Task[None] | None = None  # the worker of the present link
-        self._slow: set[asyncio.Task[None]] = set()
+        self._slow: Mapping[bool, set[asyncio.Task[None]]] = {
+            True: set(),
+            False: set(),
+        }  # by whether it is an order
         self._workers: set[asyncio.Task[None]] = set()  # the workers of present and ended links
         self._served, self._certified = served, certified
 
@@ -193,21 +197,22 @@ class RestLink:
     async def _work(self, channel: Channel | None) -> None:
         while self._waiting and channel is self._link.channel:
             made = self._waiting.popleft()
-            in_turn = type(made.request) not in ORDERS or len(self._slow) >= _MAX_SLOW
-            if isinstance(made.request, WaitingRequest) or not in_turn:
-                self._begin(channel, made)
+            order = type(made.request) in ORDERS
+            running = self._slow[order]
+            if isinstance(made.request, WaitingRequest) or (order and len(running) < _MAX_SLOW):
+                self._begin(channel, made, running)
             else:
                 await self._serve(channel, made)
             await asyncio.sleep(0)
 
-    def _begin(self, channel: Channel | None, made: RequestMade) -> None:
-        if len(self._slow) >= _MAX_SLOW:
+    def _begin(self, channel: Channel | None, made: RequestMade, running: set[asyncio.Task[None]]) -> None:
+        if len(running) >= _MAX_SLOW:
             text = "too many long requests are running: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
             return
         task = asyncio.get_running_loop().create_task(self._serve(channel, made))
-        self._slow.add(task)
-        task.add_done_callback(self._slow.discard)
+        running.add(task)
+        task.add_done_callback(running.discard)
 
     async def _serve(self, channel: Channel | None, made: RequestMade) -> None:
         withdrawn = self._withdrawn
