@@ -76,7 +76,7 @@ def require_privileges(what: str) -> None:
 
 
 class Namespace:
-    """A namespace by its name, which may not exist; one that `create` made stays in use if its name is deleted."""
+    """A network namespace, found by its name. After `create`, it stays usable if that name is deleted."""
 
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):

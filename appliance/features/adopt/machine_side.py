@@ -302,7 +302,7 @@ class AdoptWork:
 def wanted_record(record: AdoptRecord, found: RobotMaster | None) -> AdoptRecord:
     """Return the record of a wanted adoption of the graph of `found`. Raises `NetworkError` without a master.
 
-    An adoption that is wanted already, or of the graph of a stand-in, keeps the master that was recorded.
+    The recorded master stays if an adoption is already wanted, or if a stand-in has the graph.
     """
     if record.wanted:
         return record

@@ -516,7 +516,7 @@ class RelayedTopic:
         return self.latch.is_lacking and not self._is_command
 
     def upstream_closed(self, *, repeats: bool = False) -> None:
-        """Note that the connection is lost. If the publisher `repeats` its message, keep the last one that passed."""
+        """Note a lost connection. Keep the last message that passed if the publisher `repeats` it when it returns."""
         if self._rank is not None:
             self._rank.closed(self._clock())
         self._end_stream()

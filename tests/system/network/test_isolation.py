@@ -248,7 +248,7 @@ def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> 
 
 
 def test_obstacles_that_appear_later_are_named(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
-    """A listener in the forwarded ports, a program that needs a router, and one that ends forwarding."""
+    """Obstacles: a listener in the forwarded ports, a program that routes, and a program that ends forwarding."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
     interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
     with isolated(bare, tmp_path) as isolation:
