@@ -49,9 +49,9 @@ GUESSES = """
     guard remove: guard rm
     monitor disable: guard off, guard disable, guard shadow
     monitor enable: guard on, guard enable
-    host add: join vpn enroll
+    host add: join vpn enroll register ipsec
     standby status: switch
-    standby switch: failover promote
+    standby switch: failover promote switchover failback
     drive status: lease control joystick
     alarm list: alerts warnings alarms
     alarm acknowledge: ack
@@ -63,13 +63,13 @@ GUESSES = """
     systemctl stop|docker compose stop|Ctrl-C: stop shutdown down kill
     systemctl restart|docker compose restart|Ctrl-C: restart reboot
     rosnode kill NODE: kill, node kill
-    stops no robot: estop halt freeze stop emergency-stop, drive stop, guard stop, guard pause, guard halt
+    stops no robot: stop-robot robot-stop robot_stop estop halt freeze stop emergency-stop, drive stop, guard stop, guard pause, guard halt
     tools of ROS: run launch pub exec call
     clears nothing: flush reset clear
     at boot|at each boot: enable disable
     -h: man
     rostopic pub: topic pub
-    -: exit-maintenance attach-console
+    -: exit-maintenance attach-console, token update, record clear, host clear
 """
 EFFECT = re.compile(r"`rosrv ([a-z][a-z -]*)")
 
