@@ -1,8 +1,9 @@
 """Limit the open connections of each robot, of each address, and in total.
 
-A connection counts from `accept` to `close`: for its address (in IPv6 its /64 network) until a robot's certificate is
-verified, then for the robot. Each robot that has come from an address adds to the address's limit, because its next
-connections wait there for their handshakes, perhaps beside those of many robots behind the same address.
+A connection counts from `accept` to `close`: for its address until a robot's certificate is verified, then for the
+robot. In IPv6 an address is a /64 network, and before it is proven its /48: one customer may have all of that. Each
+robot that has come from an address adds to the address's limit, because its next connections wait there for their
+handshakes, perhaps beside those of many robots behind the same address.
 
 An address is *proven* once a robot or an operator has connected from it. All unproven addresses together get at most
 half of the connections. When this half or the total is used up, the unproven address with the most connections loses
@@ -101,8 +102,8 @@ class ClientConnections:
         self._logged = 0.0
 
     def accepted(self, connection: "CountedSocket", address: str) -> bool:
-        owner = owner_of(address)
-        proven = owner in self._proven
+        connection.network = owner_of(address)
+        owner, proven = self._owner(connection.network)
         most = self._limits.address_connections
         most = max(most, min(most + _OF_EACH_ROBOT * len(self._proven.get(owner, ())), self._most // 2))
         if self._owners[owner] >= most:
@@ -134,8 +135,8 @@ class ClientConnections:
             connection.due.cancel()
         if robot is None:
             return True
-        self.prove(connection.owner)
-        self._proven[connection.owner].add(robot)
+        self.prove(connection.network)
+        self._proven[connection.network].add(robot)
         owner = f"robot {robot}"
         if self._owners[owner] >= self._limits.robot_connections:
             return self._refused(owner, self._limits.robot_connections)
@@ -144,18 +145,25 @@ class ClientConnections:
         connection.owner = owner
         return True
 
-    def prove(self, owner: str) -> None:
-        self._proven.setdefault(owner, set())
-        self._proven.move_to_end(owner)
+    def prove(self, network: str) -> None:
+        self._proven.setdefault(network, set())
+        self._proven.move_to_end(network)
         if len(self._proven) > _MAX_PROVEN:
             self._proven.popitem(last=False)
-        self._others_open -= len(self._others.pop(owner, ()))
+        others = self._others.get(_wide(network), {})
+        for number, one in [(number, one) for number, one in others.items() if one.network == network]:
+            self._forget(number, one)
 
-    def may_ask(self, owner: str) -> bool:
-        return self._requests.take(owner, proven=owner in self._proven)
+    def may_ask(self, network: str) -> bool:
+        owner, proven = self._owner(network)
+        return self._requests.take(owner, proven=proven)
 
-    def is_proven(self, owner: str) -> bool:
-        return owner in self._proven
+    def is_proven(self, network: str) -> bool:
+        return network in self._proven
+
+    def _owner(self, network: str) -> tuple[str, bool]:
+        proven = network in self._proven
+        return (network if proven else _wide(network)), proven
 
     def _made_room(self, owner: str, proven: bool) -> bool:
         """Close the oldest connection of the unproven address with the most.
@@ -201,7 +209,10 @@ class CountedSocket(socket.socket):
     """A connection that is counted until it is closed."""
 
     table: ClientConnections
+    network = ""
+    """The client's address, in IPv6 its /64 network."""
     owner = ""
+    """Whose connection it is: the network, a wider one until that is proven, or the robot."""
     due: asyncio.TimerHandle | None = None
 
     def close(self) -> None:
@@ -246,6 +257,10 @@ def owner_of(address: str) -> str:
     if isinstance(parsed, ipaddress.IPv6Address) and parsed.ipv4_mapped is None:
         return str(ipaddress.ip_network((parsed, 64), strict=False))
     return address
+
+
+def _wide(network: str) -> str:
+    return str(ipaddress.ip_network(network).supernet(new_prefix=48)) if ":" in network else network
 
 
 def permitted_connections(wanted: int) -> int:

@@ -92,6 +92,19 @@ async def test_room_is_made_by_the_address_with_most(table: ClientConnections) -
     assert table.established(late.fileno(), None)
 
 
+async def test_a_customer_with_many_networks_keeps_no_robot_out(table: ClientConnections) -> None:
+    """As after a start of the collector, when no address is proven yet."""
+    others = [one for number in range(250) for one in _opened(table, f"2001:db8:0:{number:x}::1")]
+    assert len(others) == 64
+    [robot] = _opened(table, "2001:db8:1::1")
+    assert table.established(robot.fileno(), "arm1")
+    table.prove(others[0].network)
+    assert len(_opened(table, "2001:db8::9", 70)) == 64
+    for one in others:
+        table.closed(one.fileno())
+    assert len(_opened(table, "2001:db8:0:9::1", 70)) == 64
+
+
 async def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
     for _ in range(3):
         opened = [one for number in range(3) for one in _opened(table, f"203.0.113.{number}", 60)]
@@ -120,6 +133,9 @@ async def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnec
     assert all(table.accepted(_Socket(), "10.0.0.1") for _ in range(60))
     let_time_pass(60)
     assert all(table.accepted(_Socket(), "203.0.113.1") for _ in range(32))
+    let_time_pass(60)
+    assert sum(table.accepted(_Socket(), f"2001:db8:0:{number:x}::1") for number in range(300)) == 32
+    assert table.accepted(_Socket(), "2001:db8:1::1")
     let_time_pass(60)
     once = (f"203.{number >> 8}.{number & 255}.1" for number in range(65_536))
     assert 10_900 <= sum(handshakes(1, *islice(once, 30)) for _ in range(50)) <= 11_000
