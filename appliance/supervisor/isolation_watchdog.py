@@ -203,9 +203,15 @@ class IsolationWatchdog:
         return messages.EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
+        """Check regularly. A failure may be a short one, and nodes are refused until a check passes: look again soon."""
+        again = _REMEMBER_SECONDS
+        pause = self._every
         while True:
-            await asyncio.sleep(self._every)
-            await self.look()
+            await asyncio.sleep(pause)
+            if await self.look() is None:
+                again, pause = _REMEMBER_SECONDS, self._every
+            else:
+                again, pause = min(2 * again, self._every), again
 
     async def watch(self) -> None:
         """Restore rules as soon as the kernel reports that they have changed."""
