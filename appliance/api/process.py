@@ -104,7 +104,9 @@ class _Api:
             networks=map(ip_network, self._settings.api_networks),
         )
         handover = WebSocketHandover(self._control, self._doorkeeper, gate)
-        listener = Listener(AnswersHead(gate), self._settings.api_limits, self._doorkeeper.quota_class, handover)
+        listener = Listener(
+            AnswersHead(gate), self._settings.api_limits, self._doorkeeper.quota_class, handover
+        )
         await self._given.wait()
         if self._socket is None:
             return

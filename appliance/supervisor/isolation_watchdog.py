@@ -203,9 +203,8 @@ class IsolationWatchdog:
         return messages.EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
-        """Check regularly. A failure may be a short one, and nodes are refused until a check passes: look again soon."""
-        again = _REMEMBER_SECONDS
-        pause = self._every
+        """Check regularly, and soon after a failure: it may be a short one, and refuses nodes until a check passes."""
+        again, pause = _REMEMBER_SECONDS, self._every
         while True:
             await asyncio.sleep(pause)
             if await self.look() is None:

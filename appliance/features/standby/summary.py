@@ -52,7 +52,9 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
             f" only {holder}; stop this appliance, then start it again"
         )
         yield Trouble("both-active", text)
-    if state.obstacle and seconds >= {UNCHECKED: patience, CHECKING: PATIENCE_SECONDS}.get(state.obstacle, 0.0):
+    if state.obstacle and seconds >= {UNCHECKED: patience, CHECKING: PATIENCE_SECONDS}.get(
+        state.obstacle, 0.0
+    ):
         yield _unready(state)
     if other.refusal and seconds >= patience:
         yield _refusing(state)

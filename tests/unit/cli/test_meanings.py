@@ -63,7 +63,8 @@ GUESSES = """
     systemctl stop|docker compose stop|Ctrl-C: stop shutdown down kill
     systemctl restart|docker compose restart|Ctrl-C: restart reboot
     rosnode kill NODE: kill, node kill
-    stops no robot: stop-robot robot-stop robot_stop estop halt freeze stop emergency-stop, drive stop, guard stop, guard pause, guard halt
+    stops no robot: stop-robot robot-stop robot_stop estop halt freeze stop emergency-stop
+    stops no robot: drive stop, guard stop, guard pause, guard halt
     tools of ROS: run launch pub exec call
     clears nothing: flush reset clear
     at boot|at each boot: enable disable
