@@ -240,6 +240,13 @@ class RobotWorld:
             self.tell_as_own_master()
         return node
 
+    def add_nodes(self) -> None:
+        self.add(
+            "/base", 4001, publishes=("/odom", "/rosout"), subscribes=("/cmd_vel",), services=("/reset",)
+        )
+        self.add("/teleop", 4002, publishes=("/cmd_vel", "/rosout"), subscribes=("/odom",))
+        self.add("/rviz", 4003, publishes=("/rosout",), subscribes=("/odom",))
+
     def tell_as_own_master(self) -> None:
         for node in self.robot.values():
             for topic in node.subscribes:
@@ -456,6 +463,10 @@ class RobotWorld:
                 self.begin()
                 settled = False
         raise AssertionError("it does not settle")
+
+    async def release(self) -> None:
+        self.record = msgspec.structs.replace(self.record, wanted=False)
+        await self.until_settled()
 
     def _is_owed(self) -> bool:
         return (self.record.phase is Phase.TAKEN) != self.record.wanted

@@ -8,17 +8,15 @@ import itertools
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-import msgspec
 import pytest
 
 from appliance.features.adopt.adopt_record import Phase
-from tests.support import autojump
-from tests.support.control_parts import ControlParts
 from tests.support.engines import KilledError
 from tests.support.examples import covering
 from tests.unit.features.adopt.robot_world import LINK, RobotNode, RobotWorld
 from tests.unit.features.adopt.test_takeover import GIVE, TAKE
 
+pytestmark = pytest.mark.anyio
 Act = Callable[[RobotWorld], Awaitable[None]]
 NUC = "192.168.50.2"
 
@@ -115,8 +113,7 @@ KINDS: tuple[Act, ...] = (
 
 
 async def released(world: RobotWorld) -> None:
-    world.record = msgspec.structs.replace(world.record, wanted=False)
-    await world.until_settled()
+    await world.release()
 
 
 async def restarted(world: RobotWorld) -> None:
@@ -164,29 +161,25 @@ KIND_OF, END_OF = named(KINDS), named(ENDS)
 
 
 @pytest.mark.parametrize(("kind", "goes_on"), [*covering(itertools.product(KIND_OF, END_OF))])
-def test_each_living_node_hears_and_no_registration_is_lost(kind: str, goes_on: str) -> None:
-    async def story() -> None:
-        world = RobotWorld(await ControlParts.begun())
-        world.resolved["nuc"] = [NUC]
-        world.add("/base", 4001, publishes=("/odom",), subscribes=("/cmd_vel",), services=("/reset",))
-        world.add("/teleop", 4002, publishes=("/cmd_vel",), subscribes=("/odom",))
-        world.add("/rviz", 4003, subscribes=("/odom", "/cmd_vel"))
-        world.add("/far", 4010, "http://nuc:4010/", publishes=("/scan",), subscribes=("/odom",))
-        world.add("/far_ears", 4011, "http://nuc:4011/", subscribes=("/scan", "/cmd_vel"))
-        await world.until_settled()
-        await KIND_OF[kind](world)
-        await world.parts.settle()
-        await END_OF[goes_on](world)
-        wakes_up(world)
-        await world.operation.settle(
-            await world.operation.facts(), settled=True
-        )  # as control does each minute
-        await world.parts.settle()
-        world.hear()
-        world.connect_all()
-        require_hearing(world)
-
-    autojump.run(story())
+async def test_each_living_node_hears_and_no_registration_is_lost(
+    bare: RobotWorld, kind: str, goes_on: str
+) -> None:
+    bare.resolved["nuc"] = [NUC]
+    bare.add("/base", 4001, publishes=("/odom",), subscribes=("/cmd_vel",), services=("/reset",))
+    bare.add("/teleop", 4002, publishes=("/cmd_vel",), subscribes=("/odom",))
+    bare.add("/rviz", 4003, subscribes=("/odom", "/cmd_vel"))
+    bare.add("/far", 4010, "http://nuc:4010/", publishes=("/scan",), subscribes=("/odom",))
+    bare.add("/far_ears", 4011, "http://nuc:4011/", subscribes=("/scan", "/cmd_vel"))
+    await bare.until_settled()
+    await KIND_OF[kind](bare)
+    await bare.parts.settle()
+    await END_OF[goes_on](bare)
+    wakes_up(bare)
+    await bare.operation.settle(await bare.operation.facts(), settled=True)  # as control does each minute
+    await bare.parts.settle()
+    bare.hear()
+    bare.connect_all()
+    require_hearing(bare)
 
 
 def wakes_up(world: RobotWorld) -> None:
