@@ -183,6 +183,12 @@ def run(main: Coroutine[Any, Any, _Result], *, most_jumps: int = _MAX_JUMPS) -> 
         return runner.run(main)
 
 
+def own_tasks() -> set["asyncio.Task[Any]"]:
+    """Return the tasks of the running loop, without those in which anyio runs a test and its fixtures."""
+    tasks = asyncio.all_tasks()
+    return {task for task in tasks if "TestRunner" not in getattr(task.get_coro(), "__qualname__", "")}
+
+
 @pytest.fixture
 def anyio_backend(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]]]:
     if may_depend_on_chance(request.node):

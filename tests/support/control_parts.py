@@ -36,6 +36,7 @@ from appliance.store.writer_thread import Database
 from roswire.parameter_tree import standing_at
 from roswire.uris import NodeUri, parse_node_uri
 from roswire.xmlrpc import Value, build_call, parse_response
+from tests.support.autojump import own_tasks
 from tests.support.core import FakeTrail
 from tests.support.idle import idle
 from tests.support.memory_channel import HeldChannel
@@ -306,16 +307,11 @@ async def no_own_call(asked: OwnCall) -> Any:
     raise AssertionError(f"a relay asks {asked}")
 
 
-def _runs_a_test(task: "asyncio.Task[Any]") -> bool:
-    """Whether anyio made the task, for a test whose fixture made the parts."""
-    return "TestRunner" in getattr(task.get_coro(), "__qualname__", "")
-
-
 class ControlParts(Control):
     """The connected parts. `reload(text)` puts another policy in force, and `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0, store: StateStore | None = None) -> None:
-        self._not_ours = asyncio.all_tasks()  # the test's own
+        self._not_ours = own_tasks()  # the test's own
         self.seen: list[Seen] = []
         self.full = False  # whether the relay reads nothing
         self.shut_out = False  # whether the robot's firewalls may refuse connections
@@ -432,7 +428,7 @@ class ControlParts(Control):
     async def settle(self) -> None:
         self.sinks.flush()
         self.liveness.look_at_watched()
-        while others := {task for task in asyncio.all_tasks() - self._not_ours if not _runs_a_test(task)}:
+        while others := own_tasks() - self._not_ours:
             await asyncio.wait(others, timeout=5.0)
             assert all(task.done() for task in others), "tasks are still running"
             self.sinks.flush()

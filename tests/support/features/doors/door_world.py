@@ -27,6 +27,7 @@ from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.node import NodeLimits, RosNode
 from roswire.node.network import NodeMemory
 from roswire.standard import standard_definitions
+from tests.support.autojump import own_tasks
 from tests.support.memory_network import MemoryNetwork, MemoryWriter
 from tests.support.scripted_master import MASTER, ScriptedMaster
 
@@ -189,7 +190,6 @@ class DoorWorld:
 @asynccontextmanager
 async def door_world() -> AsyncIterator[DoorWorld]:
     """Yield a door and its surroundings. At the end, no task of them may remain, and no memory may be held."""
-    before = asyncio.all_tasks()
     world = DoorWorld()
     await world.start()
     try:
@@ -201,6 +201,5 @@ async def door_world() -> AsyncIterator[DoorWorld]:
         for node in world.nodes:
             await node.close()
         await asyncio.sleep(1)
-        left = [task for task in asyncio.all_tasks() - before if not task.done()]
-        assert not left, left
+        assert not own_tasks()
         assert not any(memory.held for memory in world.memories)
