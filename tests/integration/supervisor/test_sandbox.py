@@ -53,16 +53,6 @@ MAY = {
     "bundles": (ROUTES, False, [True, False]),
     "recorder": (UNIX, False, [False, False]),
 }
-WITHOUT_PRIVILEGE = {
-    "ptrace",
-    "unshare",
-    "setns",
-    "keyctl",
-    "add_key",
-    "io_uring_setup",
-    "process_vm_readv",
-    "kcmp",
-}
 PROGRAMS = {"rosmaster", "rosout", "charon"}
 
 

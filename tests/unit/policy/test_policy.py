@@ -101,7 +101,9 @@ def test_reason_stays_short_and_keeps_the_place() -> None:
     host = "fd01:1111:2222:3333:4444:5555:6666:7777"
     for decision in (
         ask(policy, host, "write", name),
-        ask_parameter(policy, "::1", "/"),
+        policy.decide_parameter(
+            Request(ipaddress.ip_address("::1"), "/n", Category.WRITE, "/"), namespace=False
+        ),
         ask(policy, host, "write", name + "x"),
         ask(policy, host, "command", "x" * 900),
         ask(policy, host, "publish", "\x00" * 900),
@@ -170,13 +172,6 @@ def test_name_that_is_not_resolved_is_denied(name: str) -> None:
     assert not any(
         ask(policy, "10.0.0.1", category, name).allowed for category in ("node", "publish", "subscribe")
     )
-
-
-def ask_parameter(
-    policy: Policy, host: str, key: str, *, namespace: bool = False, verb: str = "write"
-) -> Decision:
-    request = Request(ipaddress.ip_address(host), "/n", Category(verb), key)
-    return policy.decide_parameter(request, namespace=namespace)
 
 
 def test_audit_only_allows_and_reports_would_deny() -> None:

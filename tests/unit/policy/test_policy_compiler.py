@@ -64,11 +64,6 @@ def errors_of(text: str) -> list[str]:
     return [f"{f.line}:{f.column}: {f.text}" for f in found]
 
 
-def warnings_of(text: str, **given: object) -> list[str]:
-    policy = compile_policy(text, file="p.ini", **given)  # type: ignore[arg-type]  # forwarded as given
-    return [f"{f.line}:{f.column}: {f.text}" for f in policy.warnings]
-
-
 def test_policy_of_the_shape_of_rosrvs_loads() -> None:
     policy = compile_policy(SAMPLE_OF_ROSRV, file="access-policy.cfg")
     assert policy.ports == range(19001, 20001)

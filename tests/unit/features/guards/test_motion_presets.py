@@ -151,9 +151,6 @@ def seen(guard: Guarded, ranges: list[float], at: int = 1, times: int = 20) -> i
     return at - 100
 
 
-STILL_LEGS = twist()
-
-
 @pytest.mark.parametrize("away", [0.4, -0.7, math.pi / 4, 2.0, -2.5, 3 * math.pi / 4])
 def test_a_base_retreats_from_a_near_wall_in_any_direction(away: float) -> None:
     """From the second scan on: the guard measures the way in the direction of the last command."""

@@ -18,10 +18,6 @@ def joy(*buttons: int) -> bytes:
     return message("sensor_msgs/Joy", buttons=list(buttons))
 
 
-def odometry(v: float = 0.0, w: float = 0.0) -> bytes:
-    return message("nav_msgs/Odometry", twist__twist__linear__x=v, twist__twist__angular__z=w)
-
-
 def scan(
     ranges: list[float], start: float = -1.5, step: float = 0.1, far: float = 10.0, low: float = 0.1
 ) -> bytes:

@@ -27,12 +27,6 @@ def button(on: bool) -> bytes:
     return message("std_msgs/Bool", data=on)
 
 
-def go(guard: Guarded, at: int) -> None:
-    """Release the button `/a`, and let the node `/a` stand."""
-    guard.tell("stop", button(False), at)
-    guard.drive(twist(), at)
-
-
 def reset(guard: Guarded, at: int, node: str = "/a") -> None:
     for on, when in ((False, at), (True, at + 100)):
         guard.tell("stop", button(False), when)
