@@ -1,6 +1,6 @@
 import asyncio
 import socket
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -56,67 +56,50 @@ class Bench:
         return channel, came
 
 
-async def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
+@pytest.fixture
+async def bench() -> AsyncIterator[Bench]:
     bench = Bench()
     assert await bench.heard.get() == Ready({"x": 1})
-    try:
-        async with asyncio.timeout(30):
-            await work(bench)
-    finally:
-        bench.child.close()
-        for channel in bench.open:
-            channel.close()
+    yield bench
+    bench.child.close()
+    for channel in bench.open:
+        channel.close()
 
 
-async def test_it_answers_pings_and_stops() -> None:
-    async def work(bench: Bench) -> None:
-        bench.lifeline.send(Ping(7))
-        assert await bench.heard.get() == Pong(7)
-        bench.lifeline.send(Stop())
-        await bench.child.ended.wait()
-        assert bench.child.stopped
-
-    await run(work)
+async def test_it_answers_pings_and_stops(bench: Bench) -> None:
+    bench.lifeline.send(Ping(7))
+    assert await bench.heard.get() == Pong(7)
+    bench.lifeline.send(Stop())
+    await bench.child.ended.wait()
+    assert bench.child.stopped
 
 
-async def test_a_failure_of_the_appliance_is_not_a_stop_by_order() -> None:
-    async def work(bench: Bench) -> None:
-        bench.lifeline.send(Stop(failed=True))
-        await bench.child.ended.wait()
-        assert not bench.child.stopped
-
-    await run(work)
+async def test_a_failure_of_the_appliance_is_not_a_stop_by_order(bench: Bench) -> None:
+    bench.lifeline.send(Stop(failed=True))
+    await bench.child.ended.wait()
+    assert not bench.child.stopped
 
 
-async def test_it_ends_with_its_supervisor() -> None:
-    async def work(bench: Bench) -> None:
-        bench.lifeline.close()
-        await bench.child.ended.wait()
-        assert not bench.child.stopped
-
-    await run(work)
+async def test_it_ends_with_its_supervisor(bench: Bench) -> None:
+    bench.lifeline.close()
+    await bench.child.ended.wait()
+    assert not bench.child.stopped
 
 
-async def test_a_new_link_replaces_the_old_one() -> None:
-    async def work(bench: Bench) -> None:
-        bench.child.tell(AuthorityStated(0, b""))
-        first, came_first = bench.link()
-        first.send(AuthorityRequest(1))
-        assert (await came_first.get()).number == 1
-        second, came_second = bench.link()
-        assert await came_first.get() is None
-        second.send(AuthorityRequest(2))
-        assert (await came_second.get()).number == 2
-        assert bench.links == 2
-        second.close()
-
-    await run(work)
+async def test_a_new_link_replaces_the_old_one(bench: Bench) -> None:
+    bench.child.tell(AuthorityStated(0, b""))
+    first, came_first = bench.link()
+    first.send(AuthorityRequest(1))
+    assert (await came_first.get()).number == 1
+    second, came_second = bench.link()
+    assert await came_first.get() is None
+    second.send(AuthorityRequest(2))
+    assert (await came_second.get()).number == 2
+    assert bench.links == 2
+    second.close()
 
 
-async def test_foreign_descriptors_are_closed() -> None:
-    async def work(bench: Bench) -> None:
-        _channel, came = bench.link("relay")
-        assert await came.get() is None
-        assert bench.links == 0
-
-    await run(work)
+async def test_foreign_descriptors_are_closed(bench: Bench) -> None:
+    _channel, came = bench.link("relay")
+    assert await came.get() is None
+    assert bench.links == 0

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
@@ -11,9 +11,9 @@ from appliance.master.endpoints.delivery import UnaskedCalls
 from appliance.master.graph.registry import Incarnation
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import Value
-from tests.support.autojump import run as run_alone
 from tests.support.incarnations import incarnation
 
+pytestmark = pytest.mark.anyio
 TAKEN: Value = [1, "", 0]
 FOREIGN: Value = [-1, "not subscribed", 0]
 
@@ -37,101 +37,79 @@ class Robot:
         return self.answer(node.name, call[0])
 
 
-def run(
-    robot: Robot, story: Callable[[UnaskedCalls[Incarnation, tuple[str, int]]], Awaitable[None]]
-) -> Robot:
-    async def whole() -> None:
-        await story(UnaskedCalls(robot.call))
-
-    run_alone(whole())
-    return robot
-
-
-def test_a_node_gets_the_newest_value_of_a_key_that_changes_without_a_pause() -> None:
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for number in range(1000):
-            calls.push(incarnation("/cpp"), "/speed", ("/speed", number))
-            await asyncio.sleep(0.005)
-        await asyncio.sleep(1)
-
-    robot = run(Robot(), story)
+async def test_a_node_gets_the_newest_value_of_a_key_that_changes_without_a_pause() -> None:
+    robot = Robot()
+    calls = UnaskedCalls(robot.call)
+    for number in range(1000):
+        calls.push(incarnation("/cpp"), "/speed", ("/speed", number))
+        await asyncio.sleep(0.005)
+    await asyncio.sleep(1)
     assert robot.got[-1] == ("/cpp", "/speed", 999)
     assert len(robot.got) < 40
 
 
-def test_a_key_to_which_a_node_did_not_subscribe_is_sent_once() -> None:
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for number in range(10):
-            calls.push(incarnation("/py"), "/a/b", ("/a/b", number))
-            await asyncio.sleep(1)
+async def test_a_key_to_which_a_node_did_not_subscribe_is_sent_once() -> None:
+    robot = Robot(lambda _node, _key: FOREIGN)
+    calls = UnaskedCalls(robot.call)
+    for number in range(10):
+        calls.push(incarnation("/py"), "/a/b", ("/a/b", number))
+        await asyncio.sleep(1)
+    assert robot.got == [("/py", "/a/b", 0)]
 
-    assert run(Robot(lambda _node, _key: FOREIGN), story).got == [("/py", "/a/b", 0)]
 
-
-def test_a_key_is_sent_again_after_its_namespace_was_taken() -> None:
+async def test_a_key_is_sent_again_after_its_namespace_was_taken() -> None:
     """rospy knows a new part of a namespace only with the namespace."""
-
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for key in ("/a/b", "/a", "/a/b"):
-            calls.push(incarnation("/py"), key, (key, 1))
-            await asyncio.sleep(1)
-
-    keys = [
-        key for _node, key, _n in run(Robot(lambda _n, key: TAKEN if key == "/a" else FOREIGN), story).got
-    ]
+    robot = Robot(lambda _n, key: TAKEN if key == "/a" else FOREIGN)
+    calls = UnaskedCalls(robot.call)
+    for key in ("/a/b", "/a", "/a/b"):
+        calls.push(incarnation("/py"), key, (key, 1))
+        await asyncio.sleep(1)
+    keys = [key for _node, key, _n in robot.got]
     assert keys == ["/a/b", "/a", "/a/b"]
 
 
 @pytest.mark.parametrize("others", [1, 50])
-def test_nodes_that_never_answer_get_nothing_more_and_others_do(others: int) -> None:
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for number in range(600):
-            for name in ("/js", *(f"/cpp{one}" for one in range(others))):
-                calls.push(incarnation(name), "/speed", ("/speed", number))
-            await asyncio.sleep(0.1)
-        await asyncio.sleep(5)
-
-    robot = run(Robot(silent={"/js"}), story)
+async def test_nodes_that_never_answer_get_nothing_more_and_others_do(others: int) -> None:
+    robot = Robot(silent={"/js"})
+    calls = UnaskedCalls(robot.call)
+    for number in range(600):
+        for name in ("/js", *(f"/cpp{one}" for one in range(others))):
+            calls.push(incarnation(name), "/speed", ("/speed", number))
+        await asyncio.sleep(0.1)
+    await asyncio.sleep(5)
     assert robot.tried["/js"] == 5
     last = {name: number for name, _key, number in robot.got}
     assert last == {f"/cpp{one}": 599 for one in range(others)}
 
 
-def test_a_node_that_hangs_for_some_seconds_gets_the_newest_value_afterwards() -> None:
+async def test_a_node_that_hangs_for_some_seconds_gets_the_newest_value_afterwards() -> None:
     robot = Robot(silent={"/cpp"})
-
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for number in range(8):
-            calls.push(incarnation("/cpp"), "/speed", ("/speed", number))
-            await asyncio.sleep(1)
-        robot.silent.clear()
-        await asyncio.sleep(5)
-
-    assert run(robot, story).got == [("/cpp", "/speed", 7)]
-
-
-def test_nothing_is_sent_after_the_end() -> None:
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for number in range(3):
-            calls.push(incarnation(f"/{number}"), "/speed", ("/speed", number))
-        calls.drop(incarnation("/0"))
-        calls.clear()
-        await asyncio.sleep(10)
-
-    assert run(Robot(), story).got == []
-
-
-def test_nodes_of_a_host_that_never_answer_delay_no_node_of_another() -> None:
-    got: list[str] = []
-
-    async def story(calls: UnaskedCalls[Incarnation, tuple[str, int]]) -> None:
-        for number in range(500):
-            calls.push(incarnation(f"/a{number}", host="10.0.0.66"), "/speed", ("/speed", 1))
-        calls.push(incarnation("/base"), "/speed", ("/speed", 1))
+    calls = UnaskedCalls(robot.call)
+    for number in range(8):
+        calls.push(incarnation("/cpp"), "/speed", ("/speed", number))
         await asyncio.sleep(1)
-        got.extend(name for name, *_value in robot.got)
-        calls.clear()
+    robot.silent.clear()
+    await asyncio.sleep(5)
+    assert robot.got == [("/cpp", "/speed", 7)]
 
+
+async def test_nothing_is_sent_after_the_end() -> None:
+    robot = Robot()
+    calls = UnaskedCalls(robot.call)
+    for number in range(3):
+        calls.push(incarnation(f"/{number}"), "/speed", ("/speed", number))
+    calls.drop(incarnation("/0"))
+    calls.clear()
+    await asyncio.sleep(10)
+    assert robot.got == []
+
+
+async def test_nodes_of_a_host_that_never_answer_delay_no_node_of_another() -> None:
     robot = Robot(silent={f"/a{number}" for number in range(500)})
-    run(robot, story)
-    assert got == ["/base"]
+    calls = UnaskedCalls(robot.call)
+    for number in range(500):
+        calls.push(incarnation(f"/a{number}", host="10.0.0.66"), "/speed", ("/speed", 1))
+    calls.push(incarnation("/base"), "/speed", ("/speed", 1))
+    await asyncio.sleep(1)
+    assert [name for name, *_value in robot.got] == ["/base"]
+    calls.clear()
