@@ -3,7 +3,10 @@ from collections.abc import Iterator
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.requirements import need_program, need_root
+from tests.support.adopted_robot import POLICY
+from tests.support.appliance import Appliance
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_program, need_root, needs
 
 
 @pytest.fixture
@@ -27,3 +30,20 @@ def robot(lab: Lab) -> Host:
 @pytest.fixture
 def attacker(lab: Lab) -> Host:
     return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
+
+
+@pytest.fixture
+def host(lab: Lab) -> Host:
+    """Return the computer of a robot that is adopted."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    return lab.host("robot", "10.77.0.10/24")
+
+
+@pytest.fixture
+def appliance(host: Host) -> Iterator[Appliance]:
+    appliance = Appliance(host, isolation="netns", policy=POLICY)
+    try:
+        yield appliance
+    finally:
+        appliance.stop()
+        appliance.close()

@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 from appliance.network.listening_sockets import tcp_sockets
-from examples.landshark.lab import Lab
-from tests.support.adopted_robot import POLICY, URI, Robot, crash, rosrv, until_taken
+from examples.landshark.lab import Host, Lab
+from tests.support.adopted_robot import URI, Robot, crash, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.rosmaster import PlainMaster, call_on
 from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
@@ -26,9 +25,7 @@ _RATE = 50
 
 
 @pytest.fixture
-def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    host = lab.host("robot", "10.77.0.10/24")
+def robot(host: Host, tmp_path: Path) -> Iterator[Robot]:
     with PlainMaster(tmp_path, host), RosSession("http://localhost:11311", tmp_path, host) as ros:
         for client in ("rospy", "roscpp"):
             ros.talker(client, f"/{client}", "--rate", str(_RATE), name=f"{client}_talker")
@@ -47,16 +44,6 @@ def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
             for kept in ("", "p")
         }  # fmt: skip
         yield Robot(host, ros, listeners, callers)
-
-
-@pytest.fixture
-def appliance(robot: Robot) -> Iterator[Appliance]:
-    appliance = Appliance(robot.host, isolation="netns", policy=POLICY)
-    try:
-        yield appliance
-    finally:
-        appliance.stop()
-        appliance.close()
 
 
 @pytest.mark.nightly

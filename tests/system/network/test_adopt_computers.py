@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from examples.landshark.lab import Lab
-from tests.support.adopted_robot import POLICY, Robot, crash, rosrv, until_taken
+from examples.landshark.lab import Host, Lab
+from tests.support.adopted_robot import Robot, crash, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import Client, RosSession
 from tests.support.processes import LIMIT
-from tests.support.requirements import needs
 from tests.support.rosmaster import PlainMaster
 
 CLIENTS: tuple[Client, Client] = ("rospy", "roscpp")
@@ -24,24 +23,13 @@ pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
 
 
 @pytest.fixture
-def computers(lab: Lab, tmp_path: Path) -> Iterator[dict[str, Robot]]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    robot, nuc = lab.host("robot", "10.77.0.10/24"), lab.host("nuc", "10.77.0.11/24")
+def computers(lab: Lab, host: Host, tmp_path: Path) -> Iterator[dict[str, Robot]]:
+    nuc = lab.host("nuc", "10.77.0.11/24")
     with (
-        RosSession("http://localhost:11311", tmp_path, robot) as here,
-        RosSession(f"http://{robot.address}:11311", tmp_path, nuc) as there,
+        RosSession("http://localhost:11311", tmp_path, host) as here,
+        RosSession(f"http://{host.address}:11311", tmp_path, nuc) as there,
     ):
-        yield {"robot": Robot(robot, here, {}, {}), "nuc": Robot(nuc, there, {}, {})}
-
-
-@pytest.fixture
-def appliance(computers: dict[str, Robot]) -> Iterator[Appliance]:
-    appliance = Appliance(computers["robot"].host, isolation="netns", policy=POLICY)
-    try:
-        yield appliance
-    finally:
-        appliance.stop()
-        appliance.close()
+        yield {"robot": Robot(host, here, {}, {}), "nuc": Robot(nuc, there, {}, {})}
 
 
 def boot(computers: dict[str, Robot], name: str) -> None:

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, Robot, adoption, rosrv, until_taken
+from examples.landshark.lab import Host
+from tests.support.adopted_robot import Robot, adoption, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
-from tests.support.requirements import needs
 from tests.support.rosmaster import PlainMaster
 from tests.support.waiting import eventually
 from tests.system.network.test_adopt_nodes import (
@@ -53,12 +52,6 @@ pytestmark = [pytest.mark.nightly, pytest.mark.timeout(7200)]
 
 
 @pytest.fixture
-def host(lab: Lab) -> Host:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    return lab.host("robot", "10.77.0.10/24")
-
-
-@pytest.fixture
 def zoo(host: Host, tmp_path: Path) -> Iterator[Zoo]:
     with PlainMaster(tmp_path, host), RosSession("http://localhost:11311", tmp_path, host) as ros:
         for client in CLIENTS:
@@ -73,16 +66,6 @@ def zoo(host: Host, tmp_path: Path) -> Iterator[Zoo]:
         for add in (add_nodelets, add_bonds, add_goals, add_recording):
             add(zoo)
         yield zoo
-
-
-@pytest.fixture
-def appliance(host: Host) -> Iterator[Appliance]:
-    appliance = Appliance(host, isolation="netns", policy=POLICY)
-    try:
-        yield appliance
-    finally:
-        appliance.stop()
-        appliance.close()
 
 
 def rows(graph: list[list[tuple[str, list[str]]]]) -> set[tuple[int, str, str]]:

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, URI, Robot, rosrv, until_taken
+from tests.support.adopted_robot import URI, Robot, rosrv, until_taken
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros, nodelet_library, numbers
+from tests.support.nodes import Client, RosSession, nodelet_library, numbers
 from tests.support.processes import Process
 from tests.support.requirements import need_program, needs
 from tests.support.rosmaster import PlainMaster, call_on
@@ -193,12 +193,6 @@ GROUPS: dict[str, tuple[Callable[[Zoo], None], ...]] = {
 
 
 @pytest.fixture
-def host(lab: Lab) -> Host:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    return lab.host("robot", "10.77.0.10/24")
-
-
-@pytest.fixture
 def zoo(request: pytest.FixtureRequest, host: Host, tmp_path: Path) -> Iterator[Zoo]:
     with PlainMaster(tmp_path, host), RosSession("http://localhost:11311", tmp_path, host) as ros:
         for client in CLIENTS:
@@ -209,16 +203,6 @@ def zoo(request: pytest.FixtureRequest, host: Host, tmp_path: Path) -> Iterator[
         for add in GROUPS[request.param]:
             add(zoo)
         yield zoo
-
-
-@pytest.fixture
-def appliance(host: Host) -> Iterator[Appliance]:
-    appliance = Appliance(host, isolation="netns", policy=POLICY)
-    try:
-        yield appliance
-    finally:
-        appliance.stop()
-        appliance.close()
 
 
 def recorded(bag: Path) -> dict[str, tuple[int, int, float]]:

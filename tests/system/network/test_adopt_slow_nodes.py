@@ -4,39 +4,21 @@ import itertools
 import json
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, Robot, crash, rosrv, until_taken
+from examples.landshark.lab import Host
+from tests.support.adopted_robot import Robot, crash, rosrv, until_taken
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros, numbers
+from tests.support.nodes import Client, RosSession, numbers
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.rosmaster import PlainMaster
 from tests.support.waiting import eventually
 
 CHANGES = int(os.environ.get("ROSRV_CLOCK_CHANGES", "6"))
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1800)]
-
-
-@pytest.fixture
-def host(lab: Lab) -> Host:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    return lab.host("robot", "10.77.0.10/24")
-
-
-@pytest.fixture
-def appliance(host: Host) -> Iterator[Appliance]:
-    appliance = Appliance(host, isolation="netns", policy=POLICY)
-    try:
-        yield appliance
-    finally:
-        appliance.stop()
-        appliance.close()
 
 
 def test_time_never_goes_back_in_a_node_that_lags_behind(

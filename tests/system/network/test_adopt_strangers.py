@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.adopted_robot import POLICY, Robot, adoption, rosrv, until_taken
+from tests.support.adopted_robot import Robot, adoption, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, has_ros
@@ -87,16 +87,6 @@ def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
             for service in ("rospy", "roscpp")
         }
         yield Robot(host, ros, listeners, callers)
-
-
-@pytest.fixture
-def appliance(robot: Robot) -> Iterator[Appliance]:
-    appliance = Appliance(robot.host, isolation="netns", policy=POLICY)
-    try:
-        yield appliance
-    finally:
-        appliance.stop()
-        appliance.close()
 
 
 @contextmanager
