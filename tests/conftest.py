@@ -9,9 +9,9 @@ from hypothesis import settings
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.examples import examples
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import ThisMachine
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import need_root
 from tests.support.site import Masters, Site
 
 _LONGEST_STORY = 40_000  # characters; of a flood there are many more
@@ -53,7 +53,7 @@ def robot(lab: Lab) -> Host:
 
 @pytest.fixture(scope="session")
 def masters(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Masters]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with contextlib.closing(Masters(tmp_path_factory.mktemp)) as masters:
         yield masters
 
@@ -74,7 +74,7 @@ def site(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
 
 @pytest.fixture
 def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     robot = None if isinstance(appliance.host, ThisMachine) else request.getfixturevalue("common_robot")
     with RosSession(appliance.master_uri, tmp_path, robot) as session:
         yield session

@@ -9,8 +9,7 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.rosmaster import call_on
 
 POLICY = """\
@@ -36,7 +35,7 @@ shutdown = first
 
 @pytest.fixture(scope="module")
 def appliance(common_lab: Lab) -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host = common_lab.host("appliance", "10.77.0.2/24")
     with Appliance(host, policy=POLICY, options=("--api", "off")) as running:
         yield running

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.rest import Rest
 from tests.support.waiting import eventually
 
@@ -29,7 +28,7 @@ publishes() { event e(std::string text) /f std_msgs/String '{data:text}' {
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     settings = (
         "recorder: {enabled: true, memory: 16MiB, before: 5, after: 1, longest: 8, disk: 512MiB,"
         " triggers: [drop, change, verdict, fault]}\naudit: {reserve_bytes: 1MiB}\n"

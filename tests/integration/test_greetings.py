@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 
 MONITOR = """
 begin seen() {
@@ -20,7 +19,7 @@ DISPLAYS = 20
 
 @pytest.mark.parametrize("monitors", [{}, {"seen": MONITOR}], ids=["plain", "monitored"])
 def test_each_display_gets_the_map(tmp_path: Path, monitors: dict[str, str]) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Appliance(monitors=monitors) as appliance, RosSession(appliance.master_uri, tmp_path) as ros:
         greeter = ros.node("rospy", "greeter", "/map", name="greeter")
         bag = tmp_path / "all.bag"

@@ -4,8 +4,8 @@ import pytest
 
 from examples.landshark.lab import Lab
 from examples.landshark.stage import MASTER_URI, Actor, Stage
-from tests.support.nodes import ROOT, has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import ROOT, need_ros
+from tests.support.requirements import need_root
 from tests.support.rosmaster import PlainMaster
 
 ATTACKS = [  # attacks that end a node come after attacks that need it
@@ -26,7 +26,7 @@ ATTACKS = [  # attacks that end a node come after attacks that need it
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     home = tmp_path_factory.mktemp("master")
     with (
         Lab("rosrv-test") as lab,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.nodes import ROOT, has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import ROOT, need_ros
+from tests.support.requirements import need_root
 from tests.support.waiting import eventually
 
 NODES = 4
@@ -27,7 +27,7 @@ def folder() -> Iterator[Path]:
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_an_interrupted_launch_leaves_no_process_and_no_file(ending: signal.Signals, folder: Path) -> None:
     need_root()
-    needs(has_ros(), "roslaunch and g++ (scripts/setup)")
+    need_ros()
     command = [sys.executable, "-m", "benchmarks.launch", "--nodes", str(NODES), "--rounds", "50"]
     launch = subprocess.Popen(
         command, cwd=ROOT, env=os.environ | {"TMPDIR": str(folder)}, stderr=subprocess.PIPE

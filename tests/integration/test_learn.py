@@ -2,8 +2,7 @@ import xmlrpc.client
 from pathlib import Path
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 
 TRIAL = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n[Services]\n[Clients]\n[Parameters]\n"
 TRIAL += "[Options]\naudit-only = all\n"
@@ -24,7 +23,7 @@ def run_nodes(appliance: Appliance, home: Path) -> None:
 
 
 def test_the_same_robot_works_under_the_learned_policy(tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Appliance(policy=TRIAL) as appliance:
         run_nodes(appliance, tmp_path / "first")
         learned = tmp_path / "learned.ini"

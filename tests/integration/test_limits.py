@@ -6,9 +6,9 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
+from tests.support.nodes import Client, RosSession, need_ros, numbers, without_gap
 from tests.support.processes import Host, Process
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import need_root
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -27,7 +27,7 @@ LIMITED = (
 @pytest.fixture(scope="module")
 def lab() -> Iterator[Lab]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-limits") as lab:
         yield lab
 

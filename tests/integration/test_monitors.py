@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
-from tests.support.requirements import needs
+from tests.support.nodes import Client, RosSession, need_ros, numbers, without_gap
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -29,7 +28,7 @@ begin words() {
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     policy, options = OPEN_POLICY + "getRVState = *\n", ("--api", "127.0.0.1:0")
     with Appliance(policy=policy, monitors={"words": WORDS}, options=options) as appliance:
         yield appliance
@@ -305,7 +304,7 @@ def test_requests_are_refused_and_responses_changed(
 
 
 def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     divide = 'if (text.find("9") != std::string::npos) { int zero = 0; zero = 1 / zero; }\n        text = '
     monitors = {"words": WORDS.replace("text = ", divide, 1)}
     settings = "publish_as: /guard\nhide_publisher: true\non_fault: pass\n"

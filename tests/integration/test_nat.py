@@ -12,8 +12,8 @@ from appliance.channel.admin import GraphWanted
 from appliance.network import interfaces
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import Client, RosSession, need_ros
+from tests.support.requirements import need_root
 from tests.support.rosmaster import call_on
 from tests.support.translators import TRANSLATORS, guest_behind, load
 from tests.support.waiting import eventually
@@ -28,7 +28,7 @@ DROP += "add rule inet wall in ip saddr 10.77.0.2 tcp flags & (syn | ack) == syn
 @pytest.fixture(scope="module", params=["refuses", "drops"])
 def laptop(request: pytest.FixtureRequest) -> Iterator[tuple[Lab, Host]]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-test") as lab:
         laptop, guest = lab.host("laptop", f"{NAT}/24"), lab.host("guest", "10.76.0.2/24")
         interfaces.delete_link(guest.namespace, "eth0")

@@ -14,9 +14,8 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.rosmaster import call_on
 from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
@@ -116,7 +115,7 @@ RIGHTS: dict[str, Orders] = {
 
 @pytest.fixture(scope="module")
 def site(common_lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host, robot, guest = (
         common_lab.host(name, f"{address}/24")
         for name, address in (("appliance", "10.77.0.2"), ("robot", ROBOT), ("guest", GUEST))

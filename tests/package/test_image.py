@@ -19,8 +19,7 @@ from distribution.checkout import ROOT
 from examples.landshark.lab import Lab
 from tests.package.conftest import LATER, build_later, elsewhere
 from tests.support.docker import BASE, Engine, MachineInside, builder
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 
 pytestmark = pytest.mark.timeout(1800)  # the image is built
 NAME = f"rosrv/appliance:{__version__}"
@@ -175,7 +174,7 @@ def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
 
 
 def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 (run `make setup`)")
+    need_ros()
     with Lab("rosrv-site") as lab:
         machine = lab.host("machine", "10.79.0.1/24")
         with Engine(machine, data=tmp_path / "docker") as engine:

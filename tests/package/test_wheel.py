@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from appliance import __version__
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_program, need_root
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.timeout(600)
@@ -76,7 +76,7 @@ def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) 
 
 def test_its_demonstration_works(rosrv: Path, tmp_path: Path) -> None:
     need_root()
-    needs(has_ros(), "ROS 1 (run `make setup`)")
+    need_ros()
     done = run(rosrv, "demo", "--json", "--output", str(tmp_path / "way.svg"), folder=tmp_path, seconds=280)
     assert done.returncode == 0, done.stdout + done.stderr
     assert all(row["good"] for row in map(json.loads, done.stdout.splitlines()))

@@ -19,6 +19,7 @@ from typing import Literal, Self
 
 from tests.support import forks
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
+from tests.support.requirements import needs
 
 Client = Literal["rospy", "roscpp"]
 PYTHON = forks.PYTHON
@@ -213,5 +214,6 @@ def nodelet_library(prefix: Path) -> dict[str, str]:
     return {"AMENT_PREFIX_PATH": str(prefix), "ROS_PACKAGE_PATH": f"{share}:/usr/share"}
 
 
-def has_ros() -> bool:
-    return all(shutil.which(tool, path="/usr/bin") for tool in ("rosmaster", "rostopic", "roslaunch", "g++"))
+def need_ros() -> None:
+    tools = ("rosmaster", "rostopic", "roslaunch", "g++")
+    needs(all(shutil.which(tool, path="/usr/bin") for tool in tools), "ROS 1 and g++ (run `make setup`)")

@@ -15,10 +15,10 @@ import pytest
 
 from appliance.network.namespaces import namespaces
 from tests.support.command import ROSRV
-from tests.support.nodes import has_ros
+from tests.support.nodes import need_ros
 from tests.support.own_namespace import own_namespace
 from tests.support.processes import Process, ThisMachine
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import need_root
 
 LIMIT = 600  # for a demonstration that hangs
 
@@ -26,7 +26,7 @@ LIMIT = 600  # for a demonstration that hangs
 @pytest.fixture(autouse=True)
 def machine() -> None:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
 
 
 @pytest.fixture

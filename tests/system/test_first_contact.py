@@ -21,10 +21,10 @@ import yaml
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
 from tests.support.command import ROSRV, rosrv
-from tests.support.nodes import has_ros
+from tests.support.nodes import need_ros
 from tests.support.own_namespace import own_namespace
 from tests.support.processes import LIMIT, Process, ThisMachine
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import need_root
 from tests.support.waiting import eventually
 
 ROOT: Final = Path(__file__).parents[2]
@@ -74,7 +74,7 @@ class Checkout:
 @pytest.fixture
 def checkout(request: pytest.FixtureRequest) -> Iterator[Checkout]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     way = WAYS[request.param]
     above = Path(tempfile.mkdtemp(prefix="rosrv-first-"))
     above.chmod(0o755)

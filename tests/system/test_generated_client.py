@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from appliance.api.routes.contract import EXAMPLES
 from appliance.ipsec.requests import make_key, signing_request
 from examples.landshark.lab import Host, Lab
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import RosSession, need_ros
+from tests.support.requirements import need_root
 from tests.support.rest import Rest
 from tests.support.tunnel_site import API, MASTER, MIDDLE, OWN, POLICY, ROBOT, TunnelSite
 from tests.support.tunnels import need_strongswan
@@ -191,7 +191,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def site(tmp_path: Path) -> Iterator[TunnelSite]:
     need_root()
     need_strongswan()
-    needs(has_ros(), "ROS 1 (run `make setup`)")
+    need_ros()
     (tmp_path / "appliance.yaml").write_text(CONFIG)
     with Lab("rosrv-client") as lab:
         policy = POLICY.replace("[Publishers]\n", "[Publishers]\n/cmd_vel = 192.0.2.10\n")

@@ -13,9 +13,8 @@ import pytest
 
 from lab.proofs.spin import Bounds, Step, accepts
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Event
-from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
 NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
@@ -54,7 +53,7 @@ def number(event: Event) -> int:
 
 @pytest.fixture(scope="module")
 def trace() -> Trace:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with tempfile.TemporaryDirectory(prefix="rosrv-stamp-") as name:
         folder = Path(name)
         folder.chmod(0o755)

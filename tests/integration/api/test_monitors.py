@@ -9,8 +9,7 @@ import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.rest import Answer, Rest
 from tests.support.waiting import eventually
 
@@ -40,7 +39,7 @@ def load(rest: Rest, files: dict[str, str], match: str = "*") -> Answer:
 
 
 def test_effects_of_a_monitor_are_counted_and_kept(appliance: Appliance, tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     rest = appliance.rest()
     load(rest, {"speed.rv": DROPPING, "tally.rv": OTHER.replace("count", "tally")})
     with RosSession(appliance.master_uri, tmp_path) as ros:

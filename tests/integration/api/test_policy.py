@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.rest import Rest
 from tests.support.waiting import eventually
 
@@ -115,7 +114,7 @@ def measured(rest: Rest) -> str | None:
 
 
 def test_the_graph_shows_nodes_topics_and_connections(appliance: Appliance, tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     rest = appliance.rest()
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ros.talker("rospy", "/chatter", name="talker")

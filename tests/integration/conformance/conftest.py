@@ -5,8 +5,7 @@ import pytest
 
 from tests.integration.conformance.fake_nodes import FakeNodes
 from tests.integration.conformance.side_by_side import BothMasters, MasterSide
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.site import Masters, Site
 
 
@@ -30,7 +29,7 @@ def fakes() -> Iterator[tuple[FakeNodes, FakeNodes]]:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Site, Site]]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with (
         Site("plain", tmp_path_factory.mktemp("plain")) as plain,
         Site("appliance", tmp_path_factory.mktemp("appliance")) as appliance,

@@ -17,9 +17,9 @@ from xmlrpc.client import ServerProxy
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import Client, RosSession, need_ros
 from tests.support.processes import Process
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import need_root
 from tests.support.rosmaster import await_node
 from tests.support.waiting import eventually
 
@@ -121,7 +121,7 @@ def _ask_until_answered(asker: Process) -> None:
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     home: Path = tmp_path_factory.mktemp("robot")
     with Appliance() as appliance, RosSession(appliance.master_uri, home) as ros:
         await_node(appliance.master_uri, appliance.host, "/rosout")

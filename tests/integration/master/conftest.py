@@ -4,14 +4,14 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.support.field import Field
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_root
 
 
 @pytest.fixture(scope="module")
 def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     home, settings = tmp_path_factory.mktemp("field"), getattr(request.module, "CONFIGURATION", "")
     with Lab("rosrv-test") as lab, Field(lab, home, request.module.POLICY, settings) as field:
         yield field

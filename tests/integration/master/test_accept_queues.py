@@ -10,8 +10,8 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from roswire.xmlrpc import Value, build_call, parse_response
 from tests.support.appliance import Appliance
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_root
 
 WAIT = 30.0
 POLICY = """\
@@ -29,7 +29,7 @@ SOMAXCONN = Path("/proc/sys/net/core/somaxconn")
 @pytest.fixture
 def lab() -> Iterator[Lab]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-test") as lab:
         yield lab
 

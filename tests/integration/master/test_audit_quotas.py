@@ -8,8 +8,8 @@ import pytest
 from appliance.audit.log.folding import FoldSettings
 from appliance.quotas.table import AUDIT_BYTES, AUDIT_KINDS
 from examples.landshark.lab import Lab
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_root
 from tests.support.siege import Siege
 
 SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
@@ -20,7 +20,7 @@ LONG = "k" * 900
 @pytest.fixture(scope="module")
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     # With this size, the part of the disk of a guest's network is less than the bound of one host.
     settings = "relays: 2\naudit: {retention_bytes: 256MiB}\n"
     with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), settings) as there:

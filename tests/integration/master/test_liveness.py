@@ -10,9 +10,8 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import Client, RosSession, need_ros
 from tests.support.processes import LIMIT, Process, ThisMachine
-from tests.support.requirements import needs
 
 MONITORS = Path(__file__).parents[3] / "monitors"
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -78,7 +77,7 @@ def test_a_node_with_a_percent_sign_in_its_uri_is_found_dead(
 def test_a_paused_subscriber_gets_a_new_publisher_when_it_goes_on(
     lab: Lab, robot: Host, tmp_path: Path
 ) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     middle = lab.host("appliance", "10.77.0.2/24")
     settings = "limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n"
     with (

@@ -17,8 +17,8 @@ from examples.landshark.lab import Host, Lab
 from roswire.tcpros import encode_header
 from roswire.xmlrpc import FaultReceived
 from tests.support.field import Impostor, answering
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_root
 from tests.support.siege import Siege
 from tests.support.waiting import allowed
 
@@ -40,7 +40,7 @@ def http_request(method: str, *parameters: str) -> bytes:
 @pytest.fixture(scope="module")
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), CONFIGURATION) as there:
         there.works(slowest=SLOW)
         yield there

@@ -16,9 +16,8 @@ from appliance.channel.admin import (
 from appliance.channel.answers.monitor_answers import Replaced
 from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Event, Process
-from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
 ROUNDS = 25  # four changes in each round
@@ -40,7 +39,7 @@ def beside(version: int) -> str:
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Appliance(options=("--api", "off"), relays=2) as appliance:
         yield appliance
 

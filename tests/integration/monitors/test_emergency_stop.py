@@ -11,8 +11,7 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
 
@@ -27,7 +26,7 @@ stop() {
 
 @pytest.fixture(scope="module")
 def stopped(common_lab: Lab) -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host = common_lab.host("stopped", "10.77.0.3/24")
     with Appliance(host, options=("--api", "off"), relays=2) as running:
         spec = running.directory / "stop.rv"

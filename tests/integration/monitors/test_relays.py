@@ -11,9 +11,8 @@ from xmlrpc.client import ServerProxy
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
+from tests.support.nodes import Client, RosSession, need_ros, numbers, without_gap
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.site import Masters
 from tests.support.waiting import eventually
 
@@ -37,7 +36,7 @@ def specification(name: str, topic: str) -> str:
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     monitors = {one: specification(one, one) for one in ("left", "right")}
     with Appliance(monitors=monitors, options=("--api", "off"), relays=2) as appliance:
         yield appliance

@@ -3,8 +3,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.rosmaster import await_node
 
 SPECIFICATION = """
@@ -19,7 +18,7 @@ gate() {
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     settings, monitors = "monitors_on_rosout: true\n", {"gate": SPECIFICATION}
     with Appliance(settings=settings, monitors=monitors, options=("--api", "off"), relays=2) as appliance:
         yield appliance

@@ -5,9 +5,8 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
 GUARD = """
@@ -22,7 +21,7 @@ guard() given { int least = 1 in 0..9; } {
 
 @pytest.fixture(scope="module")
 def guarded(common_lab: Lab) -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host = common_lab.host("guarded", "10.77.0.4/24")
     with Appliance(host, options=("--api", "off")) as running:
         (running.directory / "guard.rv").write_text(GUARD)

@@ -12,8 +12,7 @@ from examples.landshark.messages import MONITORS, Messages
 from examples.landshark.nodes import physics
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import rosrv
-from tests.support.nodes import PYTHON, ROOT, RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import PYTHON, ROOT, RosSession, need_ros
 from tests.support.waiting import eventually
 
 NODES = ROOT / "examples" / "landshark" / "nodes"
@@ -148,7 +147,7 @@ def test_a_recording_gives_the_same_records_every_time(bag: Path) -> None:
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     options = ("--monitors", str(MONITORS), "--api", "off")
     with Appliance(policy=OPEN_POLICY, options=options) as appliance:
         yield appliance

@@ -8,8 +8,8 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import PYTHON, RosSession, has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import PYTHON, RosSession, need_ros
+from tests.support.requirements import need_root
 from tests.support.rosmaster import await_node, call_on
 
 SPECIFICATION = """
@@ -43,7 +43,7 @@ _CALLS = (
 @pytest.fixture(scope="module")
 def field() -> Iterator[tuple[Appliance, Host]]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-test") as lab:
         middle, robot = lab.host("appliance", "10.77.0.2/24"), lab.host("robot", "10.77.0.10/24")
         with Appliance(middle, monitors={"gate": SPECIFICATION}, options=("--api", "off")) as appliance:

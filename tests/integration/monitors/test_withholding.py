@@ -2,12 +2,11 @@ from pathlib import Path
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 
 
 def test_a_topic_is_withheld_from_one_host(common_lab: Lab, common_robot: Host, tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     tablet = common_lab.host("tablet", "10.77.0.11/24")
     for name in ("robot", "tablet"):
         (tmp_path / name).mkdir()

@@ -3,14 +3,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.relay_driver import RelayDriver
-from tests.support.requirements import needs
 
 
 @pytest.fixture
 def driver() -> Iterator[RelayDriver]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with RelayDriver() as driver:
         yield driver
 

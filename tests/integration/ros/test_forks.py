@@ -9,9 +9,8 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.support.forks import PYTHON, Fork, Forking
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import LIMIT, Host, ThisMachine
-from tests.support.requirements import needs
 
 LOOK = """
 import faulthandler, gc, json, os, resource, signal, sys, threading
@@ -52,7 +51,7 @@ def looked(host: Host | Forking, command: list[str], environment: Mapping[str, s
 @pytest.mark.parametrize("place", ["this machine", "a host"])
 @pytest.mark.parametrize("form", ["-c", "file"])
 def test_a_fork_looks_like_a_new_process(lab: Lab, tmp_path: Path, place: str, form: str) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host = ThisMachine() if place == "this machine" else lab.host("robot", "10.77.0.10/24")
     file = tmp_path / "look.py"
     file.write_text(LOOK)
@@ -65,7 +64,7 @@ def test_a_fork_looks_like_a_new_process(lab: Lab, tmp_path: Path, place: str, f
 
 
 def test_a_fork_ends_as_a_process_does(tmp_path: Path) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host, program = ThisMachine(), "import signal; print('here'); signal.pause()"
     environment = RosSession("", tmp_path, host).environment(host)
     for number in (signal.SIGTERM, signal.SIGKILL):

@@ -9,8 +9,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.waiting import eventually
 from tests.system.console.reader import Reader
 
@@ -46,7 +45,7 @@ NAME() {
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with tempfile.TemporaryDirectory(prefix="rosrv-incident-") as name:
         folder = Path(name)
         folder.chmod(0o755)  # the appliance's processes run as other users

@@ -5,14 +5,13 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.system.console.reader import LIMIT, Reader
 
 
 @pytest.fixture
 def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with RosSession(appliance.master_uri, tmp_path) as session:
         yield session
 

@@ -6,8 +6,7 @@ import pytest
 
 from appliance.network.scan import scan
 from tests.support.docker import Compose, MachineInside, project_beside
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.waiting import eventually
 from tests.system.containers.conftest import Site
 
@@ -31,7 +30,7 @@ def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
 def test_nodes_of_the_machine_work_and_its_ports_are_closed(
     site: Site, beside: Compose, tmp_path: Path
 ) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     rules = beside.exec("appliance", "rosrv", "protect", "--appliance", APPLIANCE).stdout
 
     def nft(*arguments: str, text: str = "") -> None:

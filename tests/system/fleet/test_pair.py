@@ -10,8 +10,8 @@ from appliance.audit.proof.copies import signed_checkpoints
 from examples.landshark.lab import Lab
 from fleet.tests.support.fleet_site import FleetSite
 from tests.support.features.standby.standby_site import StandbySite
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_program, need_root
 from tests.support.waiting import eventually
 from tests.system.fleet.test_bundles import BUNDLE, Operator, serve_bundles
 
@@ -39,13 +39,9 @@ class Fleet(FleetSite):
 def pair(tmp_path: Path) -> Iterator[tuple[Lab, StandbySite]]:
     need_root()
     need_program("nft", "nftables")
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-fleetpair") as lab, StandbySite(lab, tmp_path, monitors={}) as made:
-        made.start_witness()
-        made.start("a")
-        made.until_active("a")
-        made.start("b")
-        made.until_both_in_sync()
+        made.begin()
         yield lab, made
 
 

@@ -5,8 +5,8 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import POLICY
 from tests.support.appliance import Appliance
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_program, need_root
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def attacker(lab: Lab) -> Host:
 @pytest.fixture
 def host(lab: Lab) -> Host:
     """Return the computer of a robot that is adopted."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     return lab.host("robot", "10.77.0.10/24")
 
 

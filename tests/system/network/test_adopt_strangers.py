@@ -15,8 +15,7 @@ from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import Robot, adoption, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.rosmaster import PlainMaster
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(900)]
@@ -66,7 +65,7 @@ while True:
 @pytest.fixture
 def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
     """A robot whose only honest companion is a second computer."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host, nuc = lab.host("robot", "10.77.0.10/24"), lab.host("nuc", "10.77.0.11/24")
     with (
         PlainMaster(tmp_path, host),

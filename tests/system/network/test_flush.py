@@ -23,9 +23,9 @@ from appliance.network.listening_sockets import TcpSocket, tcp_sockets
 from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import Robot, rosrv, until_taken
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Process
-from tests.support.requirements import need_program, needs
+from tests.support.requirements import need_program
 from tests.support.rosmaster import PlainMaster
 from tests.support.waiting import eventually
 
@@ -191,7 +191,7 @@ def test_closed_ports_of_the_machine_come_back_after_a_flush_and_not_after_their
 
 @pytest.fixture
 def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     host = lab.host("robot", "10.77.0.10/24")
     with PlainMaster(tmp_path, host), RosSession("http://localhost:11311", tmp_path, host) as ros:
         ros.talker("rospy", TOPIC, "--rate", "50", name="driver")

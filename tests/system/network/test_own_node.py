@@ -13,8 +13,8 @@ from appliance.network.firewall.firewall_rules import FirewallSettings, OwnNodeA
 from appliance.supervisor.users import account_of
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_program, need_root
 
 CONTROL, ROSMASTER, RELAY, ROSOUT, OTHER = 61011, 61012, 61013, 61018, 61055
 PORTS = PortRange(17000, 17063)
@@ -99,7 +99,7 @@ def test_only_control_calls_it_and_only_the_relay_gets_its_messages(
 
 def test_a_compromised_rosout_or_rosmaster_reaches_nothing() -> None:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-own") as lab:
         host, robot = lab.host("appliance", "10.77.0.2/24"), lab.host("robot", "10.77.0.10/24")
         with Appliance(host, options=("--api", "10.77.0.2:8443")) as appliance, listening(robot) as outside:

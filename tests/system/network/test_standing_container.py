@@ -8,9 +8,8 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import Robot, rosrv
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
 _POLICY = f"{OPEN_POLICY.replace('*', '10.77.0.10')}\n[Options]\naudit-only = Publishers\n"
@@ -25,7 +24,7 @@ def box(lab: Lab) -> Host:
 
 @pytest.fixture
 def appliance(box: Host) -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Appliance(box, policy=_POLICY) as appliance:
         yield appliance
 

@@ -9,16 +9,15 @@ import pytest
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from tests.support.appliance import Appliance
 from tests.support.features.guards.guarded_robot import stream
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession, need_ros
 from tests.support.processes import Process
-from tests.support.requirements import needs
 
 OFF = "rosrv: monitor-off:deadman"
 
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     settings = "name: carrier\nalarms_on_diagnostics: true\nrelay:\n  late: 100\n"  # the machine may be busy
     guard = {"deadman": text_of(Guard("deadman", PRESETS["deadman"]))}
     with Appliance(settings=settings, monitors=guard, options=("--api", "off"), relays=2) as appliance:

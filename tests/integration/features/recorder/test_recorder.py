@@ -13,8 +13,7 @@ from appliance.api.routes.contract import EXAMPLES
 from appliance.features.recorder.mcap import as_mcap
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import rosrv
-from tests.support.nodes import RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import RosSession, need_ros
 from tests.support.waiting import eventually
 
 MONITOR = """
@@ -42,7 +41,7 @@ audit: {reserve_bytes: 1MiB}
 
 @pytest.fixture(scope="module")
 def recording() -> Iterator[Appliance]:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     monitors, options = {"censor": MONITOR}, ("--api", "127.0.0.1:0")
     with Appliance(settings=CONFIGURATION, monitors=monitors, options=options) as appliance:
         yield appliance

@@ -131,6 +131,14 @@ class StandbySite:
         (self.home / "boot").write_text(secrets.token_hex(8))
         self.start_witness()
 
+    def begin(self) -> None:
+        """Start the witness and the active appliance a, then its standby b."""
+        self.start_witness()
+        self.start("a")
+        self.until_active("a")
+        self.start("b")
+        self.until_both_in_sync()
+
     def start(self, name: str) -> Process:
         one = self.appliances[name]
         one.process = Process(one.host, self._up(one), env=dict(os.environ), label=f"rosrv up {name}")

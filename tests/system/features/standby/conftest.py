@@ -8,8 +8,8 @@ from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
 from tests.support.features.standby.standby_robot import StandbyRobot
 from tests.support.features.standby.standby_site import StandbySite
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_program, need_root
 
 RULE = "seen() { event said() /map std_msgs/String '{}' { } }\n"
 
@@ -18,7 +18,7 @@ RULE = "seen() { event said() /map std_msgs/String '{}' { } }\n"
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
     need_root()
     need_program("nft", "nftables")
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     home: Path = tmp_path_factory.mktemp("standby")
     with Lab("rosrv-standby") as lab, StandbySite(lab, home, monitors={}) as site:
         site.start_witness()

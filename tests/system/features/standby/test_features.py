@@ -10,8 +10,8 @@ from websockets.sync.client import connect
 
 from examples.landshark.lab import Lab
 from tests.support.features.standby.standby_site import ADDRESSES, OCU, ROBOT, StandbySite
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_root
 from tests.support.waiting import eventually
 
 POLICY = f"""\
@@ -37,17 +37,13 @@ TWIST = ("rostopic", "pub", "-r", "20", "/cmd_vel", "geometry_msgs/Twist", "{lin
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[StandbySite]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     settings, rest = "api_networks: [10.79.0.0/24]\n", ("--api", "0.0.0.0:8443")
     with (
         Lab("rosrv-features") as lab,
         StandbySite(lab, tmp_path, policy=POLICY, settings=settings, monitors={}, options=rest) as made,
     ):
-        made.start_witness()
-        made.start("a")
-        made.until_active("a")
-        made.start("b")
-        made.until_both_in_sync()
+        made.begin()
         yield made
 
 

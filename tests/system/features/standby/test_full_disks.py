@@ -12,9 +12,9 @@ from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
-from tests.support.nodes import has_ros
+from tests.support.nodes import need_ros
 from tests.support.processes import Process
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.requirements import need_program, need_root
 from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
 
@@ -25,7 +25,7 @@ _LITTLE = 3 << 20  # bytes
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
     need_root()
     need_program("nft", "nftables")
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     home: Path = tmp_path_factory.mktemp("disks")
     with (
         small_disk(home / "robot", "1m") as disk,
@@ -38,11 +38,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
             assert member is not None
             disks.enter_context(small_disk(appliance.state, "200m", "mode=0711"))
             save_membership(path_of(appliance.state), member)
-        made.start_witness()
-        made.start("a")
-        made.until_active("a")
-        made.start("b")
-        made.until_both_in_sync()
+        made.begin()
         yield made
 
 

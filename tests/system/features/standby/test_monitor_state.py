@@ -11,21 +11,17 @@ from examples.landshark.lab import Lab
 from tests.integration.monitors.test_emergency_stop import STOP
 from tests.support.features.guards.guarded_robot import PATIENCE, GuardedRobot, rows
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_root
 from tests.support.waiting import eventually
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[StandbySite]:
     need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     with Lab("rosrv-monitors") as lab, StandbySite(lab, tmp_path) as made:
-        made.start_witness()
-        made.start("a")
-        eventually(lambda: made.holder() == "a", made.story)
-        made.start("b")
-        made.until_both_in_sync()
+        made.begin()
         spec = made.appliances["a"].directory / "stop.rv"
         spec.write_text(STOP)
         made.appliances["a"].rosrv("monitor", "load", str(spec))

@@ -4,8 +4,8 @@ import datetime
 
 from benchmarks.pair_fault_kinds import drawn
 from benchmarks.pair_faults import QUIET_SECONDS, run
-from tests.support.nodes import has_ros
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.nodes import need_ros
+from tests.support.requirements import need_program, need_root
 from tests.support.waiting import allowed
 
 _FAULTS = 20
@@ -15,7 +15,7 @@ def test_random_faults_break_no_promise() -> None:
     """To repeat a failure: `python -m benchmarks.pair_faults --faults 20 --seed NUMBER`, as in the message."""
     need_root()
     need_program("nft", "nftables")
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     seed = datetime.datetime.now(tz=datetime.UTC).toordinal()
     broken = [
         (seed, row.number, row.fault, row.broken, row.story)

@@ -15,9 +15,9 @@ from appliance.features.standby import requests as standby_requests
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
 from tests.support.features.standby.standby_site import StandbySite
-from tests.support.nodes import has_ros
+from tests.support.nodes import need_ros
 from tests.support.printed import row_of
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.requirements import need_program, need_root
 from tests.support.site_key import LINE, signed
 from tests.support.waiting import NoAnswerError, eventually
 from tests.system.features.standby.conftest import RULE
@@ -29,7 +29,7 @@ NO_SIGNATURE = "it has no signature of the site"
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
     need_root()
     need_program("nft", "nftables")
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    need_ros()
     home: Path = tmp_path_factory.mktemp("unready")
     with Lab("rosrv-unready") as lab, StandbySite(lab, home, monitors={}) as made:
         standby = made.appliances["b"]
@@ -38,11 +38,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
         file.with_name(f"{file.name}.sig").write_text(signed(file.read_text()))
         config.write_text(f"site_keys:\n  - {LINE}\n")
         standby.options = ("--config", str(config), *standby.options)
-        made.start_witness()
-        made.start("a")
-        made.until_active("a")
-        made.start("b")
-        made.until_both_in_sync()
+        made.begin()
         yield made
 
 

@@ -60,11 +60,7 @@ class TunnelledStandbySite:
         self.kits = 0
 
     def start(self) -> None:
-        self.site.start_witness()
-        for name in ADDRESSES:
-            self.site.start(name)
-            eventually(lambda: self.site.holder() == "a", self.site.story)
-        self.site.until_both_in_sync()
+        self.site.begin()
 
     def kit(self, verb: str, name: str) -> Path:
         self.kits += 1
