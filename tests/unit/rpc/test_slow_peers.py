@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from appliance.base import clock
-from appliance.rpc.server import HttpRequest
+from appliance.rpc.server import Handler, HttpRequest
 from tests.support.http_server import (
     LARGE,
     LIMITS,
@@ -144,14 +144,17 @@ async def test_connections_that_are_too_many_do_not_stay() -> None:
         assert (await (await server.connect()).response())[0] == 503
 
 
-async def test_bytes_per_host() -> None:
-    release = asyncio.Event()
-
+def answering_after(release: asyncio.Event) -> Handler:
     async def handler(_request: HttpRequest) -> bytes:
         await release.wait()
         return b"done"
 
-    async with serving(handler, shares=Shares(held=two_hosts(250_000))) as server:
+    return handler
+
+
+async def test_bytes_per_host() -> None:
+    release = asyncio.Event()
+    async with serving(answering_after(release), shares=Shares(held=two_hosts(250_000))) as server:
         clients = [await server.connect() for _ in range(2)]
         for client in clients:
             await client.send(post(b"x" * 100_000))
@@ -167,12 +170,7 @@ async def test_bytes_per_host() -> None:
 
 async def test_small_requests_that_wait_are_counted() -> None:
     release = asyncio.Event()
-
-    async def handler(_request: HttpRequest) -> bytes:
-        await release.wait()
-        return b"done"
-
-    async with serving(handler, shares=Shares(held=two_hosts(100_000))) as server:
+    async with serving(answering_after(release), shares=Shares(held=two_hosts(100_000))) as server:
         client = await server.connect()
         await client.send(post(b"first"))
         await until(lambda: bool(server.requests))
@@ -190,12 +188,7 @@ async def test_small_requests_that_wait_are_counted() -> None:
 
 async def test_requests_behind_one_that_is_served_are_not_read() -> None:
     release = asyncio.Event()
-
-    async def handler(_request: HttpRequest) -> bytes:
-        await release.wait()
-        return b"done"
-
-    async with serving(handler) as server:
+    async with serving(answering_after(release)) as server:
         client = await server.connect()
         await client.send(post(b"x") * 2000)
         await until(lambda: bool(server.requests))
@@ -207,12 +200,7 @@ async def test_requests_behind_one_that_is_served_are_not_read() -> None:
 
 async def test_gone_before_its_turn() -> None:
     release = asyncio.Event()
-
-    async def handler(_request: HttpRequest) -> bytes:
-        await release.wait()
-        return b"done"
-
-    async with serving(handler, shares=Shares(requests=two_hosts(1))) as server:
+    async with serving(answering_after(release), shares=Shares(requests=two_hosts(1))) as server:
         first = await server.connect()
         await first.send(post(b"first"))
         await until(lambda: len(server.requests) == 1)
