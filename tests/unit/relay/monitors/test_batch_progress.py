@@ -9,13 +9,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.channel.messages import Message, MonitorRow
+from appliance.channel.messages import MonitorRow
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.observation_points import BatchProgress, ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
-from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.report import Reporter
 from appliance.relay.transport.frames import Batch, FrameReceiver, Scratch
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
@@ -36,23 +34,10 @@ from roswire.tcpros import encode_frame
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.support.stated import stated
-from tests.unit.relay.monitors.quiet import QuietMonitors
+from tests.unit.relay.monitors.quiet import QuietMonitors, Reports
 from tests.unit.transcripts import transcripts
 
 MONITORS = Path(__file__).parents[4] / "monitors"
-
-
-class Heard(Reporter):
-    def __init__(self) -> None:
-        super().__init__(RelayLimits())
-        self.messages: list[Message] = []
-
-    @property
-    def attached(self) -> bool:
-        return True
-
-    def send(self, told: Message) -> None:
-        self.messages.append(told)
 
 
 class Monitored:
@@ -67,7 +52,7 @@ class Monitored:
         restarted: bool = False,
         began: int = 1_000_000_000,
     ) -> None:
-        self.heard = Heard()
+        self.heard = Reports()
         self.time = began
         self.published: list[tuple[str, bytes]] = []
         self._loop = EventLoop()
@@ -122,11 +107,11 @@ class Monitored:
         self.interceptor.tick()
         self.interceptor.observations.flush()
         told = sorted(repr(one) for one in self.sent())
-        self.heard.messages.clear()
+        self.heard.sent.clear()
         return told
 
     def sent(self) -> Iterable[object]:
-        for one in self.heard.messages:
+        for one in self.heard.sent:
             yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
 
     def rows(self) -> list[MonitorRow]:

@@ -35,7 +35,7 @@ class Told:
         self.monitored.interceptor.tick()
         self.monitored.interceptor.observations.flush()
         found: list[Any] = [one for one in self.monitored.sent() if getattr(one, "kind", "") == kind]
-        self.monitored.heard.messages.clear()
+        self.monitored.heard.sent.clear()
         return found
 
     def counts(self) -> dict[str, tuple[int, int]]:
@@ -136,7 +136,7 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
 def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
     told.send((1, 5, 0))
     told.monitored.interceptor.observations.flush()
-    *_before, events, counters = told.monitored.heard.messages
+    *_before, events, counters = told.monitored.heard.sent
     assert isinstance(events, MonitorsReported)
     assert isinstance(counters, MonitorsCounted)
     assert [event.kind for event in events.events] == ["drop"]
