@@ -23,6 +23,7 @@ from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, listen
 from roswire.xmlrpc import FaultReceived, parse_response
+from tests.support.waiting import until
 
 LIMITS = HttpLimits()
 WAIT = 20.0
@@ -179,9 +180,3 @@ async def serving(
         assert server.connection_table.connected.total == server.connection_table.farewells.total == 0
         sweep.cancel()
         server.http.close()
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(WAIT):
-        while not condition():
-            await asyncio.sleep(0.01)

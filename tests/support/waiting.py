@@ -1,5 +1,6 @@
 """Wait for changes without an event, such as a number in a status or a record that is written later."""
 
+import asyncio
 import os
 import threading
 import time
@@ -33,6 +34,13 @@ def eventually(
             raise AssertionError(f"not within {seconds:.0f} s: {told}{why}")
         pause.wait(moment)
         moment = min(1.5 * moment, 0.25)  # fewer polls do not slow down a slow machine further
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Let the other tasks of the loop run until the condition holds."""
+    async with asyncio.timeout(LIMIT):
+        while not condition():
+            await asyncio.sleep(0.01)
 
 
 def _tried(condition: Callable[[], T | None]) -> tuple[T | None, str]:

@@ -10,7 +10,8 @@ from appliance.rpc.acceptor import first_for
 from appliance.rpc.connection_table import Stage
 from appliance.rpc.processor_time import TURN_SECONDS
 from appliance.rpc.server import HttpRequest, NoAnswerError
-from tests.support.http_server import WAIT, Client, Server, Shares, post, serving, until
+from tests.support.http_server import WAIT, Client, Server, Shares, post, serving
+from tests.support.waiting import until
 
 pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 

@@ -17,8 +17,8 @@ from tests.support.http_server import (
     post,
     serving,
     two_hosts,
-    until,
 )
+from tests.support.waiting import until
 
 pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 

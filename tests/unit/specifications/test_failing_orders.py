@@ -24,6 +24,7 @@ from appliance.store.ends import EndKind
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.engines import InlineDatabase
+from tests.support.waiting import until
 from tests.unit.specifications.monitor_desk import B, C, Desk, SlowCompiler
 
 pytestmark = pytest.mark.anyio
@@ -281,9 +282,7 @@ async def test_disabled_periods_end_even_on_a_full_disk(desk: Desk) -> None:
     await monitors.switch(admin.MonitorSwitch(["c"], False, for_seconds=600.0), "eve")
     await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=0.1), "eve")
     full(desk)
-    async with asyncio.timeout(30):
-        while monitors.now.states != {"a": True, "b": "shadow", "c": False}:
-            await asyncio.sleep(0.01)
+    await until(lambda: monitors.now.states == {"a": True, "b": "shadow", "c": False})
 
 
 @pytest.mark.parametrize("end", ["of a disabled period", "of the time to confirm"])
@@ -301,9 +300,7 @@ async def test_an_order_that_is_carried_out_before_an_end_that_is_due_stands_unl
     await slow.begun.wait()
     for_good = asyncio.ensure_future(monitors.switch(admin.MonitorSwitch(["a"], False), "eve"))
     await asyncio.sleep(0)
-    async with asyncio.timeout(30):
-        while not all(monitors.ends.passed(kind, name) for kind, name in due(monitors)):
-            await asyncio.sleep(0.01)
+    await until(lambda: all(monitors.ends.passed(kind, name) for kind, name in due(monitors)))
     monitors.ends.look()
     await asyncio.sleep(0)
     slow.goes_on.set()
@@ -322,9 +319,7 @@ async def test_an_unconfirmed_change_ends_even_on_a_full_disk(desk: Desk) -> Non
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}, confirm_within=0.1), "eve")
     no_room(desk, monitors)
-    async with asyncio.timeout(30):
-        while monitors.names() != ["a"]:
-            await asyncio.sleep(0.01)
+    await until(lambda: monitors.names() == ["a"])
     desk.store = reopened(desk)
     again = await desk.monitors(restarted=True)
     assert (again.names(), again.confirm_by) == (["a"], None)

@@ -27,6 +27,7 @@ from appliance.specifications.specification_manager import (
 from appliance.specifications.specification_revisions import text_of
 from tests.support.answers import example
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
+from tests.support.waiting import until
 from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, SlowCompiler
 from tests.unit.transcripts import played, transcripts
 
@@ -57,9 +58,7 @@ async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> N
         tag = monitors.tag
         await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=seconds), "eve")
         assert monitors.until("a") is not None
-        async with asyncio.timeout(30):
-            while monitors.switches.states["a"] is False:
-                await asyncio.sleep(0.01)
+        await until(lambda: monitors.switches.states["a"] is not False)
         assert (monitors.switches.states["a"], monitors.until("a")) == (state, None)
         assert monitors.tag != tag
     rows = [row for row in desk.trail.heard if row[0] in {"monitor disabled", "monitor enabled"}]
@@ -92,9 +91,7 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
     assert again.until("b") is None
     desk.kill()
     later = await desk.monitors(restarted=True)
-    async with asyncio.timeout(30):
-        while not later.switches.enabled("a"):
-            await asyncio.sleep(0.01)
+    await until(lambda: later.switches.enabled("a"))
     await later.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
     endless = await later.switch(admin.MonitorSwitch(["a"], False), "eve")
     assert (endless.names, endless.until) == (["a"], None)
@@ -612,9 +609,7 @@ async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> No
     promote = partial(admin.MonitorShadow, ["a"], False)
 
     async def shadowed(now: Any) -> None:
-        async with asyncio.timeout(30):
-            while not now.switches.in_shadow("a"):
-                await asyncio.sleep(0.01)
+        await until(lambda: now.switches.in_shadow("a"))
         assert now.until("a", of=True) is None
 
     with pytest.raises(SpecificationsRefusedError, match="in force already"):

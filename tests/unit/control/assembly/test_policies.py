@@ -33,6 +33,7 @@ from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
 from tests.support.virtual_clock import ShiftedClock, let_time_pass, set_wall
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.anyio
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
@@ -87,12 +88,6 @@ class Appliance:
             store.close()
 
 
-async def until(policies: Policies, revision: int) -> None:
-    async with asyncio.timeout(10):
-        while policies.revision != revision:
-            await asyncio.sleep(0.01)
-
-
 async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Path) -> None:
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
@@ -103,7 +98,7 @@ async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Pa
     with appliance.started() as policies:
         assert (policies.revision, policies.current.text) == (2, OTHER)
         assert policies.confirm_by == pytest.approx(deadline, abs=1)
-        await until(policies, 3)
+        await until(lambda: policies.revision == 3)
         assert policies.current.text == OPEN
         assert policies.confirm_by is None
     with appliance.started(restarted=True) as policies:
@@ -176,7 +171,7 @@ async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> N
         appliance.file.write_text(OTHER)
         await policies.reload(PolicyReload(confirm_within=2.0), "operator")
     with using(ShiftedClock(-3e8)), appliance.started() as policies:
-        await until(policies, 3)
+        await until(lambda: policies.revision == 3)
         assert policies.current.text == OPEN
 
 
@@ -227,7 +222,7 @@ async def test_only_a_confirmation_and_a_rollback_end_the_timeout(tmp_path: Path
         assert policies.confirm_by == pytest.approx(end, abs=1)
         before = policies.revision
         let_time_pass(60.5)
-        await until(policies, before + 1)
+        await until(lambda: policies.revision == before + 1)
         assert policies.current.text == OPEN
 
 
@@ -391,7 +386,7 @@ async def test_a_crash_during_an_unconfirmed_change_rolls_it_back(tmp_path: Path
             await policies.reload(PolicyReload(confirm_within=1.0), "operator")
     with appliance.started(restarted=True) as policies:
         assert (policies.revision, policies.current.text) == (2, OTHER)
-        await until(policies, 3)
+        await until(lambda: policies.revision == 3)
         assert policies.current.text == OPEN
 
 
@@ -408,7 +403,7 @@ async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: 
         assert (await policies.load(PolicyLoad(OTHER), "eve")).revision == 2
         assert (await policies.roll_back(PolicyRollback(None), "eve")).revision == 3
         assert (await policies.reload(PolicyReload(confirm_within=1.0), "operator")).revision == 4
-        await until(policies, 5)
+        await until(lambda: policies.revision == 5)
         assert [row.revision for row in (await policies.revisions(PolicyRevisions())).revisions] == [
             5, 4, 3, 2, 1,
         ]  # fmt: skip
@@ -459,7 +454,7 @@ async def test_a_rollback_restores_a_signed_revision(tmp_path: Path) -> None:
     (tmp_path / "policy.ini.sig").write_text(signed(OPEN))
     with appliance.started(site_keys=[LINE]) as policies:
         await policies.load(PolicyLoad(OTHER, confirm_within=0.0, signature=signed(OTHER)), "adam")
-        await until(policies, 3)
+        await until(lambda: policies.revision == 3)
         assert (policies.current.text, policies.in_force.signature) == (OPEN, signed(OPEN))
 
 

@@ -1,7 +1,7 @@
 import asyncio
 import contextlib
 import ipaddress
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +32,10 @@ from tests.support.control_parts import OPEN, ControlParts
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import let_time_pass, set_wall
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.anyio
 NODE, ROBOT, OTHER, OURS = "10.0.0.5", "10.0.0.1", "10.0.0.7", "10.0.0.2"
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(10):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 async def at_once() -> None: ...

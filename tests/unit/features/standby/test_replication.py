@@ -61,16 +61,11 @@ from tests.support.features.standby.replication import (
 )
 from tests.support.processes import LIMIT
 from tests.support.sources import ROOT
-from tests.support.waiting import allowed
+from tests.support.waiting import allowed, until
 
 pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("sockets")]
 SECONDS = 2 * LIMIT
 OF_LAST_RELEASE = ROOT / "tests" / "integration" / "state-0.4.1.sql"
-
-
-async def until(condition: Callable[[], Any]) -> None:
-    while not condition():
-        await asyncio.sleep(0.01)
 
 
 async def require_equal(directory: Path, active: ActiveSide) -> None:

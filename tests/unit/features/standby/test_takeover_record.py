@@ -1,5 +1,4 @@
-import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from tests.support.features.standby.appliance_pair import Member, World
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.anyio
 
@@ -34,11 +34,6 @@ async def b(tmp_path: Path, world: World) -> AsyncIterator[Member]:
     member.open()
     yield member
     member.close()
-
-
-async def until(condition: Callable[[], object]) -> None:
-    while not condition():
-        await asyncio.sleep(0.01)
 
 
 def records(member: Member, event: str) -> list[dict[str, Any]]:
