@@ -26,17 +26,15 @@ class QuotaRow(NamedTuple):
     """One resource and its quotas.
 
     `thing` is the resource with its unit: "connections to RVMaster". `alarm` names the audit event and the metric.
-    `shown_by` lists the tests that exhaust the resource, as paths below tests/. `margin` compares the bounds with an
-    honest use. `setting` is the key in appliance.yaml that changes the bounds, or "". `between` describes the order of
-    hosts and which host makes room. `counting` defines a host, an unknown host and the kept part, where they differ
-    from the general rule of the page.
+    `margin` compares the bounds with an honest use. `setting` is the key in appliance.yaml that changes the bounds, or
+    "". `between` describes the order of hosts and which host makes room. `counting` defines a host, an unknown host and
+    the kept part, where they differ from the general rule of the page.
     """
 
     thing: str
     bounds: Bounds
     at_limit: str
     alarm: str
-    shown_by: tuple[str, ...]
     margin: HonestUse
     setting: str = ""
     between: str = ""
@@ -57,10 +55,6 @@ RVMASTER_CONNECTIONS = QuotaRow(
         1_200,
         beyond="its idle connections are replaced, the longest idle one first; a client connects again",
     ),
-    shown_by=(
-        "integration/master/test_quotas.py::test_connections_of_two_hundred_addresses",
-        "unit/control/assembly/test_listener_limits.py::test_connections_of_a_wildcard_displace_no_named_host",
-    ),
 )
 RVMASTER_ARRIVALS = QuotaRow(
     thing="connections to RVMaster and the proxy endpoints that are accepted and not opened yet",
@@ -73,12 +67,6 @@ RVMASTER_ARRIVALS = QuotaRow(
         "200 nodes of one machine that connect in the same instant, to RVMaster and one other node",
         400,
     ),
-    shown_by=(
-        "integration/master/test_accept_queues.py::test_a_full_queue_of_unknown_hosts",
-        "unit/rpc/test_server.py::test_connections_that_come_faster_than_they_are_opened",
-        "unit/control/assembly/test_listener_limits.py::test_hosts_of_a_wildcard_leave_a_named_host_its_slot",
-        "unit/control/assembly/test_listener_limits.py::test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots",
-    ),
 )
 RVMASTER_BYTES = QuotaRow(
     thing="bytes of requests and answers under way at RVMaster and the proxy endpoints",
@@ -90,10 +78,6 @@ RVMASTER_BYTES = QuotaRow(
         "a launch file that sets 5,000 parameters of 400 bytes in one request",
         2_000_000,
     ),
-    shown_by=(
-        "integration/master/test_quotas.py::test_requests_of_two_hundred_addresses",
-        "unit/rpc/test_connection_table.py::test_bytes_are_freed_by_the_host_that_holds_most",
-    ),
 )
 RVMASTER_FAREWELLS = QuotaRow(
     thing="connections that RVMaster is rejecting with a 503",
@@ -104,7 +88,6 @@ RVMASTER_FAREWELLS = QuotaRow(
         "",
         0,
     ),
-    shown_by=("unit/rpc/test_connection_table.py::test_connections_turned_away_in_all",),
 )
 RVMASTER_REQUESTS = QuotaRow(
     thing="requests that RVMaster and the proxy endpoints serve at once",
@@ -117,11 +100,6 @@ RVMASTER_REQUESTS = QuotaRow(
         "200 nodes of one machine that call at once",
         200,
         beyond="each waits for the calls before it; one thread carries them out in any case",
-    ),
-    shown_by=(
-        "integration/master/test_quotas.py::test_requests_of_two_hundred_addresses",
-        "unit/rpc/test_fair_queue.py::test_requests_of_many_guests_leave_slots_for_the_robot",
-        "unit/rpc/test_fair_queue.py::test_a_host_that_begins_waits_for_no_guest",
     ),
 )
 RVMASTER_TIME = QuotaRow(
@@ -137,12 +115,6 @@ RVMASTER_TIME = QuotaRow(
         0,
         beyond="other hosts go first if the robot has used more time than they have",
     ),
-    shown_by=(
-        "unit/rpc/test_processor_time.py::test_a_turn_of_the_loop_is_bounded",
-        "unit/rpc/test_processor_time.py::test_the_robot_waits_for_one_piece_of_a_flood",
-        "unit/rpc/test_processor_time.py::test_two_hundred_unknown_hosts_are_one",
-        "unit/rpc/test_server.py::test_many_connections_are_accepted_in_one_turn",
-    ),
 )
 PARAMETER_BYTES = QuotaRow(
     thing="bytes of parameters",
@@ -156,10 +128,6 @@ PARAMETER_BYTES = QuotaRow(
         "5,000 parameters of 200 bytes, and a robot description of 500 KB",
         1_500_000,
     ),
-    shown_by=(
-        "integration/master/test_quotas.py::test_parameters_of_two_hundred_addresses",
-        "unit/master/test_parameter_charges.py::test_no_sequence_exceeds_a_quota",
-    ),
 )
 LARGE_WRITES = QuotaRow(
     thing="large values under way to the ROS master and to a standby",
@@ -170,10 +138,6 @@ LARGE_WRITES = QuotaRow(
         "one large value at a time, such as a robot description",
         1,
         beyond="a second one waits for the first",
-    ),
-    shown_by=(
-        "unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",
-        "unit/rpc/test_bulk.py::test_a_large_value_has_its_turn_until_the_standby_has_it",
     ),
 )
 PROBES = QuotaRow(
@@ -186,7 +150,6 @@ PROBES = QuotaRow(
         200,
         beyond="checks go in turns; a closed port answers at once",
     ),
-    shown_by=("unit/master/reconcile/test_liveness.py::test_silent_nodes_delay_no_check_of_other_hosts",),
 )
 NODE_CALLS_UNDER_WAY = QuotaRow(
     thing="calls to nodes under way",
@@ -198,7 +161,6 @@ NODE_CALLS_UNDER_WAY = QuotaRow(
         200,
         beyond="the calls go in turns",
     ),
-    shown_by=("unit/master/endpoints/test_delivery.py::test_silent_nodes_delay_no_call_to_other_hosts",),
 )
 QUEUED_NODE_CALLS = QuotaRow(
     thing="bytes of calls that wait for nodes",
@@ -210,7 +172,6 @@ QUEUED_NODE_CALLS = QuotaRow(
         "ten waiting lists of 1 KB for each of 200 nodes",
         2_000_000,
     ),
-    shown_by=("unit/master/endpoints/test_delivery.py::test_a_host_loses_only_its_own_calls",),
 )
 RELAY_FRAMES = QuotaRow(
     thing="bytes of unfinished messages in one relay",
@@ -224,7 +185,6 @@ RELAY_FRAMES = QuotaRow(
         "ten cameras with images of 6 MB and four lidars with clouds of 2 MB, all under way",
         68_000_000,
     ),
-    shown_by=("unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_no_other_host",),
 )
 RELAY_QUEUES = QuotaRow(
     thing="bytes that wait for subscribers and clients in one relay",
@@ -238,7 +198,6 @@ RELAY_QUEUES = QuotaRow(
         "ten subscribers that are one image of 6 MB behind",
         60_000_000,
     ),
-    shown_by=("unit/relay/test_shares.py::test_subscribers_of_a_guest_that_never_read_stop_no_other_host",),
 )
 RELAY_LATCHED = QuotaRow(
     thing="bytes of latched messages in one relay",
@@ -252,10 +211,6 @@ RELAY_LATCHED = QuotaRow(
     margin=HonestUse(
         "three maps of 16 MB and a thousand small latched messages",
         50_000_000,
-    ),
-    shown_by=(
-        "unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_no_other_host",
-        "unit/relay/test_shares.py::test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots",
     ),
 )
 RELAY_CONNECTIONS = QuotaRow(
@@ -271,7 +226,6 @@ RELAY_CONNECTIONS = QuotaRow(
         "200 nodes of one machine with one relay: ten publications and ten subscriptions each",
         4_000,
     ),
-    shown_by=("integration/master/test_quotas.py::test_connections_to_the_relay",),
 )
 RELAY_HEADERS = QuotaRow(
     thing="bytes of unfinished connection headers in one relay, beyond 4 KiB each",
@@ -282,10 +236,6 @@ RELAY_HEADERS = QuotaRow(
     margin=HonestUse(
         "200 connections at once whose headers have a message definition of 8 KB",
         1_000_000,
-    ),
-    shown_by=(
-        "unit/relay/test_shares.py::test_headers_of_unknown_hosts_leave_room_for_the_robots",
-        "unit/relay/connections/test_pending_connections.py::test_long_headers_make_room_for_short_ones",
     ),
 )
 RELAY_TURN = QuotaRow(
@@ -300,14 +250,6 @@ RELAY_TURN = QuotaRow(
         "a host with ten cameras beside one that sends a stop",
         0,
         beyond="the camera host waits for the other one",
-    ),
-    shown_by=(
-        "unit/relay/test_loop.py::test_a_host_with_little_to_do_waits_for_one_quantum_of_others",
-        "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
-        "unit/relay/test_loop.py::test_costly_messages_of_many_hosts_never_come_in_a_row",
-        "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
-        "unit/relay/test_data_plane.py::test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time",
-        "unit/relay/test_grant_table.py::test_hosts_that_only_a_star_names_pay_as_one",
     ),
 )
 LIMITED_TOPIC = QuotaRow(
@@ -324,11 +266,6 @@ LIMITED_TOPIC = QuotaRow(
         0,
         beyond="the operator sets the limit",
     ),
-    shown_by=(
-        "unit/relay/transport/test_rate_limit.py::test_a_host_within_its_part_loses_nothing_because_of_others",
-        "unit/relay/transport/test_rate_limit.py::test_names_of_a_host_share_its_limit",
-        "unit/relay/test_data_plane.py::test_a_limit_counts_hosts_and_not_node_names",
-    ),
 )
 RELAY_MESSAGE = QuotaRow(
     thing="microseconds of processor time that monitors take for one message, request or reply",
@@ -344,13 +281,6 @@ RELAY_MESSAGE = QuotaRow(
         "a monitor that publishes a changed laser scan of twice 100 numbers",
         100,
     ),
-    shown_by=(
-        "unit/relay/monitors/test_interceptor.py::test_dialogue",
-        "unit/relay/monitors/test_interceptor.py::test_hosts_that_the_policy_does_not_name_have_one_pace",
-        "unit/relay/monitors/test_interceptor.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
-        "rosmop/tests/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
-        "unit/relay/monitors/test_time_budget.py::test_a_sender_of_costly_messages_has_the_whole_budget_ever_more_rarely",
-    ),
 )
 DRY_RUNS = QuotaRow(
     thing="seconds of processor time of the compiler for one dry run",
@@ -363,11 +293,6 @@ DRY_RUNS = QuotaRow(
     margin=HonestUse(
         "a specification that compiles in a second",
         1,
-    ),
-    shown_by=(
-        "unit/compiler/test_process.py::test_a_dry_run_ends_with_its_budget",
-        "unit/specifications/test_compiler_link.py::test_an_order_ends_a_dry_run",
-        "unit/specifications/test_specification_manager.py::test_a_client_has_one_dry_run_at_a_time",
     ),
 )
 SLICES = QuotaRow(
@@ -384,11 +309,6 @@ SLICES = QuotaRow(
         "a monitor with a slice for each of 1,000 tracked objects",
         1_000,
     ),
-    shown_by=(
-        "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",
-        "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_pushes_out_its_own",
-        "rosmop/tests/test_slices_shares.py::test_one_message_concerns_a_bounded_number_of_slices",
-    ),
 )
 REST_CONNECTIONS = QuotaRow(
     thing="connections to REST, including TLS handshakes",
@@ -402,11 +322,6 @@ REST_CONNECTIONS = QuotaRow(
     margin=HonestUse(
         "50 browsers behind one address, with six connections each",
         300,
-    ),
-    shown_by=(
-        "integration/master/test_quotas.py::test_handshakes_with_rest",
-        "unit/api/front/test_listener.py::test_a_known_peer_is_opened_before_waiting_unknown_hosts",
-        "unit/api/front/test_listener.py::test_unknown_hosts_in_the_handshake_make_room",
     ),
 )
 _STREAMS_SHOWN_BY = (
@@ -426,7 +341,6 @@ REST_STREAMS = QuotaRow(
         of="unkept",
         beyond='a page shows "too many clients follow" and tries again; raise `api_limits.streams` for more',
     ),
-    shown_by=_STREAMS_SHOWN_BY,
 )
 REST_EXPORTS = QuotaRow(
     thing="exports of the audit log and of evidence under way",
@@ -439,7 +353,6 @@ REST_EXPORTS = QuotaRow(
         1,
         beyond="a further one is answered 503 until one of them ends",
     ),
-    shown_by=_STREAMS_SHOWN_BY,
 )
 REST_WORK = QuotaRow(
     thing="slow answers of REST of one kind under way: dry runs and explanations (4: searches of the audit log; 1: its"
@@ -454,7 +367,6 @@ REST_WORK = QuotaRow(
         1,
         beyond="a further one waits",
     ),
-    shown_by=("unit/api/front/test_streams.py::test_a_viewer_with_many_requests_leaves_turns_to_an_admin",),
 )
 AUDIT_KINDS = QuotaRow(
     thing="kinds of folded denials in the audit log",
@@ -466,11 +378,6 @@ AUDIT_KINDS = QuotaRow(
         "a robot whose 20 nodes are each denied ten things, again and again",
         200,
     ),
-    shown_by=(
-        "unit/audit/log/test_folding.py::test_unknown_hosts_leave_named_hosts_their_kinds",
-        "unit/audit/log/test_folding.py::test_named_hosts_keep_a_line_each",
-        "integration/master/test_audit_quotas.py::test_unknown_hosts_do_not_displace_denials_of_named_hosts",
-    ),
 )
 AUDIT_READ_KINDS = QuotaRow(
     thing="kinds of folded reads in the audit log",
@@ -481,7 +388,6 @@ AUDIT_READ_KINDS = QuotaRow(
         "200 nodes of one machine that each read their own parameters, `/use_sim_time` and two others",
         800,
     ),
-    shown_by=("unit/audit/log/test_folding.py::test_reads_beyond_the_quota_are_recorded_in_full",),
 )
 AUDIT_RATE = 64 << 10
 """Bytes a second by which a host's debt of audit records falls."""
@@ -504,12 +410,6 @@ AUDIT_BYTES = QuotaRow(
         100_000_000,
         of="robot",
     ),
-    shown_by=(
-        "unit/audit/log/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",
-        "unit/audit/log/test_budget.py::test_a_host_in_debt_waits_until_it_is_paid",
-        "unit/audit/log/test_starts.py::test_a_robot_that_is_started_again_and_again_never_waits",
-        "integration/master/test_audit_quotas.py::test_reads_with_long_keys_do_not_fill_the_disk",
-    ),
 )
 AUDIT_RESERVE = QuotaRow(
     thing="bytes of free disk space reserved for the audit log",
@@ -525,10 +425,6 @@ AUDIT_RESERVE = QuotaRow(
         2_200_000,
         of="robot",
     ),
-    shown_by=(
-        "unit/control/assembly/test_quota_class.py::test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart",
-        "unit/audit/log/test_disk_space.py::test_low_space_raises_an_alarm_before_the_disk_is_full",
-    ),
 )
 NODE_PORTS = QuotaRow(
     thing="ports of `[Ports]`: one for each node, and one for each node and relay",
@@ -543,10 +439,6 @@ NODE_PORTS = QuotaRow(
         "200 nodes of one machine with four relays",
         1_000,
     ),
-    shown_by=(
-        "integration/master/test_quotas.py::test_ports_and_names",
-        "unit/master/endpoints/test_node_ports.py::test_no_host_takes_all_ports",
-    ),
 )
 NODES = QuotaRow(
     thing="nodes: each has one of the ports of `[Ports]`",
@@ -559,7 +451,6 @@ NODES = QuotaRow(
         "200 nodes of one machine",
         200,
     ),
-    shown_by=("unit/master/graph/test_registry.py::test_the_node_that_was_lost_first_makes_room",),
 )
 NAMES = QuotaRow(
     thing="registrations (topics, services and parameters of nodes)",
@@ -573,7 +464,6 @@ NAMES = QuotaRow(
         "200 nodes of one machine: ten publications, ten subscriptions, two services each",
         4_400,
     ),
-    shown_by=("unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",),
 )
 GRANTS = QuotaRow(
     thing="grants of the relays (permissions to subscribe to a topic or to call a service)",
@@ -585,7 +475,6 @@ GRANTS = QuotaRow(
         "200 nodes of one machine with ten subscriptions and ten service clients each",
         4_000,
     ),
-    shown_by=("unit/master/endpoints/test_relay_control.py::test_grants_of_all_hosts_are_bounded",),
 )
 IKE_HANDSHAKES = QuotaRow(
     thing="IKE handshakes under way",
@@ -598,7 +487,6 @@ IKE_HANDSHAKES = QuotaRow(
         "one machine that connects, and again after a lost packet",
         2,
     ),
-    shown_by=("unit/ipsec/test_strongswan.py::test_two_hundred_addresses_leave_handshakes_for_hosts",),
 )
 DESCRIPTORS = QuotaRow(
     thing="file descriptors of control, of each relay and of the supervisor (the api has a sixteenth)",
@@ -610,7 +498,6 @@ DESCRIPTORS = QuotaRow(
         "4,096 connections to RVMaster, and those of 200 nodes with four relays",
         10_000,
     ),
-    shown_by=("unit/quotas/test_descriptors.py::test_all_quotas_together_fit_the_descriptors",),
 )
 
 QUOTA_ROWS = (

@@ -15,10 +15,6 @@ APPROVALS = QuotaRow(
         "one person or agent with three calls that wait",
         3,
     ),
-    shown_by=(
-        "unit/features/approvals/test_approval_orders.py::test_a_host_has_a_quota_of_waiting_calls",
-        "unit/features/approvals/test_approval_orders.py::test_many_addresses_leave_another_host_its_calls",
-    ),
 )
 
 ROWS = (APPROVALS,)

@@ -21,11 +21,6 @@ DOOR_CONNECTIONS = QuotaRow(
         20,
         beyond="raise `doors.connections` for more",
     ),
-    shown_by=(
-        "unit/features/doors/test_session.py::test_connections_of_a_door_are_bounded_in_number_and_rate",
-        "unit/features/doors/test_connections.py::test_a_host_leaves_connections_for_others",
-        "unit/features/doors/test_door_table.py::test_doors_are_bounded",
-    ),
 )
 
 DOOR_BYTES = QuotaRow(
@@ -46,13 +41,6 @@ DOOR_BYTES = QuotaRow(
         20_000_000,
         of="whole",
     ),
-    shown_by=(
-        "unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",
-        "unit/features/doors/test_door_memory.py::test_the_clients_of_one_host_leave_memory_for_other_hosts",
-        "unit/features/doors/test_session.py::test_a_protocol_charges_a_client_for_what_it_keeps",
-        "unit/features/doors/test_session.py::test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds",
-        "unit/features/doors/test_unfinished.py::test_a_client_that_holds_memory_of_others_must_send_the_rest_faster",
-    ),
 )
 
 DOOR_TOPICS = QuotaRow(
@@ -65,10 +53,6 @@ DOOR_TOPICS = QuotaRow(
     margin=HonestUse(
         "20 clients with ten topics each",
         200,
-    ),
-    shown_by=(
-        "unit/features/doors/test_session.py::test_topics_of_a_door_are_bounded_over_all_its_hosts",
-        "unit/features/doors/test_session.py::test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_of_another",
     ),
 )
 
@@ -83,9 +67,6 @@ DOOR_CALLS = QuotaRow(
         "20 clients with two calls that wait",
         40,
     ),
-    shown_by=(
-        "unit/features/doors/test_session.py::test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts",
-    ),
 )
 
 DOOR_SERVICES = QuotaRow(
@@ -98,9 +79,6 @@ DOOR_SERVICES = QuotaRow(
     margin=HonestUse(
         "20 clients that offer two services each",
         40,
-    ),
-    shown_by=(
-        "unit/features/doors/test_session.py::test_services_that_one_host_offers_leave_some_for_others",
     ),
 )
 
@@ -115,7 +93,6 @@ DOOR_PARAMETERS = QuotaRow(
         "20 clients with 20 parameters each",
         400,
     ),
-    shown_by=("unit/features/doors/test_session.py::test_parameters_of_one_host_leave_some_for_others",),
 )
 
 ROWS = (DOOR_CONNECTIONS, DOOR_BYTES, DOOR_TOPICS, DOOR_CALLS, DOOR_SERVICES, DOOR_PARAMETERS)

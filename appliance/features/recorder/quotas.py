@@ -15,10 +15,6 @@ RECORDER_MEMORY = QuotaRow(
         20_000_000,
         beyond="large images are kept for a shorter time",
     ),
-    shown_by=(
-        "unit/features/recorder/test_ring.py::test_a_flood_displaces_only_itself",
-        "unit/features/recorder/test_ring.py::test_many_topics_of_a_host_displace_only_its_own",
-    ),
 )
 RECORDER_DISK = QuotaRow(
     thing="bytes of recordings",
@@ -34,13 +30,6 @@ RECORDER_DISK = QuotaRow(
     margin=HonestUse(
         "ten recordings of 30 MB by one host",
         300_000_000,
-    ),
-    shown_by=(
-        "unit/features/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own_recordings",
-        "unit/features/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",
-        "unit/features/recorder/test_recording_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
-        "unit/features/recorder/test_recording_plan.py::test_unknown_hosts_are_one",
-        "unit/features/recorder/test_recorder.py::test_a_flood_of_triggers_does_not_fill_the_disk",
     ),
 )
 

@@ -17,7 +17,6 @@ SIGN_ONS = QuotaRow(
         10,
         beyond="the first of them signs on again",
     ),
-    shown_by=("unit/features/sso/test_sign_on.py::test_a_flood_of_sign_ons_ends_only_its_own",),
 )
 SESSIONS = QuotaRow(
     thing="sessions of people who signed in at the provider",
@@ -29,7 +28,6 @@ SESSIONS = QuotaRow(
         "one person with a browser on four machines",
         4,
     ),
-    shown_by=("unit/features/sso/test_sessions.py::test_a_person_and_all_people_have_a_quota_of_sessions",),
 )
 
 ROWS = (SIGN_ONS, SESSIONS)

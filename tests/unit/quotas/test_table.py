@@ -1,6 +1,3 @@
-import re
-from pathlib import Path
-
 from appliance.quotas import table
 from appliance.quotas.table import (
     LIMITED_TOPIC,
@@ -16,7 +13,6 @@ from appliance.quotas.table import (
 from appliance.relay.monitors.time_budget import TimeBudget
 from distribution.generated_pages import all_rows, allowed
 
-ROOT = Path(__file__).parents[3]
 WITHOUT_NUMBER = {RVMASTER_FAREWELLS.thing, LIMITED_TOPIC.thing}
 
 
@@ -36,15 +32,6 @@ def test_only_turns_are_too_few_for_an_honest_use() -> None:
     """Beyond these bounds work waits for its turn, or costs a connection: nothing of an honest host is rejected."""
     short = [row for row in QUOTA_ROWS if row.margin.needs > allowed(row)]
     assert short == [RVMASTER_CONNECTIONS, RVMASTER_REQUESTS, PROBES, NODE_CALLS_UNDER_WAY]
-
-
-def test_each_row_is_attacked_by_a_test_that_exists() -> None:
-    for row in all_rows():
-        assert row.shown_by, row.thing
-        for place in row.shown_by:
-            file, _, name = place.partition("::")
-            folder = ROOT if file.startswith("rosmop/") else ROOT / "tests"
-            assert re.search(rf"^ *(?:async )?def {name}\(", (folder / file).read_text(), re.MULTILINE), place
 
 
 def test_the_reduction_of_a_message_over_budget_is_that_of_the_relay() -> None:
