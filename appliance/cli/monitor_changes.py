@@ -4,6 +4,7 @@ specifications, with their switches. The appliance itself never writes to it.
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -17,6 +18,14 @@ from appliance.cli.connection.target import Appliance
 from appliance.cli.output import moment
 from rosmop.form.switch_words import with_file_switch
 from rosmop.tool.terminal import say
+
+Hold = Annotated[
+    bool,
+    typer.Option(
+        "--hold",
+        help="Load even if a monitor then holds topics in use: it drops their messages until `rosrv monitor resume`",
+    ),
+]
 
 
 def say_replaced(body: Replaced | Replacement, enforce: str = "rosrv monitor enforce") -> None:

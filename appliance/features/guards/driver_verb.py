@@ -13,6 +13,7 @@ from appliance.features.guards.driver_outcomes import CONSENT, QUESTION, REQUEST
 from appliance.features.guards.guard_answers import DriverCheck
 from appliance.features.guards.presets import DRIVER_CHECK
 from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
+from appliance.features.guards.verbs import CommandTopic
 from rosmop.tool.terminal import say
 
 _VERB = "rosrv guard check-driver"
@@ -21,15 +22,7 @@ _VERB = "rosrv guard check-driver"
 @speaks
 def check_driver(
     appliance: Appliance,
-    topic: Annotated[
-        str,
-        typer.Argument(
-            metavar="TOPIC",
-            help="The topic of the commands, such as /cmd_vel",
-            autocompletion=completion.topics,
-            show_default=False,
-        ),
-    ],
+    topic: CommandTopic,
     *,
     by: Annotated[
         str,

@@ -1,18 +1,15 @@
 """The command `rosrv guard show`."""
 
 import re
-from typing import Annotated
-
-import typer
 
 from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import MonitorReadout
-from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, say_row
 from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_words import origin_in_words, state_in_words
 from appliance.features.guards.requests import GuardsWanted
+from appliance.features.guards.verbs import GuardName
 from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import refused, say
 
@@ -25,15 +22,7 @@ _FIRST_TIME, _LAST_TIME = 1e9, 1e10
 @speaks
 def show(
     appliance: Appliance,
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="GUARD",
-            help="Name as in `rosrv guard list`",
-            autocompletion=completion.monitors,
-            show_default=False,
-        ),
-    ],
+    name: GuardName,
 ) -> None:
     """Show a guard: whether it is in force, its parameters, and the values on which it decides now.
 

@@ -17,6 +17,7 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import (
+    Hold,
     folder_of,
     say_obstacle,
     say_replaced,
@@ -58,7 +59,7 @@ from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import say
 
 _VERB = "rosrv guard"
-_Name = Annotated[
+GuardName = Annotated[
     str,
     typer.Argument(
         metavar="GUARD",
@@ -67,23 +68,22 @@ _Name = Annotated[
         show_default=False,
     ),
 ]
-_Values = Annotated[
-    list[str] | None,
+CommandTopic = Annotated[
+    str,
     typer.Argument(
-        metavar="PARAMETER=VALUE",
-        help="Parameters of the preset, such as silent=0.5; `rosrv guard list` prints their units",
+        metavar="TOPIC",
+        help="The topic of the commands, such as /cmd_vel",
+        autocompletion=completion.topics,
         show_default=False,
     ),
 ]
+_VALUES = typer.Argument(
+    metavar="PARAMETER=VALUE",
+    help="Parameters of the preset, such as silent=0.5; `rosrv guard list` prints their units",
+    show_default=False,
+)
 _DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only report what would be loaded, changed and held")
-]
-_Hold = Annotated[
-    bool,
-    typer.Option(
-        "--hold",
-        help="Load even if a monitor then holds topics in use: it drops their messages until `rosrv monitor resume`",
-    ),
 ]
 
 
@@ -139,16 +139,8 @@ def new(
             show_default=False,
         ),
     ],
-    topic: Annotated[
-        str,
-        typer.Argument(
-            metavar="TOPIC",
-            help="The topic of the commands, such as /cmd_vel",
-            autocompletion=completion.topics,
-            show_default=False,
-        ),
-    ],
-    values: _Values = None,
+    topic: CommandTopic,
+    values: Annotated[list[str] | None, _VALUES] = None,
     *,
     by: Annotated[
         str | None,
@@ -184,7 +176,7 @@ def new(
     confirm_within: ConfirmWithin = None,
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
-    hold: _Hold = False,
+    hold: Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
     """Make a guard from a preset and load it. Its file is also written into the folder of specifications.
@@ -215,15 +207,8 @@ def new(
 @speaks
 def set_values(
     appliance: Appliance,
-    name: _Name,
-    values: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="PARAMETER=VALUE",
-            help="Parameters of the preset, such as silent=0.5; `rosrv guard list` prints their units",
-            show_default=False,
-        ),
-    ],
+    name: GuardName,
+    values: Annotated[list[str], _VALUES],
     *,
     dry_run: Annotated[
         bool,
@@ -243,7 +228,7 @@ def set_values(
     ] = None,
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
-    hold: _Hold = False,
+    hold: Hold = False,
 ) -> None:
     """Set parameters of a guard while it runs. It keeps its state, but starts again after a change of joint limits or
     of a deadline.
@@ -284,7 +269,7 @@ def set_values(
 @speaks
 def enforce(
     appliance: Appliance,
-    name: _Name,
+    name: GuardName,
     *,
     confirm_within: ConfirmWithin = None,
     when_standing: WhenStanding = False,
@@ -339,7 +324,7 @@ def upgrade(
     confirm_within: ConfirmWithin = None,
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
-    hold: _Hold = False,
+    hold: Hold = False,
     dry_run: _DryRun = False,
 ) -> None:
     """Replace guards of an older version with new ones from the present presets. Topics and values stay the same.
@@ -392,7 +377,7 @@ def _write(appliance: Appliance, name: str, *, temporary: bool) -> None:
 
 
 @speaks
-def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = None) -> None:
+def remove(appliance: Appliance, name: GuardName, confirm_within: ConfirmWithin = None) -> None:
     """Remove a guard, and its file from the folder of specifications.
 
     With --confirm-within, and over REST, the file stays: a reload of the folder loads the guard again.

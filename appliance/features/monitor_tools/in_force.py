@@ -13,7 +13,7 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
-from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline, write_switches
+from appliance.cli.monitor_changes import Hold, say_held, say_replaced, say_shadow_deadline, write_switches
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.tables import say_table, table_of
@@ -33,13 +33,6 @@ _SHADOW = "shadow mode"
 Shadow = Annotated[
     bool,
     typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
-]
-Hold = Annotated[
-    bool,
-    typer.Option(
-        "--hold",
-        help="Load even if a monitor then holds topics in use: it drops their messages until `rosrv monitor resume`",
-    ),
 ]
 Force = Annotated[
     bool,
@@ -100,10 +93,7 @@ def enable(
     appliance: Appliance,
     names: _Names,
     *,
-    shadow: Annotated[
-        bool,
-        typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
-    ] = False,
+    shadow: Shadow = False,
     when_standing: WhenStanding = False,
     within: Within = WITHIN,
 ) -> None:

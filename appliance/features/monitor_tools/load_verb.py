@@ -14,10 +14,10 @@ from appliance.channel.admin import AdminAnswer
 from appliance.channel.rest_bodies import DEFINITION, FILE_NAME, LONGEST_TEXT
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor_changes import say_replaced
+from appliance.cli.monitor_changes import Hold, say_replaced
 from appliance.cli.monitor_program import MONITOR
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
-from appliance.features.monitor_tools.in_force import Force, Hold, Shadow, given_to_monitors
+from appliance.features.monitor_tools.in_force import Force, Shadow, given_to_monitors
 from appliance.specifications.specification_files import Sources, signatures_of
 from rosmop.form.findings import Position, SpecificationError
 from rosmop.tool.specification_input import definition_folders, definition_texts, read_specifications
