@@ -1,4 +1,4 @@
-"""`/v1/policy/explain`, `/v1/policy/uses`, `/v1/policy/test`, `/v1/audit/ID/why`, `/grant`: nothing is loaded."""
+"""`/v1/policy`, with the report of a load, `explain`, `uses` and `test`; `/v1/audit/ID/why` and `grant`."""
 
 import asyncio
 from collections.abc import Iterable, Iterator
@@ -14,19 +14,19 @@ from appliance.api.front.access import Bearer
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask, ask_optional
-from appliance.api.front.routing import Responses, Routes, body
+from appliance.api.front.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord, readable_by
-from appliance.api.routes.named_hosts import host_in_words
-from appliance.api.routes.operation_routes import AnsweringRoutes
+from appliance.api.routes.named_hosts import HostLabels, host_in_words, labels_of
+from appliance.api.routes.operation_routes import Answer, AnsweringRoutes, OperationCall
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export, recorded_in_full
-from appliance.channel.admin import PolicyWanted, RegistrationsWanted
+from appliance.channel.admin import PolicyLoad, PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.graph_answers import Registration
-from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
-from appliance.features.policy_tools import policy_routes
+from appliance.channel.answers.policy_answers import Granted, PolicyInForce, PolicyKnown, Why
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation
+from appliance.features.policy_tools.dry_run_policy import judge_change
 from appliance.features.policy_tools.explanations import (
     asks_policy,
     explained,
@@ -43,6 +43,7 @@ from appliance.features.policy_tools.policy_models import (
     LostRule,
     PolicyUses,
     Question,
+    Report,
     RuleText,
     RuleUsed,
     Tested,
@@ -52,6 +53,63 @@ from appliance.policy.cases import CaseResult
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Category
+
+# The policy in force, and the report of a load.
+
+
+def _of_texts(services: Services) -> Routes:
+    router = Routes(prefix="/policy", tags=["policy"])
+    control = services.control
+
+    @router.get("")
+    async def policy(bearer: Viewer) -> Tagged[PolicyInForce]:
+        """Return the policy in force, with its ETag."""
+        known = await ask(control, PolicyWanted(), bearer)
+        return tagged(msgspec.convert(known, PolicyInForce, from_attributes=True))
+
+    @router.get("/hosts")
+    async def host_names(bearer: Viewer) -> HostLabels:
+        """Return the names of hosts: enrolled hosts, `robot` and groups of the policy in force, with their networks."""
+        known = await ask(control, PolicyWanted(), bearer)
+        return await asyncio.to_thread(labels_of, known)
+
+    return router
+
+
+async def _load(call: OperationCall[PolicyLoad]) -> Tagged[Report]:
+    order, services = call.order, call.services
+    current = await call.ask(PolicyWanted())
+    if order.expected not in (None, current.revision):
+        text = f"revision {current.revision} is in force, not {order.expected}"
+        raise ProblemError(412, "changed-meanwhile", text)
+    live = (await call.ask(RegistrationsWanted())).registrations
+    try:
+        async with services.judging.turn(call.bearer) if call.dry_run else services.ordering:
+            report = await asyncio.to_thread(judge_change, order, current, live)
+    except ProblemError as refusal:
+        if call.dry_run:
+            raise
+        # Control decides and records the rejection; this process adds the findings with their places.
+        try:
+            loaded = await call.ask(order)
+        except ProblemError as said:
+            raise refusal if said.kind == "refused" else said from None
+        report = Report(loaded=False, revision=0, warnings=[], changes=[], ends=[])
+    else:
+        if call.dry_run:
+            return tagged(report)
+        loaded = await call.ask(order)
+    return tagged(
+        msgspec.structs.replace(
+            report,
+            loaded=True,
+            revision=loaded.revision,
+            replaced=loaded.replaced,
+            revoked=loaded.revoked,
+            confirm_by=loaded.confirm_by,
+        )
+    )
+
 
 # Find the uses of each rule of the policy in force, for `/v1/policy/uses`.
 
@@ -111,8 +169,8 @@ _MAX_SHOWN = 1000
 
 
 def routes(services: Services) -> Routes:
-    router = AnsweringRoutes(policy_routes.ANSWERS, prefix="/v1")
-    router.include_router(policy_routes.routes(services))
+    router = AnsweringRoutes({"load_policy": Answer(_load)}, prefix="/v1")
+    router.include_router(_of_texts(services))
     router.include_router(_of_policy(services))
     router.include_router(_of_records(services))
     return router
