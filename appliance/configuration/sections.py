@@ -67,6 +67,11 @@ def checked_receiver(text: str) -> str:
     return text
 
 
+def checked_address(text: str) -> str:
+    split_receiver(f"tcp://{text}")
+    return text
+
+
 def is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
@@ -88,6 +93,10 @@ class FeatureSection:
     @property
     def holds_records(self) -> str:
         return ""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return ()
 
     @classmethod
     def with_stored(cls, _state: Path, given: dict[str, Any]) -> dict[str, Any]:

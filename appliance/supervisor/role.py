@@ -3,14 +3,17 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
-from appliance.configuration.sections import DEFAULTS, Sections
-from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
+from appliance.configuration.sections import DEFAULTS, FeatureSection, Sections
+from appliance.supervisor.sandbox.folders import folders_of
+from appliance.supervisor.sandbox.sandbox_plan import ROUTES, SandboxPlan
 
 if TYPE_CHECKING:
     from appliance.channel.messages import MemoryGiven
     from appliance.supervisor.sandbox.private_view import PrivateView
+
+S = TypeVar("S", bound=FeatureSection)
 
 
 @dataclass(frozen=True)
@@ -107,3 +110,43 @@ class Role:
     @property
     def serves_robot(self) -> bool:
         return not (self.outlives_takeover or self.stands_by)
+
+
+def sender(
+    name: str,
+    user: str,
+    part: str,
+    entry: str,
+    *,
+    section: type[S],
+    receiver: Callable[[S], RemoteReceiver | None],
+    configured: Callable[[S], bool] | None = None,
+    reads_log: bool = False,
+    **more: Any,
+) -> Role:
+    """Return the role of a process that speaks with the receiver of its feature's section, and with no other machine.
+
+    Without `configured`, it runs if there is a receiver.
+    """
+
+    def receiver_in(sections: Sections) -> RemoteReceiver | None:
+        return receiver(sections.of(section))
+
+    def runs(sections: Sections) -> bool:
+        return receiver_in(sections) is not None if configured is None else configured(sections.of(section))
+
+    def sandbox(facts: Facts) -> SandboxPlan:
+        found, log = receiver_in(facts.sections), (str(facts.part("control")),) if reads_log else ()
+        return SandboxPlan(
+            allowlist=True,
+            families=ROUTES,
+            reads=(*log, *folders_of(*facts.sections.of(section).files)),
+            connects=None if found is None or found.protocol == "udp" else (found.port,),
+        )
+
+    return Role(
+        name, user, part, entry, path=lambda facts: facts.config, links=("control",), nice=10, after="control",
+        dispensable=True, group="rosrv-api" if reads_log else None,
+        inputs=lambda facts: facts.sections.of(section).files, sandbox=sandbox, configured=runs, receiver=receiver_in,
+        **more,
+    )  # fmt: skip

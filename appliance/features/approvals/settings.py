@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 from urllib.parse import urlsplit
 
 from appliance.configuration.quantities import check
-from appliance.configuration.sections import FeatureSection, key, section, split_receiver
+from appliance.configuration.sections import FeatureSection, checked_address, key, section, split_receiver
 
 _HTTPS = 443
 
@@ -24,11 +24,6 @@ def _check_url(text: str) -> str:
     return text
 
 
-def _check_address(text: str) -> str:
-    split_receiver(f"tcp://{text}")
-    return text
-
-
 def _check_console(text: str) -> str:
     if text and (urlsplit(_check_url(text)).path or "?" in text):
         raise ValueError(f"{text!r} must be https://HOST:PORT without a path, as browsers open the console")
@@ -43,7 +38,7 @@ class ApprovalHook(FeatureSection):
     url: Annotated[str, check(_check_url)] | None = key(
         default=None, description="https URL that gets a POST for each call that begins to wait"
     )
-    address: Annotated[str, check(_check_address)] | None = key(
+    address: Annotated[str, check(checked_address)] | None = key(
         default=None, description="ADDRESS:PORT of the URL's host; names are not looked up"
     )
     secret_file: Path | None = key(

@@ -10,7 +10,14 @@ from urllib.parse import urlsplit
 
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.configuration.quantities import check, rules
-from appliance.configuration.sections import FeatureSection, is_loopback, key, section, split_receiver
+from appliance.configuration.sections import (
+    FeatureSection,
+    checked_address,
+    is_loopback,
+    key,
+    section,
+    split_receiver,
+)
 
 Algorithm = Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512"]
 """The accepted algorithms: signatures with a public key, neither `none` nor an HMAC."""
@@ -58,16 +65,11 @@ def _check_url(text: str) -> str:
     return text
 
 
-def _check_address(text: str) -> str:
-    split_receiver(f"tcp://{text}")
-    return text
-
-
 def _check_proxy(text: str) -> str:
     protocol, _slashes, place = text.partition("://")
     if protocol != "http":
         raise ValueError(f"{text!r} is not http://ADDRESS:PORT, for example http://10.0.0.3:3128")
-    _check_address(place)
+    checked_address(place)
     return text
 
 
@@ -100,7 +102,7 @@ class Sso(FeatureSection):
     issuer: Annotated[str, check(_check_issuer)] | None = key(
         default=None, description="the provider's issuer URL, exactly as in its discovery document"
     )
-    address: Annotated[str, check(_check_address)] | None = key(
+    address: Annotated[str, check(checked_address)] | None = key(
         default=None, description="ADDRESS:PORT of the provider; names are not looked up. Or give `proxy`"
     )
     proxy: Annotated[str, check(_check_proxy)] | None = key(
