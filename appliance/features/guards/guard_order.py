@@ -14,42 +14,30 @@ class Precedence(NamedTuple):
     otherwise: str
 
 
+_STOPPING = (
+    "agree",
+    "deadman",
+    "diagnostics",
+    "estop",
+    "fence",
+    "hold_to_run",
+    "mode",
+    "overspeed",
+    "ready",
+    "sensor",
+    "separation",
+    "zone",
+)
+"""Presets that stop a base at once, whatever it does."""
+
 PRECEDENCES = (
     Precedence(
-        (
-            "agree",
-            "deadman",
-            "diagnostics",
-            "estop",
-            "fence",
-            "hold_to_run",
-            "mode",
-            "overspeed",
-            "ready",
-            "sensor",
-            "separation",
-            "standstill",
-            "zone",
-        ),
+        tuple(sorted((*_STOPPING, "standstill"))),
         ("speed",),
         "after a stop the base jumps to its full velocity, as if it had driven on",
     ),
     Precedence(
-        (
-            "agree",
-            "deadman",
-            "diagnostics",
-            "estop",
-            "fence",
-            "hold_to_run",
-            "mode",
-            "overspeed",
-            "ready",
-            "sane",
-            "sensor",
-            "separation",
-            "zone",
-        ),
+        tuple(sorted((*_STOPPING, "sane"))),
         ("standstill",),
         "a base that moves after a stop by the other guard is not noticed",
     ),
