@@ -21,9 +21,11 @@ never compared.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from appliance.features.standby.witness.protocol import EXPIRY
+import msgspec
+
+from appliance.features.standby.witness.protocol import EXPIRY, HIGHEST
 
 RENEW_SECONDS = 0.3
 CLAIM_SECONDS = 0.1  # between two claims, while no appliance is admitted
@@ -51,19 +53,18 @@ class WitnessRequest:
     sent: float
 
 
-@dataclass(frozen=True)
-class WitnessAnswer:
-    """The lease after a request."""
+class WitnessAnswer(msgspec.Struct, frozen=True, kw_only=True):
+    """The lease after a request, as the witness sends it."""
 
-    ok: bool
-    reason: str
-    epoch: int
-    holder: str
-    in_sync: frozenset[str]
-    expired: bool
+    ok: bool = False
+    reason: str = ""
+    epoch: Annotated[int, msgspec.Meta(ge=0, le=HIGHEST)] = 0
+    holder: str = ""
+    in_sync: frozenset[str] = frozenset()
+    expired: bool = False
     """Whether no appliance has renewed the lease in time."""
     trouble: str = ""
-    follower_trouble: str = ""
+    follower_trouble: str = msgspec.field(default="", name="followers")
 
 
 @dataclass(frozen=True)

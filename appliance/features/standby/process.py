@@ -55,20 +55,12 @@ _MAX_PENDING = 32
 _Count = Annotated[int, msgspec.Meta(ge=0, le=HIGHEST)]
 
 
-class _AnswerBody(msgspec.Struct, frozen=True):
+class _AnswerBody(WitnessAnswer, frozen=True, kw_only=True):
     boot: str
     session: str
     number: _Count
     stale: bool = False
     last: _Count = 0
-    ok: bool = False
-    reason: str = ""
-    epoch: _Count = 0
-    holder: str = ""
-    in_sync: frozenset[str] = frozenset()
-    expired: bool = False
-    trouble: str = ""
-    followers: str = ""
 
 
 class WitnessChannel:
@@ -113,17 +105,7 @@ class WitnessChannel:
         if body.stale:
             self._boot, self._number = body.boot, max(self._number, body.last)
             return None
-        answer = WitnessAnswer(
-            body.ok,
-            body.reason,
-            body.epoch,
-            body.holder,
-            body.in_sync,
-            body.expired,
-            body.trouble,
-            body.followers,
-        )
-        return request, answer
+        return request, body
 
 
 # Judge whether the control of an active appliance serves the robot, by its reports.
