@@ -4,6 +4,7 @@ import datetime
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pkgutil import resolve_name
 from typing import Annotated
 
 import typer
@@ -31,7 +32,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
-from appliance.features.views import pair_view, passive_status, states_of
+from appliance.features.views import pair_view, states_of
 from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
 
@@ -84,7 +85,8 @@ def _look(appliance: Appliance) -> StatusView:
 def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
-        return _shown(appliance.ask(pair_view().request()), passive_status())
+        pair = pair_view()
+        return _shown(appliance.ask(resolve_name(pair.request)()), resolve_name(pair.status))
     return _shown(answer, partial(_view, appliance=appliance))
 
 

@@ -3,11 +3,9 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 from appliance.base.metric import Metric
-from appliance.base.user_errors import UserError
 
 S = TypeVar("S")
 
@@ -61,41 +59,23 @@ class StateView(Generic[S]):
     """
 
 
-_NO_PAIRS = UserError("this appliance is one of two, which this rosrv cannot show: use one with `standby`")
+class PairView(NamedTuple):
+    """The passive of two appliances. Three members are named `module:name`: a command imports only what it needs."""
 
-
-class PairView:
-    """The passive of two appliances, in a product without pairs."""
-
-    def request(self) -> Any:
-        raise _NO_PAIRS
-
-    def samples(self, state: Any) -> Mapping[str, Samples]:
-        del state
-        return {}
-
-
-def no_passive_status(state: Any) -> Any:
-    del state
-    raise _NO_PAIRS
-
-
-def no_verification(
-    own: Path, verified: Any, other: Path, state: Path, verify: Callable[[], Any]
-) -> tuple[Any, Callable[[Any], None]]:
-    """Verify the takeovers between two logs; return the result, and the function that prints it."""
-    del verified, state, verify
-    raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
-
-
-@dataclass(frozen=True)
-class FeatureView:
-    """A feature's views. The feature that makes pairs also names (`module:name`) its `PairView`, and its functions in
-    place of `no_passive_status` and `no_verification`; a command imports only the one that it needs.
+    request: str
+    """The request for its state."""
+    samples: Callable[[Any], Mapping[str, Samples]]
+    status: str
+    """The function from the state to the `StatusView`."""
+    verification: str
+    """The function that verifies the takeovers between two logs. It returns the result, and the function that prints
+    this.
     """
 
-    name: str
+
+class FeatureView(NamedTuple):
+    """The views of a feature."""
+
     states: tuple[StateView[Any], ...] = ()
-    pair: str = ""
-    passive_status: str = ""
-    verification: str = ""
+    pair: PairView | None = None
+    """In the feature that makes pairs."""

@@ -1,12 +1,11 @@
 """List the views of the features. To remove a feature, also remove its import and its row here."""
 
-import functools
-import pkgutil
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 
+from appliance.base.user_errors import UserError
 from appliance.channel.answers.field_docs import doc
 from appliance.features.adopt.view import ADOPT_VIEW
 from appliance.features.approvals.view import APPROVALS_VIEW
@@ -17,13 +16,12 @@ from appliance.features.guards.view import GUARDS_VIEW
 from appliance.features.recorder.view import RECORDER_VIEW
 from appliance.features.standby.view import STANDBY_VIEW
 from appliance.features.syslog.view import SYSLOG_VIEW
-from appliance.features.view import FeatureView, PairView, StateView, no_passive_status, no_verification
+from appliance.features.view import FeatureView, PairView, StateView
 
 VIEWS: tuple[FeatureView, ...] = (
     SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW, APPROVALS_VIEW, GUARDS_VIEW,
     ADOPT_VIEW, AUTHORITY_VIEW,
 )  # fmt: skip
-T = TypeVar("T")
 STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)
 
 
@@ -54,22 +52,8 @@ def states_of(status: Any) -> Iterator[tuple[StateView[Any], Any]]:
             yield view, state
 
 
-@functools.cache
 def pair_view() -> PairView:
-    return _named((view.pair for view in VIEWS), PairView)()
-
-
-def passive_status() -> Any:
-    return _named((view.passive_status for view in VIEWS), no_passive_status)
-
-
-def pair_verification() -> Any:
-    return _named((view.verification for view in VIEWS), no_verification)
-
-
-def _named(names: Iterator[str], otherwise: T) -> T:
-    name = next(filter(None, names), None)
-    if name is None:
-        return otherwise
-    member: T = pkgutil.resolve_name(name)
-    return member
+    for view in VIEWS:
+        if view.pair is not None:
+            return view.pair
+    raise UserError("this appliance is one of two, which this rosrv cannot show: use one with `standby`")

@@ -37,7 +37,6 @@ FAILURES = {
     "appliance/features/doors/rosbridge_frames.py::_publish_head": NEVER,
     "appliance/features/guards/released.py::origin_of": OURS,
     "appliance/features/standby/witness/protocol.py::tag_of": NEVER,
-    "appliance/features/views.py::pair_view": OURS,
     "appliance/network/cut.py::_libc": NEVER,
     "appliance/policy/model.py::address_of": SHORT,
     "appliance/relay/monitors/monitor_sets.py::prepare": NEVER,

@@ -40,7 +40,6 @@ def _line(state: AdoptState) -> tuple[str, Any]:
 
 
 ADOPT_VIEW = FeatureView(
-    "adopt",
     (
         StateView(
             "adopt",

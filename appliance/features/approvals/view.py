@@ -54,7 +54,6 @@ def _line(state: ApprovalCounts) -> tuple[str, str]:
 
 
 APPROVALS_VIEW = FeatureView(
-    "approvals",
     (
         StateView(
             "approvals",

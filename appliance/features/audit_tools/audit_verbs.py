@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Protocol, TextIO, TypeVar
 
 import msgspec
@@ -49,7 +50,7 @@ from appliance.cli.connection.audit_source import AuditSource, audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.unrecorded import unrecorded
-from appliance.features.views import pair_verification
+from appliance.features.views import pair_view
 from appliance.policy.host_names import HostInWords
 from appliance.policy.model import Category
 from rosmop.tool.batch_session import progress
@@ -353,7 +354,7 @@ def verify(
             _print_result(result, print_verification, as_json_lines=appliance.as_json)
             return
         own, of_other = partner
-        found, printed = pair_verification()(
+        found, printed = resolve_name(pair_view().verification)(
             own.path, result, of_other.path, other, lambda: _verify(of_other, other_key, other_checkpoints)
         )
         _print_result(found, printed, as_json_lines=appliance.as_json)

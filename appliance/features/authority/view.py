@@ -56,7 +56,6 @@ def _line(state: AuthorityState) -> tuple[str, str]:
 
 
 AUTHORITY_VIEW = FeatureView(
-    "authority",
     (
         StateView(
             "authority",

@@ -109,7 +109,6 @@ def _line(state: DoorsState) -> tuple[str, str]:
 
 
 DOORS_VIEW = FeatureView(
-    "doors",
     (
         StateView(
             "doors",

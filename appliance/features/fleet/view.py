@@ -102,7 +102,6 @@ def _bundle_line(bundles: BundlesState) -> tuple[str, Pieces]:
 
 
 FLEET_VIEW = FeatureView(
-    "fleet",
     (
         StateView(
             "collector",

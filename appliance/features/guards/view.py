@@ -164,7 +164,6 @@ def _samples(state: GuardsState) -> Mapping[str, Samples]:
 
 
 GUARDS_VIEW = FeatureView(
-    "guards",
     (
         StateView(
             "guards",

@@ -4,6 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
@@ -43,7 +44,8 @@ def routes(services: Services) -> Routes:
         except ProblemError as problem:
             if problem.kind != "standby":
                 raise
-            page = rendered_standby(await ask(services.control, pair_view().request(), bearer), calls)
+            wanted = resolve_name(pair_view().request)()
+            page = rendered_standby(await ask(services.control, wanted, bearer), calls)
         return Response(page, media_type=CONTENT_TYPE_LATEST)
 
     for prefix, name in (("", ""), ("/v1", "_v1")):

@@ -38,7 +38,6 @@ def _line(state: RecorderState) -> tuple[str, str]:
 
 
 RECORDER_VIEW = FeatureView(
-    "recorder",
     (
         StateView(
             "recorder",

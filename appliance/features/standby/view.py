@@ -13,7 +13,7 @@ from appliance.features.standby.summary import (
     present_troubles,
     standby_troubles,
 )
-from appliance.features.view import AlarmKind, FeatureView, Pieces, Samples, StateView
+from appliance.features.view import AlarmKind, FeatureView, PairView, Pieces, Samples, StateView
 
 # Write the state of two appliances in one line.
 
@@ -111,7 +111,6 @@ _METRICS = (
 
 
 STANDBY_VIEW = FeatureView(
-    "standby",
     (
         StateView(
             "standby",
@@ -140,7 +139,10 @@ STANDBY_VIEW = FeatureView(
             line=standby_line,
         ),
     ),
-    pair="appliance.features.standby.pair_view:StandbyPairView",
-    passive_status="appliance.features.standby.live_verbs:standby_view",
-    verification="appliance.features.standby.takeover_table:verification",
+    PairView(
+        "appliance.features.standby.requests:StandbyWanted",
+        samples_of,
+        "appliance.features.standby.live_verbs:standby_view",
+        "appliance.features.standby.takeover_table:verification",
+    ),
 )

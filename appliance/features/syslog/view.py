@@ -23,7 +23,6 @@ def _alarms(state: ForwardingState) -> Iterator[Trouble]:
 
 
 SYSLOG_VIEW = FeatureView(
-    "syslog",
     (
         StateView(
             "forwarding",
