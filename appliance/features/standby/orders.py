@@ -24,20 +24,10 @@ _SINGLE = "this appliance is not one of two; to add a standby, run `rosrv standb
 class StandbySource(Protocol):
     """The state of the two appliances, and the switchover."""
 
-    def state(self) -> StandbyState | None:
-        """Return None on a single appliance."""
+    def state(self) -> StandbyState: ...
 
     async def hand_over(self) -> None:
         """Raise `HandOverError`. The active appliance may end before this returns."""
-
-
-class SingleAppliance:
-    """The `StandbySource` of a single appliance."""
-
-    def state(self) -> None: ...
-
-    async def hand_over(self) -> None:
-        raise HandOverError(_SINGLE)
 
 
 class ActiveAppliance:
@@ -72,27 +62,28 @@ class ActiveAppliance:
 class StandbyOrders:
     """Answers operators of an appliance in service. Requests raise `UnknownThingError` without a pair."""
 
-    def __init__(self, source: StandbySource, trail: AuditTrail) -> None:
+    def __init__(self, source: StandbySource | None, trail: AuditTrail) -> None:
         self._source = source
         self._trail = trail
 
     async def state(self, _request: standby_requests.StandbyWanted) -> StandbyState:
-        return _state_of(self._source)
+        return self._pair().state()
 
     async def promote(self, _request: standby_requests.StandbyPromote, who: str) -> StandbyState:
         """Hand over to the standby. The order is on the disk before, because the hand-over ends this process."""
-        other = _state_of(self._source).other
+        pair = self._pair()
+        other = pair.state().other
         self._trail.happened(
             "switchover ordered", f"{other.name} ({other.address}) is to become the active appliance", who=who
         )
         await self._trail.durable()
         try:
-            await self._source.hand_over()
+            await pair.hand_over()
         except (HandOverError, WithdrawnError) as error:
             self._trail.happened("switchover failed", str(error), who=who)
             await self._trail.durable()
             raise
-        return _state_of(self._source)
+        return pair.state()
 
     async def obey(self, wanted: asyncio.Event, refuse: Callable[[str], Awaitable[None]]) -> None:
         while True:
@@ -103,6 +94,11 @@ class StandbyOrders:
             except HandOverError as error:
                 await refuse(str(error))
 
+    def _pair(self) -> StandbySource:
+        if self._source is None:
+            raise UnknownThingError(_SINGLE)
+        return self._source
+
 
 class StandbyAdministration:
     """The answers of a standby: its state and, if `orders`, the switchover.
@@ -112,38 +108,23 @@ class StandbyAdministration:
 
     def __init__(self, source: StandbySource, *, orders: bool) -> None:
         self._source = source
-        self._answers: dict[type, Callable[[], Awaitable[StandbyState]]] = {
-            standby_requests.StandbyWanted: self._state
-        }
-        if orders:
-            self._answers[standby_requests.StandbyPromote] = self._promote
+        self._orders = orders
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         del who
-        answer: Callable[[], Awaitable[Any]] | None = self._answers.get(type(request))
-        if answer is None:
-            return on_standby(_state_of(self._source))
+        promotes = self._orders and isinstance(request, standby_requests.StandbyPromote)
+        if not promotes and not isinstance(request, standby_requests.StandbyWanted):
+            return on_standby(self._source.state())
         try:
-            return admin.AdminAnswer(True, await answer())
+            if promotes:
+                await self._source.hand_over()
         except HandOverError as error:
             return admin.AdminAnswer(False, error=str(error), trouble="failed")
-
-    async def _state(self) -> StandbyState:
-        return _state_of(self._source)
-
-    async def _promote(self) -> StandbyState:
-        await self._source.hand_over()
-        return _state_of(self._source)
+        state: Any = self._source.state()
+        return admin.AdminAnswer(True, state)
 
 
 def on_standby(state: StandbyState) -> admin.AdminAnswer[Never]:
     other = state.other
     text = f"this appliance is the standby of {other.name} ({other.address}); give the command there"
     return admin.AdminAnswer(False, error=text, trouble="standby", active=other.address)
-
-
-def _state_of(source: StandbySource) -> StandbyState:
-    state = source.state()
-    if state is None:
-        raise UnknownThingError(_SINGLE)
-    return state

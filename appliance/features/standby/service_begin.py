@@ -26,7 +26,7 @@ from appliance.control.start_rehearsal import lacking_room
 from appliance.features.standby import lease_link
 from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
-from appliance.features.standby.orders import ActiveAppliance, SingleAppliance, StandbyOrders
+from appliance.features.standby.orders import ActiveAppliance, StandbyOrders
 from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.takeovers import TOOK_OVER, EpochOf, TookOver
@@ -225,7 +225,7 @@ _log = structlog.get_logger()
 async def begin(control: Control) -> ControlPart:
     role, store = control.role, control.store
     if not isinstance(role, PairedRole):
-        return _part(StandbyOrders(SingleAppliance(), control.trail))
+        return _part(StandbyOrders(None, control.trail))
     pair, replication, rollout = role.pair, role.replication, control.monitors.rollout
     recorder = await _begin_epoch(control, pair)
     copies = StateCopies(pair, store, rollout, replication.followed)

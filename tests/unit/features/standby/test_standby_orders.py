@@ -7,7 +7,7 @@ from appliance.channel import admin
 from appliance.control.errors import UnknownThingError
 from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.lease_client import HandOverError
-from appliance.features.standby.orders import SingleAppliance, StandbyAdministration, StandbyOrders
+from appliance.features.standby.orders import StandbyAdministration, StandbyOrders
 from tests.support.core import FakeTrail
 from tests.unit.features.standby.parts import Member
 
@@ -43,7 +43,7 @@ async def test_a_failed_switchover_is_recorded_with_its_reason() -> None:
 @pytest.mark.parametrize("request_", [standby_requests.StandbyWanted(), standby_requests.StandbyPromote()])
 async def test_a_single_appliance_says_how_it_gets_a_standby(request_: Any) -> None:
     trail = FakeTrail()
-    orders = StandbyOrders(SingleAppliance(), trail)
+    orders = StandbyOrders(None, trail)
     with pytest.raises(UnknownThingError, match="rosrv standby join"):
         await (
             orders.state(request_)
