@@ -5,6 +5,7 @@ import { useEffect, useRef } from "#console/html.js";
 import { live } from "#console/live.js";
 import { notable } from "#console/notable.js";
 import { counted } from "#console/numbers.js";
+import { attempt } from "#console/parts/attempt.js";
 import { inTime } from "#console/parts/resource.js";
 import { done, failed } from "#console/parts/toast.js";
 import { ask, get } from "#console/rest.js";
@@ -78,11 +79,8 @@ export function useHeldCalls() {
 /** Approve a call that still waits, or refuse one or end an approval, and say so. @param {number} number @param {"approve" | "refuse"} verb @param {number} [seconds] */
 export async function decide(number, verb, seconds) {
   const json = verb === "approve" ? { seconds, waits: true } : undefined;
-  try {
+  await attempt(async () => {
     const { body } = await ask("POST", `/v1/approvals/${number}/${verb}`, { json, match: "*" });
     done(`Approval ${body.number}: ${body.state === "lease" ? "approved" : body.state}`, `${body.host} ${body.resource}`);
-  } catch (failure) {
-    failed(failure);
-  }
-  await again();
+  }, again);
 }

@@ -2,6 +2,7 @@
 
 import { html, useId, useState } from "#console/html.js";
 import { lasting } from "#console/moments.js";
+import { attempt } from "#console/parts/attempt.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
@@ -9,7 +10,7 @@ import { Field } from "#console/parts/field.js";
 import { Given } from "#console/parts/given.js";
 import { Host, Sentence, useHosts } from "#console/parts/host.js";
 import { Empty, Failure, Loading } from "#console/parts/notice.js";
-import { done, failed } from "#console/parts/toast.js";
+import { done } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
 import { isSilent, isStuck, NotCarried, useGroups } from "./situation.js";
 
@@ -42,16 +43,11 @@ function HandOver(/** @type {{verb: keyof typeof VERBS, group: any, again: () =>
   const hosts = useHosts();
   const id = useId();
   const free = verb === "free";
-  const go = async () => {
-    try {
-      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: group.ranks.length ? {} : { free: { to: host, holder }, assign: { host, holder }, ask: { host } }[verb], match: "*" });
-      done(body.ranks.length ? `${body.group} is ${body.standing}` : body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
-      close();
-    } catch (failure) {
-      failed(failure);
-    }
-    again();
-  };
+  const go = () => attempt(async () => {
+    const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: group.ranks.length ? {} : { free: { to: host, holder }, assign: { host, holder }, ask: { host } }[verb], match: "*" });
+    done(body.ranks.length ? `${body.group} is ${body.standing}` : body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
+    close();
+  }, again);
   const text = {
     assign: html`${holder && html`<${Host} value=${holder} /> loses the group. `}The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.`,
     free: group.ranks.length ? "The group is handed back: the next node that moves drives." : html`<${Host} value=${holder} /> loses the group. It goes to this host, or without one to the first that waits.`,

@@ -2,6 +2,7 @@
 
 import { html, useEffect, useState } from "#console/html.js";
 import { OUTDATED } from "#console/outdated.js";
+import { attempt } from "#console/parts/attempt.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Field } from "#console/parts/field.js";
@@ -42,15 +43,10 @@ export function OwnDoor() {
     setEnded(reason);
     again();
   };
-  const add = async () => {
-    try {
-      await ask("POST", "/v1/doors", { json: { name: value.name }, match: "*" });
-      done(`${value.name} is added`, `It has the rights of door:${value.name} in the policy.`);
-    } catch (failure) {
-      failed(failure);
-    }
-    again();
-  };
+  const add = () => attempt(async () => {
+    await ask("POST", "/v1/doors", { json: { name: value.name }, match: "*" });
+    done(`${value.name} is added`, `It has the rights of door:${value.name} in the policy.`);
+  }, again);
   const rights = door && `/console/policy?${new URLSearchParams({ tab: "explain", host: `door:${door.name}`, node: door.node })}`;
   return html`<section class="panel" aria-labelledby="own-door"><div class="panel-head"><h2 id="own-door">Your door</h2>${door && html`<${Badge} word=${`door:${door.name}`} tone="note" />`}
       ${door && html`<span class="end"><${Link} class="button small" to=${rights}>Rights</${Link}>${open ? html`<${Button} small onClick=${() => leave("")}>Close</${Button}>` : html`<${Button} small tone="primary" disabled=${door.trouble !== ""} why=${door.trouble} onClick=${enter}>Open</${Button}>`}</span>`}</div>

@@ -3,6 +3,7 @@
 import { html, useState } from "#console/html.js";
 import { Moment } from "#console/moments.js";
 import { count, counted } from "#console/numbers.js";
+import { attempt, useAttempt } from "#console/parts/attempt.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
@@ -38,17 +39,14 @@ function DoorRow(/** @type {{door: any, again: () => void}} */ { door, again }) 
   const close = () => setOpen("");
   const remove = async () => {
     close();
-    try {
+    await attempt(async () => {
       await ask("DELETE", `/v1/doors/${encodeURIComponent(door.name)}`, { match: "*" });
       done(`${door.name} is removed`, "Its connections and tickets have ended.", async () => {
         await ask("POST", "/v1/doors", { json: { name: door.name, port: door.port, source: door.source }, match: "*" });
         done(`${door.name} is back`, "Its tickets stay ended.");
         again();
       });
-    } catch (failure) {
-      failed(failure);
-    }
-    again();
+    }, again);
   };
   const rights = `/console/policy?${new URLSearchParams({ tab: "explain", host: `door:${door.name}`, node: door.node })}`;
   return html`<tr data-door=${door.name}>
@@ -77,14 +75,9 @@ function Clients(/** @type {{door: any}} */ { door }) {
 function Ticket(/** @type {{door: any, again: () => void, close: () => void}} */ { door, again, close }) {
   const [hours, setHours] = useState("8");
   const [made, setMade] = useState(/** @type {any} */ (null));
-  const make = async () => {
-    try {
-      setMade((await ask("POST", `/v1/doors/${encodeURIComponent(door.name)}/tickets`, { json: { seconds: Number(hours) * 3600 }, match: "*" })).body);
-    } catch (failure) {
-      failed(failure);
-    }
-    again();
-  };
+  const make = () => attempt(async () => {
+    setMade((await ask("POST", `/v1/doors/${encodeURIComponent(door.name)}/tickets`, { json: { seconds: Number(hours) * 3600 }, match: "*" })).body);
+  }, again);
   const address = made && `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${made.path}`;
   const copy = async () => {
     try {
@@ -106,17 +99,13 @@ function Add(/** @type {{again: () => void, close: () => void}} */ { again, clos
   const [name, setName] = useState("");
   const [port, setPort] = useState("");
   const [source, setSource] = useState("");
-  const [error, setError] = useState(/** @type {unknown} */ (null));
-  const add = async () => {
-    try {
-      const { body } = await ask("POST", "/v1/doors", { json: { name, port: port ? Number(port) : null, source }, match: "*" });
-      done(`${body.name} is added`, `It has the address ${body.address}.`);
-      again();
-      close();
-    } catch (failure) {
-      setError(failure);
-    }
-  };
+  const [error, attemptToAdd] = useAttempt();
+  const add = () => attemptToAdd(async () => {
+    const { body } = await ask("POST", "/v1/doors", { json: { name, port: port ? Number(port) : null, source }, match: "*" });
+    done(`${body.name} is added`, `It has the address ${body.address}.`);
+    again();
+    close();
+  });
   const submit = (/** @type {Event} */ event) => {
     event.preventDefault();
     if (name) add();

@@ -4,7 +4,8 @@ import { useEffect, useState } from "#console/html.js";
 import { live } from "#console/live.js";
 import { ask, get } from "#console/rest.js";
 import { useStore } from "#console/store.js";
-import { done, failed } from "#console/parts/toast.js";
+import { attempt } from "#console/parts/attempt.js";
+import { done } from "#console/parts/toast.js";
 
 const PASSING = ["stopping", "withholding", "shadow"]; // states whose counts change without a change of the specifications
 
@@ -26,17 +27,14 @@ export function useGuards({ presets = true } = {}) {
   /** Send a change, say that it is done, and fetch the guards again. Returns whether it was done. `undo` gets the tag after it. */
   const order = async (/** @type {string} */ said, /** @type {string} */ more, /** @type {string} */ method, /** @type {string} */ path, /** @type {any} */ { undo, ...options } = {}) => {
     let made = false;
-    try {
+    await attempt(async () => {
       const { body } = await ask(method, path, { ...options, match: `"${state.body.tag}"` });
       done(said, more, undo && (async () => {
         await undo(body.tag);
         await again();
       }));
       made = true;
-    } catch (failure) {
-      failed(failure);
-    }
-    await again();
+    }, again);
     return made;
   };
   return { ...state, again, order };

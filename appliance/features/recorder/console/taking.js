@@ -4,10 +4,11 @@ import { html, useEffect, useState } from "#console/html.js";
 import { take } from "#console/audit/proof.js";
 import { isDenial } from "#console/audit/rows.js";
 import { iso, Moment } from "#console/moments.js";
+import { attempt } from "#console/parts/attempt.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
 import { Icon } from "#console/parts/icon.js";
-import { done, failed } from "#console/parts/toast.js";
+import { done } from "#console/parts/toast.js";
 import { ask, get, queryText } from "#console/rest.js";
 import { Link } from "#console/router.js";
 import { fileName, may } from "#console/session.js";
@@ -26,17 +27,11 @@ export function Taking({ row, small = false }) {
 /** @param {{row: any, small?: boolean, gone: () => void}} given `gone`: what follows when it is removed */
 export function Remove({ row, small = false, gone }) {
   const [asking, setAsking] = useState(false);
-  const remove = async () => {
-    try {
-      await ask("DELETE", `/v1/recordings/${encodeURIComponent(row.id)}`, { match: "*" });
-      done("The recording is removed", "The audit log records it.");
-      setAsking(false);
-      gone();
-    } catch (failure) {
-      setAsking(false);
-      failed(failure);
-    }
-  };
+  const remove = () => attempt(async () => {
+    await ask("DELETE", `/v1/recordings/${encodeURIComponent(row.id)}`, { match: "*" });
+    done("The recording is removed", "The audit log records it.");
+    gone();
+  }, () => setAsking(false));
   return html`<${Button} small=${small} role="admin" tone="danger" onClick=${() => setAsking(true)}>Remove</${Button}>
     ${asking && html`<${Dialog} title="Remove this recording?" close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
       <p>Its messages are deleted. The audit log keeps its hash and the events.</p></${Dialog}>`}`;

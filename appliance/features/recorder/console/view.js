@@ -4,6 +4,7 @@ import { html, useState } from "#console/html.js";
 import { live } from "#console/live.js";
 import { lasting, Moment } from "#console/moments.js";
 import { bytes, counted } from "#console/numbers.js";
+import { attempt } from "#console/parts/attempt.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
@@ -13,7 +14,7 @@ import { Host } from "#console/parts/host.js";
 import { Icon } from "#console/parts/icon.js";
 import { Empty, Failure, Loading } from "#console/parts/notice.js";
 import { useResource } from "#console/parts/resource.js";
-import { done, failed } from "#console/parts/toast.js";
+import { done } from "#console/parts/toast.js";
 import { Problem } from "#console/problem.js";
 import { ask, get } from "#console/rest.js";
 import { Link, place } from "#console/router.js";
@@ -100,16 +101,11 @@ function RecordNow(/** @type {{disabled: boolean}} */ { disabled }) {
   const [note, setNote] = useState("");
   const [after, setAfter] = useState("");
   const seconds = after.trim() === "" ? null : Number(after);
-  const record = async () => {
-    try {
-      const { body } = await ask("POST", "/v1/recordings", { match: "*", json: { note, after: seconds } });
-      done("It is being recorded", `Until ${new Date(body.ends / 1e6).toLocaleTimeString()}, or longer if more happens; then it is listed here.`);
-      setNote("");
-    } catch (failure) {
-      failed(failure);
-    }
-    setOpen(false);
-  };
+  const record = () => attempt(async () => {
+    const { body } = await ask("POST", "/v1/recordings", { match: "*", json: { note, after: seconds } });
+    done("It is being recorded", `Until ${new Date(body.ends / 1e6).toLocaleTimeString()}, or longer if more happens; then it is listed here.`);
+    setNote("");
+  }, () => setOpen(false));
   return html`<${Button} role="operator" tone="primary" disabled=${disabled} why="The flight recorder is not running" onClick=${() => setOpen(true)}><${Icon} name="recordings" size=${16} />Record now</${Button}>
     ${open && html`<${Dialog} title="Record the robot's messages" close=${() => setOpen(false)} foot=${html`<button class="button" onClick=${() => setOpen(false)}>Not now</button><${Button} role="operator" tone="primary" disabled=${seconds !== null && !(seconds > 0)} why="Enter a number of seconds above 0" onClick=${record}>Record</${Button}>`}>
       <p>Records the last seconds, from memory, and the next ones.</p><${Field} label="What happened" value=${note} set=${setNote} placeholder="The arm hit the door" maxlength="300" />

@@ -3,6 +3,7 @@
 import { html, useState } from "#console/html.js";
 import { save } from "#console/audit/proof.js";
 import { Moment } from "#console/moments.js";
+import { useAttempt } from "#console/parts/attempt.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
 import { Field } from "#console/parts/field.js";
@@ -18,25 +19,20 @@ const LASTS = /** @type {[string, string][]} */ ([["900", "15 minutes"], ["3600"
 /** @param {{host?: any, etag: string, close: () => void, after: () => void}} given `host`: one that is there already */
 export function Enrol({ host, etag, close, after }) {
   const [form, setForm] = useState({ name: host?.name ?? "", how: "token", endpoint: reachedAt(location.hostname), days: "90", token_seconds: "3600", open: "", address: "" });
-  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const [error, attemptToEnrol] = useAttempt();
   const [made, setMade] = useState(/** @type {any} */ (null));
   const set = (/** @type {string} */ name) => (/** @type {string} */ value) => setForm({ ...form, [name]: value });
   const token = form.how === "token";
-  const go = async () => {
-    setError(null);
-    try {
-      const response = await request(form, host, etag);
-      if (token) setMade(await response.json());
-      else {
-        save(await response.blob(), `rosrv-${form.name}.tar.gz`);
-        done(`The kit of ${form.name} is saved`, "It contains a private key: keep it secret, and delete it afterwards.");
-        close();
-      }
-      after();
-    } catch (failure) {
-      setError(failure);
+  const go = () => attemptToEnrol(async () => {
+    const response = await request(form, host, etag);
+    if (token) setMade(await response.json());
+    else {
+      save(await response.blob(), `rosrv-${form.name}.tar.gz`);
+      done(`The kit of ${form.name} is saved`, "It contains a private key: keep it secret, and delete it afterwards.");
+      close();
     }
-  };
+    after();
+  });
   if (made) return html`<${Made} made=${made} close=${close} />`;
   const title = host ? `A new ${host.enrolled === null ? "token" : "certificate"} for ${host.name}` : "Enrol a host";
   const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="admin" tone="primary" disabled=${!form.name} why="Enter a name" onClick=${go}>${token ? "Create the token" : "Create the kit"}</${Button}>`;

@@ -1,6 +1,7 @@
 /** Revoke a host, after confirmation. */
 
 import { html, useState } from "#console/html.js";
+import { useAttempt } from "#console/parts/attempt.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
 import { Field } from "#console/parts/field.js";
@@ -12,18 +13,14 @@ import { ask } from "#console/rest.js";
 /** @param {{host: any, etag: string, close: () => void, after: () => void}} given */
 export function Revoke({ host, etag, close, after }) {
   const [typed, setTyped] = useState("");
-  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const [error, attemptToRevoke] = useAttempt();
   const go = async () => {
-    setError(null);
-    try {
+    await attemptToRevoke(async () => {
       const { body } = await ask("DELETE", `/v1/hosts/${encodeURIComponent(host.name)}`, { match: etag });
       done(`${host.name} is revoked`, `${body.taken_back} registrations and grants were removed.`);
-      after();
       close();
-    } catch (failure) {
-      setError(failure);
-      after();
-    }
+    });
+    after();
   };
   const foot = html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" disabled=${typed !== host.name} why="Type the host's name first" onClick=${go}>Revoke ${host.name}</${Button}>`;
   return html`<${Dialog} title=${`Revoke ${host.name}?`} close=${close} foot=${foot}><${Failure} error=${error} />

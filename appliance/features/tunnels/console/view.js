@@ -4,6 +4,7 @@ import { html, useState } from "#console/html.js";
 import { live } from "#console/live.js";
 import { lasting, Moment } from "#console/moments.js";
 import { bytes, counted } from "#console/numbers.js";
+import { attempt } from "#console/parts/attempt.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Given } from "#console/parts/given.js";
@@ -11,7 +12,7 @@ import { Host } from "#console/parts/host.js";
 import { Icon } from "#console/parts/icon.js";
 import { Empty, Failure, Loading, Notice } from "#console/parts/notice.js";
 import { useResource } from "#console/parts/resource.js";
-import { done, failed } from "#console/parts/toast.js";
+import { done } from "#console/parts/toast.js";
 import { ask } from "#console/rest.js";
 import { useStore } from "#console/store.js";
 import { Block, Blocked } from "#console/hosts/block.js";
@@ -30,15 +31,11 @@ export function Hosts() {
   const body = value?.body;
   const etag = value?.etag ?? "";
   if (!body) return html`<div class="head"><h1>Hosts</h1></div>${error ? html`<${Failure} error=${error} retry=${again} />` : html`<section class="panel"><${Loading} rows=${8} /></section>`}`;
-  const reload = async () => {
-    try {
-      const { body: now } = await ask("POST", "/v1/hosts/reload", { match: etag });
-      done("hosts.yaml was read again", `${counted(now.declared.length, "host")} declared.`);
-      again();
-    } catch (failure) {
-      failed(failure);
-    }
-  };
+  const reload = () => attempt(async () => {
+    const { body: now } = await ask("POST", "/v1/hosts/reload", { match: etag });
+    done("hosts.yaml was read again", `${counted(now.declared.length, "host")} declared.`);
+    again();
+  });
   return html`<div class="head"><h1>Hosts</h1><span class="head-sub">${counted(body.hosts.length, "tunnel")}, ${body.hosts.filter((/** @type {any} */ one) => one.state === "up").length} up; ${counted(body.machines.length, "other machine")} without a tunnel</span>
       <div class="head-actions"><${Button} role="operator" onClick=${reload} title=${`Read ${body.hosts_file} again`}><${Icon} name="again" size=${16} />Reload hosts.yaml</${Button}><${Block}>Block a host…</${Block}><${Button} role="admin" tone="primary" onClick=${() => setOpen({ what: "enrol" })}><${Icon} name="plus" size=${16} />Enrol a host</${Button}></div></div>
     <div class="standing"><${Failure} error=${error} retry=${again} heard=${heard} />${isolation === "none" && html`<${Notice} title="Tunnels need isolation netns or container">With isolation none the appliance shares the robot's network, and no host can be enrolled.</${Notice}>`}

@@ -2,12 +2,12 @@
 
 import { html, useState } from "../html.js";
 import { count, whole } from "../numbers.js";
+import { attempt } from "../parts/attempt.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Notice } from "../parts/notice.js";
-import { failed } from "../parts/toast.js";
 import { get, queryText, send } from "../rest.js";
 import { fileName, may } from "../session.js";
 import { askedOf } from "./records.js";
@@ -55,13 +55,8 @@ function now() {
 }
 
 /** Download a REST answer as a file. */
-export async function take(/** @type {string} */ path, /** @type {string} */ name) {
-  try {
-    const response = await send("GET", path);
-    save(await response.blob(), name);
-  } catch (error) {
-    failed(error);
-  }
+export function take(/** @type {string} */ path, /** @type {string} */ name) {
+  return attempt(async () => save(await (await send("GET", path)).blob(), name));
 }
 
 /** Download a file. @param {Blob} blob @param {string} name */

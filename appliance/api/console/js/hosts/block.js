@@ -4,13 +4,14 @@ import { html, useEffect, useState } from "../html.js";
 import { applianceNow } from "../live.js";
 import { Moment } from "../moments.js";
 import { counted } from "../numbers.js";
+import { attempt, useAttempt } from "../parts/attempt.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Check, Field } from "../parts/field.js";
 import { Given } from "../parts/given.js";
 import { Failure } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
-import { done, failed } from "../parts/toast.js";
+import { done } from "../parts/toast.js";
 import { Problem } from "../problem.js";
 import { ask, get } from "../rest.js";
 
@@ -28,25 +29,20 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
   const [seconds, setSeconds] = useState("3600");
   const [note, setNote] = useState("");
   const [force, setForce] = useState(false);
-  const [error, setError] = useState(/** @type {any} */ (null));
-  const block = async () => {
-    setError(null);
-    try {
-      const json = { address: address.trim(), for_seconds: seconds ? Number(seconds) : null, note, force };
-      const { body } = await ask("POST", "/v1/blocks", { match: "*", json });
-      const uses = body.ended.uses.length ? ` Ended: ${body.ended.uses.join("; ")}.` : "";
-      const others = body.other_addresses.length ? ` Not blocked: its other address ${body.other_addresses.join(", ")}.` : "";
-      const undo = async () => {
-        await takeBack(body);
-        after();
-      };
-      done(`${body.name || body.address} is blocked`, `It lost ${ended(body.ended)}.${uses}${others}`, undo);
+  const [error, attemptToBlock] = useAttempt();
+  const block = () => attemptToBlock(async () => {
+    const json = { address: address.trim(), for_seconds: seconds ? Number(seconds) : null, note, force };
+    const { body } = await ask("POST", "/v1/blocks", { match: "*", json });
+    const uses = body.ended.uses.length ? ` Ended: ${body.ended.uses.join("; ")}.` : "";
+    const others = body.other_addresses.length ? ` Not blocked: its other address ${body.other_addresses.join(", ")}.` : "";
+    const undo = async () => {
+      await takeBack(body);
       after();
-      close();
-    } catch (failure) {
-      setError(failure);
-    }
-  };
+    };
+    done(`${body.name || body.address} is blocked`, `It lost ${ended(body.ended)}.${uses}${others}`, undo);
+    after();
+    close();
+  });
   const foot = html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="danger" disabled=${!address.trim()} why="Enter the host's address or name first" onClick=${block}>Block the host</${Button}>`;
   return html`<${Dialog} title="Block this host?" close=${close} foot=${foot}><${Failure} error=${error} />
     <p>The host is refused at every entrance, whatever the policy says: its registrations, connections, sessions and tunnel end. When the block ends, the policy decides again.</p>
@@ -100,15 +96,10 @@ export function Blocked({ mark }) {
     const timer = setTimeout(again, Math.max(1000, Math.min(...ends, 2 ** 31 - 1)));
     return () => clearTimeout(timer);
   }, [value]);
-  const unblock = (/** @type {any} */ one) => async () => {
-    try {
-      const { body } = await ask("DELETE", `/v1/blocks/${encodeURIComponent(one.address)}`, { match: "*" });
-      done(`${one.name || one.address} is no longer blocked`, `${counted(body.restored, "registration")} returned.`);
-    } catch (failure) {
-      failed(failure);
-    }
-    again();
-  };
+  const unblock = (/** @type {any} */ one) => () => attempt(async () => {
+    const { body } = await ask("DELETE", `/v1/blocks/${encodeURIComponent(one.address)}`, { match: "*" });
+    done(`${one.name || one.address} is no longer blocked`, `${counted(body.restored, "registration")} returned.`);
+  }, again);
   if (!value?.blocks.length) return null;
   return html`<section class="panel" aria-labelledby="blocked"><div class="panel-head"><h2 id="blocked">Blocked hosts</h2></div>
     <div class="table-wrap"><table class="table stacked"><thead><tr><th>Host</th><th>Since</th><th>Until</th><th>By</th><th>Note</th><th><span class="sr-only">Actions</span></th></tr></thead>

@@ -1,13 +1,14 @@
 /** Load a new specification, from a file or the editor, with its message definitions. */
 
 import { html, useState } from "../html.js";
+import { attempt } from "../parts/attempt.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Editor } from "../parts/editor.js";
 import { Check, Field } from "../parts/field.js";
 import { Given } from "../parts/given.js";
 import { Signature } from "../parts/signature.js";
-import { done, failed } from "../parts/toast.js";
+import { done } from "../parts/toast.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
 
@@ -42,23 +43,19 @@ export function LoadSpecification({ etag, files, signed, close, loaded }) {
     await loaded();
     close();
   };
-  const choose = async (/** @type {any} */ event) => {
-    try {
-      const read = await Promise.all([...event.target.files].map(async (/** @type {File} */ one) => [one.name, one.webkitRelativePath, await one.text()]));
-      for (const [file, , text] of read) {
-        if (file.endsWith(".rv")) {
-          setName(file);
-          draft.write(text);
-        }
+  const choose = (/** @type {any} */ event) => attempt(async () => {
+    const read = await Promise.all([...event.target.files].map(async (/** @type {File} */ one) => [one.name, one.webkitRelativePath, await one.text()]));
+    for (const [file, , text] of read) {
+      if (file.endsWith(".rv")) {
+        setName(file);
+        draft.write(text);
       }
-      const beside = read.filter(([file]) => file.endsWith(".sig")).map(([file, , text]) => [file.slice(0, -4), text]);
-      setSignatures({ ...signatures, ...Object.fromEntries(beside) });
-      const more = read.filter(([file]) => /\.(msg|srv)$/.test(file)).map(([file, , text]) => [`custom_msgs/${file}`, text]);
-      if (more.length) setDefinitions({ ...definitions, ...Object.fromEntries(more) });
-    } catch (failure) {
-      failed(failure);
     }
-  };
+    const beside = read.filter(([file]) => file.endsWith(".sig")).map(([file, , text]) => [file.slice(0, -4), text]);
+    setSignatures({ ...signatures, ...Object.fromEntries(beside) });
+    const more = read.filter(([file]) => /\.(msg|srv)$/.test(file)).map(([file, , text]) => [`custom_msgs/${file}`, text]);
+    if (more.length) setDefinitions({ ...definitions, ...Object.fromEntries(more) });
+  });
   const rename = (/** @type {string} */ old, /** @type {string} */ next) => setDefinitions(Object.fromEntries(Object.entries(definitions).map(([key, text]) => [key === old ? next : key, text])));
   const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="operator" onClick=${() => send(true)}>Dry run</${Button}><${Button} role="admin" tone="primary" onClick=${load}>${files.includes(name) ? "Replace the file" : "Load"}</${Button}>`;
   return html`<${Dialog} wide title="Load a specification" close=${close} foot=${foot}>

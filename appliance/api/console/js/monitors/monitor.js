@@ -4,6 +4,7 @@ import { html, useState } from "../html.js";
 import { live } from "../live.js";
 import { Moment } from "../moments.js";
 import { count, counted, lately } from "../numbers.js";
+import { attempt } from "../parts/attempt.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
@@ -16,7 +17,7 @@ import { Plot } from "../parts/plot.js";
 import { Signature } from "../parts/signature.js";
 import { useResource } from "../parts/resource.js";
 import { Tabs } from "../parts/tabs.js";
-import { done, failed } from "../parts/toast.js";
+import { done } from "../parts/toast.js";
 import { ask, get, send } from "../rest.js";
 import { go, Link } from "../router.js";
 import { may } from "../session.js";
@@ -114,17 +115,12 @@ function tone(/** @type {any} */ one) {
 
 function Remove(/** @type {any} */ { name, row, path, monitors, close }) {
   const others = monitors.body.monitors.filter((/** @type {any} */ one) => one.file === row.file && one.name !== name).map((/** @type {any} */ one) => one.name);
-  const remove = async () => {
-    try {
-      const { body } = await ask("DELETE", path, { match: monitors.etag });
-      done(`${row.file} is removed`, `Revision ${body.revision} of the specifications is in force.`);
-      go("/console/monitors");
-      await monitors.again();
-    } catch (failure) {
-      failed(failure);
-    }
-    close();
-  };
+  const remove = () => attempt(async () => {
+    const { body } = await ask("DELETE", path, { match: monitors.etag });
+    done(`${row.file} is removed`, `Revision ${body.revision} of the specifications is in force.`);
+    go("/console/monitors");
+    await monitors.again();
+  }, close);
   return html`<${Dialog} title=${`Remove ${name}?`} close=${close} foot=${html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
     <p>Its topics are no longer monitored. The file <code><${Given} value=${row.file} /></code> on disk is kept.</p>
     ${others.length > 0 && html`<p>This also removes the other monitors of this file: <${Given} value=${others.join(", ")} most=${200} />.</p>`}</${Dialog}>`;

@@ -4,13 +4,14 @@ import { html, useState } from "../html.js";
 import { live } from "../live.js";
 import { Moment } from "../moments.js";
 import { count, counted } from "../numbers.js";
+import { attempt } from "../parts/attempt.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { By, Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
 import { Sparkline } from "../parts/plot.js";
-import { done, failed } from "../parts/toast.js";
+import { done } from "../parts/toast.js";
 import { ask } from "../rest.js";
 import { Link, place } from "../router.js";
 import { useStore } from "../store.js";
@@ -27,15 +28,11 @@ export function Monitors() {
   if (!body) return html`<div class="head"><h1>Monitors</h1></div>${error ? html`<${Failure} error=${error} retry=${again} />` : html`<section class="panel"><${Loading} rows=${8} /></section>`}`;
   const row = body.monitors.find((/** @type {any} */ one) => one.name === chosen);
   if (chosen) return html`<${MonitorPage} key=${chosen} name=${chosen} row=${row} monitors=${monitors} />`;
-  const reload = async () => {
-    try {
-      const { body: now } = await ask("POST", "/v1/monitors/reload", { match: monitors.etag });
-      done(`Revision ${now.revision} of the specifications is in force`, "They are the folder's.");
-      await again();
-    } catch (failure) {
-      failed(failure);
-    }
-  };
+  const reload = () => attempt(async () => {
+    const { body: now } = await ask("POST", "/v1/monitors/reload", { match: monitors.etag });
+    done(`Revision ${now.revision} of the specifications is in force`, "They are the folder's.");
+    await again();
+  });
   return html`<div class="head"><h1>Monitors</h1><span class="head-sub">revision ${body.revision}, loaded <${Moment} at=${body.loaded} /> <${By} who=${body.who} />${body.note && html`: <${Given} value=${body.note} most=${80} />`}</span>
       <div class="head-actions"><${Button} role="admin" tone="primary" onClick=${() => setLoading(true)}><${Icon} name="up" size=${16} />Load a specification</${Button}></div></div>
     <div class="standing">

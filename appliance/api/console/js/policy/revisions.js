@@ -2,6 +2,7 @@
 
 import { html, useState } from "../html.js";
 import { Moment } from "../moments.js";
+import { attempt } from "../parts/attempt.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
@@ -10,7 +11,7 @@ import { Editor } from "../parts/editor.js";
 import { actor, Given } from "../parts/given.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
-import { done, failed } from "../parts/toast.js";
+import { done } from "../parts/toast.js";
 import { get } from "../rest.js";
 import { useStore } from "../store.js";
 import { change, draft, revisions } from "./draft.js";
@@ -31,15 +32,11 @@ export function Revisions() {
 function RevisionDialog(/** @type {{revision: number, back: boolean, close: () => void}} */ { revision, back, close }) {
   const live = useStore(draft, (one) => one.live);
   const { value, error } = useResource((signal) => get(`/v1/policy/revisions/${revision}`, {}, signal), [revision]);
-  const go = async () => {
-    try {
-      const body = await change("rollback", { revision });
-      done(`Revision ${body.revision} is in force`, `It has the text of revision ${revision}; ${body.revoked} registrations and connections were revoked.`);
-      close();
-    } catch (failure) {
-      failed(failure);
-    }
-  };
+  const go = () => attempt(async () => {
+    const body = await change("rollback", { revision });
+    done(`Revision ${body.revision} is in force`, `It has the text of revision ${revision}; ${body.revoked} registrations and connections were revoked.`);
+    close();
+  });
   const foot = back ? html`<button class="button" onClick=${close}>Leave it</button><${Button} tone="primary" role="operator" disabled=${!value} onClick=${go}>Roll back to revision ${revision}</${Button}>` : undefined;
   return html`<${Dialog} wide title=${back ? `Roll back to revision ${revision}?` : `Revision ${revision} beside revision ${live.revision}`} close=${close} foot=${foot}>
     ${error ? html`<${Failure} error=${error} />` : !value ? html`<${Loading} rows=${4} />` : html`<p class="muted">${back ? "Changes to the policy in force:" : "Removed lines are from the older revision."}</p>

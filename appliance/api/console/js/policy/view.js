@@ -5,6 +5,7 @@ import { live as appliance } from "../live.js";
 import { lasting, Moment } from "../moments.js";
 import { counted } from "../numbers.js";
 import { useApplianceTime } from "../parts/ago.js";
+import { attempt } from "../parts/attempt.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Difference } from "../parts/difference.js";
@@ -13,7 +14,7 @@ import { By, Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Loading, Notice } from "../parts/notice.js";
 import { Tabs } from "../parts/tabs.js";
-import { done, failed } from "../parts/toast.js";
+import { done } from "../parts/toast.js";
 import { go, place } from "../router.js";
 import { may } from "../session.js";
 import { useStore } from "../store.js";
@@ -89,13 +90,9 @@ function older(/** @type {URLSearchParams} */ query, /** @type {any} */ live) {
 
 function Standing(/** @type {{live: any, stale: boolean, showDiff: () => void}} */ { live, stale, showDiff }) {
   const now = useApplianceTime();
-  const act = (/** @type {string} */ what, /** @type {any} */ json, /** @type {string} */ said) => async () => {
-    try {
-      done(said, `Revision ${(await change(what, json)).revision} is in force.`);
-    } catch (error) {
-      failed(error);
-    }
-  };
+  const act = (/** @type {string} */ what, /** @type {any} */ json, /** @type {string} */ said) => () => attempt(async () => {
+    done(said, `Revision ${(await change(what, json)).revision} is in force.`);
+  });
   return html`<div class="standing">
     ${live.confirm_by && html`<${Notice} tone="warn" title=${`Revision ${live.revision} rolls back ${now === null ? "soon" : `in ${lasting(live.confirm_by - now)}`} unless confirmed`}>
       <div class="row"><${Button} small role="operator" tone="primary" onClick=${act("confirm", undefined, "The policy is kept")}>Keep it</${Button}><${Button} small role="operator" onClick=${act("rollback", {}, "The previous policy is back in force")}>Roll back now</${Button}></div></${Notice}>`}
