@@ -10,9 +10,11 @@
 
 import { mark, since } from "./elapsed.js";
 import { Problem } from "./problem.js";
+import { store, stored } from "./storage.js";
 import { createStore } from "./store.js";
 
 const KEY = "rosrv.token";
+const TAB = "sessionStorage";
 /** Names of people who signed in at the provider start with this. */
 export const PERSON = "sso:";
 /** Of all tabs: a person left without another signing in, so the provider must ask who signs in next. */
@@ -63,7 +65,7 @@ export function open(opened, keep) {
   const { locked } = session.get();
   const same = locked?.name === opened.name && locked.role === opened.role;
   if (locked && !same) end(null);
-  if (keep) store(opened.token);
+  if (keep) store(KEY, opened.token, TAB);
   const { number } = session.get();
   session.set({ current: opened, ended: null, heading: "Signed out", checking: false, waiting: null, locked: null, number: same ? number : number + 1 });
   clearTimeout(ending);
@@ -83,11 +85,7 @@ export function end(why, heading = "Signed out") {
 
 /** Note that the person left: the provider asks who signs in next, in each tab. */
 export function leave() {
-  try {
-    if (stated("sign-on")) localStorage.setItem(LEFT, "yes");
-  } catch {
-    // the provider may then sign the same person in without a question
-  }
+  if (stated("sign-on")) store(LEFT, "yes"); // without storage, the provider may sign the same person in without a question
 }
 
 /** Lock the unused page: forget the token, but keep unsaved work. */
@@ -116,16 +114,12 @@ export async function unlocked() {
 
 /** Return the token of an earlier page of this tab, unless that page was unused for so long that it would be locked. */
 export function kept() {
-  try {
-    const last = Number(sessionStorage.getItem(LAST_USE) ?? Date.now());
-    if (Date.now() - last >= UNUSED) {
-      forget();
-      leave();
-    }
-    return sessionStorage.getItem(KEY);
-  } catch {
-    return null;
+  const last = Number(stored(LAST_USE, TAB) ?? Date.now());
+  if (Date.now() - last >= UNUSED) {
+    forget();
+    leave();
   }
+  return stored(KEY, TAB);
 }
 
 /** Whether the user has the rights of this role; only investigators have the rights of investigators. @param {keyof typeof RANK} role */
@@ -144,11 +138,7 @@ for (const kind of USES) {
 
 function use() {
   used = mark();
-  try {
-    if (sessionStorage.getItem(KEY)) sessionStorage.setItem(LAST_USE, String(used.wall));
-  } catch {
-    // the token will not survive a reload
-  }
+  if (stored(KEY, TAB)) store(LAST_USE, String(used.wall), TAB);
 }
 
 /** Start the timer that locks the page after `UNUSED` milliseconds without use. */
@@ -159,18 +149,6 @@ function watch() {
   else lock();
 }
 
-function store(/** @type {string} */ token) {
-  try {
-    sessionStorage.setItem(KEY, token);
-  } catch {
-    // kept in memory only
-  }
-}
-
 function forget() {
-  try {
-    for (const name of [KEY, LAST_USE]) sessionStorage.removeItem(name);
-  } catch {
-    // without storage, no token is stored
-  }
+  for (const name of [KEY, LAST_USE]) store(name, null, TAB);
 }

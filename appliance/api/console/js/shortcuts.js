@@ -6,6 +6,7 @@
 import { html, useLayoutEffect, useRef } from "./html.js";
 import { Dialog } from "./parts/dialog.js";
 import { Check } from "./parts/field.js";
+import { store, stored } from "./storage.js";
 import { createStore, useStore } from "./store.js";
 
 const KEPT = "rosrv.keys";
@@ -27,7 +28,7 @@ const LIST = /** @type {[string, string][]} */ ([
   ["?", "This list"],
 ]);
 
-export const keys = createStore({ on: remembered(), listed: false });
+export const keys = createStore({ on: stored(KEPT) !== "off", listed: false });
 
 export function listKeys() {
   keys.update({ listed: true });
@@ -74,18 +75,6 @@ function typing(/** @type {Event} */ event) {
 }
 
 function turn(/** @type {boolean} */ on) {
-  try {
-    localStorage.setItem(KEPT, on ? "on" : "off");
-  } catch {
-    // without storage, the choice lasts until the page is closed
-  }
+  store(KEPT, on ? "on" : "off");
   keys.update({ on });
-}
-
-function remembered() {
-  try {
-    return localStorage.getItem(KEPT) !== "off";
-  } catch {
-    return true;
-  }
 }

@@ -10,6 +10,7 @@ import { Problem } from "./problem.js";
 import { ask } from "./rest.js";
 import { go } from "./router.js";
 import { end, leave, LEFT, open, PERSON, session, stated } from "./session.js";
+import { store, stored } from "./storage.js";
 
 const BEGUN = "rosrv.sign-on"; // the token, the state and the place of a sign-in that is not finished
 
@@ -22,7 +23,7 @@ export const PROVIDER = stated("sign-on");
 export async function begin(keep) {
   const token = newToken();
   const verifiers = await verifiersOf(token);
-  const { body } = await ask("POST", "/v1/sso/begin", { json: { ...verifiers, again: stored(LEFT, "localStorage") !== null }, anonymous: true });
+  const { body } = await ask("POST", "/v1/sso/begin", { json: { ...verifiers, again: stored(LEFT) !== null }, anonymous: true });
   const place = location.pathname + location.search;
   try {
     sessionStorage.setItem(BEGUN, JSON.stringify({ token, state: body.state, keep, place }));
@@ -41,8 +42,8 @@ export function returned() {
 /** Complete the sign-in with which the provider has sent the browser back. */
 export async function complete() {
   const given = new URLSearchParams(location.search);
-  const begun = /** @type {Begun | null} */ (JSON.parse(stored(BEGUN) ?? "null"));
-  remove(BEGUN);
+  const begun = /** @type {Begun | null} */ (JSON.parse(stored(BEGUN, "sessionStorage") ?? "null"));
+  store(BEGUN, null, "sessionStorage");
   go(begun?.place ?? "/console", { replace: true }); // the code leaves the URL, and the history
   session.update({ checking: true });
   try {
@@ -54,7 +55,7 @@ export async function complete() {
     const { state, token, keep } = begun;
     await ask("POST", "/v1/sso/complete", { json: { state, code: given.get("code"), iss: given.get("iss") ?? "" }, anonymous: true });
     const { body } = await ask("GET", "/v1/whoami", { token });
-    remove(LEFT, "localStorage");
+    store(LEFT, null);
     open({ token, ...body }, keep);
   } catch (/** @type {any} */ failure) {
     end(failure.message, "Not signed in");
@@ -73,20 +74,4 @@ export async function signOut() {
     }
   }
   end(null);
-}
-
-function stored(/** @type {string} */ name, /** @type {"localStorage" | "sessionStorage"} */ where = "sessionStorage") {
-  try {
-    return window[where].getItem(name);
-  } catch {
-    return null;
-  }
-}
-
-function remove(/** @type {string} */ name, /** @type {"localStorage" | "sessionStorage"} */ where = "sessionStorage") {
-  try {
-    window[where].removeItem(name);
-  } catch {
-    // nothing is stored
-  }
 }

@@ -1,5 +1,6 @@
 /** The dark or light theme: the system's until the switch is used. */
 
+import { store, stored } from "./storage.js";
 import { createStore } from "./store.js";
 
 const KEY = "rosrv.theme";
@@ -12,23 +13,11 @@ theme.subscribe(() => {
 });
 
 system.addEventListener("change", () => {
-  if (!remembered()) theme.set(system.matches ? "dark" : "light");
+  if (!stored(KEY)) theme.set(system.matches ? "dark" : "light");
 });
 
 export function switchTheme() {
   const next = theme.get() === "dark" ? "light" : "dark";
-  try {
-    localStorage.setItem(KEY, next);
-  } catch {
-    // without storage, the theme lasts until the page is closed
-  }
+  store(KEY, next);
   theme.set(next);
-}
-
-function remembered() {
-  try {
-    return localStorage.getItem(KEY);
-  } catch {
-    return null;
-  }
 }

@@ -2,6 +2,7 @@
 
 import { html } from "#console/html.js";
 import { Check } from "#console/parts/field.js";
+import { store, stored } from "#console/storage.js";
 import { createStore, useStore } from "#console/store.js";
 
 const KEPT = "rosrv.approval-sound";
@@ -9,7 +10,7 @@ const TONES = [660, 880]; // Hz
 const LENGTH = 0.18; // seconds
 
 /** `silent`: it is on, but the browser plays nothing before the page is clicked. */
-const sound = createStore({ on: remembered(), silent: false });
+const sound = createStore({ on: stored(KEPT) === "on", silent: false });
 let player = /** @type {AudioContext | null} */ (null);
 
 export function Sound() {
@@ -42,19 +43,7 @@ function play(/** @type {AudioContext} */ player, /** @type {number} */ tone, /*
 }
 
 function turn(/** @type {boolean} */ on) {
-  try {
-    localStorage.setItem(KEPT, on ? "on" : "off");
-  } catch {
-    // without storage, the choice lasts until the page is closed
-  }
+  store(KEPT, on ? "on" : "off");
   sound.update({ on });
   ring(); // so that the person hears it
-}
-
-function remembered() {
-  try {
-    return localStorage.getItem(KEPT) === "on";
-  } catch {
-    return false;
-  }
 }

@@ -4,6 +4,7 @@ import { html, useState } from "../html.js";
 import { plain } from "../words.js";
 import { Icon } from "../parts/icon.js";
 import { go } from "../router.js";
+import { store, stored } from "../storage.js";
 import { auditPath, NAMES } from "./filters.js";
 
 const KEY = "rosrv.searches"; // stores only filters: no token, and no content of the log
@@ -18,11 +19,7 @@ export function Presets({ filter }) {
   const [kept, setKept] = useState(read);
   const keep = (/** @type {Record<string, string>[]} */ next) => {
     setKept(next);
-    try {
-      localStorage.setItem(KEY, JSON.stringify(next));
-    } catch {
-      // without storage, the search is kept only until the page is left
-    }
+    store(KEY, JSON.stringify(next));
   };
   const known = [...PRESETS.map(([, one]) => one), ...kept].some((one) => same(one, filter));
   return html`<div class="row presets" role="group" aria-label="Searches">
@@ -34,7 +31,7 @@ export function Presets({ filter }) {
 /** Return the stored searches; ignore invalid content. @returns {Record<string, string>[]} */
 function read() {
   try {
-    const found = JSON.parse(localStorage.getItem(KEY) ?? "[]");
+    const found = JSON.parse(stored(KEY) ?? "[]");
     return found.map((/** @type {any} */ one) => Object.fromEntries(NAMES.filter((name) => typeof one[name] === "string" && one[name]).map((name) => [name, one[name]]))).filter((/** @type {any} */ one) => Object.keys(one).length).slice(-MAX);
   } catch {
     return [];

@@ -9,6 +9,7 @@ import { Given } from "../parts/given.js";
 import { Sentence } from "../parts/host.js";
 import { Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
+import { store, stored } from "../storage.js";
 
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
 const SEEN = "rosrv.reviewed";
@@ -28,11 +29,7 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
   const open = (incidents ?? []).filter((one) => !seen.has(one.id));
   const review = () => {
     const ids = [...open.map((one) => one.id), ...seen].slice(0, KEPT);
-    try {
-      localStorage.setItem(SEEN, JSON.stringify(ids));
-    } catch {
-      // without storage, the review is remembered only until the page is closed
-    }
+    store(SEEN, JSON.stringify(ids));
     setSeen(new Set(ids));
   };
   return html`<section class="panel spaced" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>${incidents !== null && !alarms.length && !open.length && html`<span class="muted small">No open alarms</span>`}
@@ -54,7 +51,7 @@ function Told(/** @type {{text: string}} */ { text }) {
 /** The ids, and no sequence number: another log at this address, such as that of a new state, begins again at 1. */
 function reviewed() {
   try {
-    const ids = JSON.parse(localStorage.getItem(SEEN) ?? "[]");
+    const ids = JSON.parse(stored(SEEN) ?? "[]");
     return new Set(Array.isArray(ids) ? ids : []);
   } catch {
     return new Set();
