@@ -29,7 +29,7 @@ from rosrv_fleet.index_commands import report_app, search, who_drove
 from rosrv_fleet.indexer import NOT_INDEXABLE, index
 from rosrv_fleet.invitations import Invitations
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json, duration
-from rosrv_fleet.output import configure_log
+from rosrv_fleet.output import configure_log, note
 from rosrv_fleet.presence import RobotPresence
 from rosrv_fleet.receipt_key import ReceiptKeyError, make_receipt_key
 from rosrv_fleet.robots import Robots, make_folder
@@ -285,7 +285,7 @@ def serve_collector(config: Config = DEFAULT_CONFIG) -> None:
     """
     found = load_config(config)
     if found.silent_seconds < LEAST_SILENT_SECONDS:
-        _note(
+        note(
             f"silent_seconds: {found.silent_seconds:g} is too short, so parked robots appear as silent:"
             f" set at least {LEAST_SILENT_SECONDS:g} in {config}"
         )
@@ -330,10 +330,6 @@ def _tokens(config: Path) -> OperatorTokens:
     return OperatorTokens(load_config(config).data / "tokens.json")
 
 
-def _note(text: str) -> None:
-    typer.echo(f"rosrv-fleet: {text}", err=True)
-
-
 @app.command()
 def verify(
     robot: Annotated[str | None, typer.Argument(help="Name of the robot; default: all")] = None,
@@ -358,9 +354,9 @@ def verify(
             complete = complete and proof.ok
             _print_proof(proof, as_json=as_json)
         if not proofs:
-            _note(f"{one.name}: nothing was collected yet")
+            note(f"{one.name}: nothing was collected yet")
         if len(proofs) > 1:
-            _note(
+            note(
                 f"{one.name}: {len(proofs)} logs, each proven for itself; see why a new one began:"
                 f" rosrv-fleet search --robot {one.name} --event 'log *'"
             )
@@ -400,7 +396,7 @@ def reindex(config: Config = DEFAULT_CONFIG) -> None:
         indexed, damaged = _index_all(collector)
     finally:
         collector.database.close()
-    _note(f"{counted(indexed, 'segment is', 'segments are')} indexed")
+    note(f"{counted(indexed, 'segment is', 'segments are')} indexed")
     raise typer.Exit(1 if damaged else 0)
 
 
@@ -422,5 +418,5 @@ def _index_all(collector: Collector) -> tuple[int, int]:
                     )
                 except NOT_INDEXABLE as error:
                     damaged += 1
-                    _note(f"{collector.store.path(place)} is not indexed: {printable(str(error).strip())}")
+                    note(f"{collector.store.path(place)} is not indexed: {printable(str(error).strip())}")
     return indexed, damaged

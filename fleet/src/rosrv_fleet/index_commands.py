@@ -35,6 +35,7 @@ from rosrv_fleet.collector import make_collector
 from rosrv_fleet.config import load_config
 from rosrv_fleet.database import Connection, IndexDatabase, Row
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
+from rosrv_fleet.output import note
 from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
 from rosrv_fleet.search_sql import FleetFilter, logs_statement, records_statement
 
@@ -134,7 +135,6 @@ def _reported(logs: Iterable[CollectedLog]) -> list[ReportedLog]:
 
 
 report_app = typer.Typer(no_args_is_help=True, help="Print the robots' logbooks.")
-_MAX_WAITING = 1000
 _REPORT_SECONDS = 600.0
 
 
@@ -163,7 +163,7 @@ def search(
     """
     wanted = FILTER.value(context.params)
     collector = make_collector(load_config(config))
-    waiting = collector.store.waiting(_MAX_WAITING)
+    waiting = collector.store.waiting()
     database = collector.searches.database
     database.open()
     try:
@@ -173,9 +173,9 @@ def search(
     for record in page.records:
         typer.echo(json.dumps(record, separators=(",", ":")) if as_json else _line(record))
     if page.waiting:
-        _note(f"{page.waiting} stored segments are not indexed yet: this search misses them")
+        note(f"{page.waiting} stored segments are not indexed yet: this search misses them")
     if page.cursor is not None:
-        _note(f"more records match: --cursor {page.cursor}, or a larger --limit")
+        note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
 def _line(record: dict[str, Any]) -> str:
@@ -211,7 +211,7 @@ def report_interventions(
     if output is not None:
         with output.open("x", encoding="utf-8") as file:
             file.write(page(report))
-        _note(f"written to {output}")
+        note(f"written to {output}")
     if as_json:
         typer.echo(msgspec.json.encode(report).decode())
     elif output is None:
@@ -249,11 +249,7 @@ def _report(config: Path, robot: str | None, since: int | None, until: int) -> M
     database = IndexDatabase(collector.config.database, connections=1, statement_seconds=_REPORT_SECONDS)
     database.open()
     try:
-        waiting = collector.store.waiting(_MAX_WAITING)
+        waiting = collector.store.waiting()
         return fleet_report(database, robot, since, until, waiting=waiting, version=__version__)
     finally:
         database.close()
-
-
-def _note(text: str) -> None:
-    typer.echo(f"rosrv-fleet: {text}", err=True)

@@ -15,6 +15,10 @@ def say(line: str) -> None:
     typer.echo(printable(line))
 
 
+def note(text: str) -> None:
+    typer.echo(f"rosrv-fleet: {text}", err=True)
+
+
 def say_json(fields: dict[str, object]) -> None:
     typer.echo(json.dumps(fields))
 

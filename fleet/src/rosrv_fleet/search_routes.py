@@ -21,8 +21,6 @@ from rosrv_fleet.search import (
 from rosrv_fleet.search_sql import FleetFilter
 from rosrv_fleet.tokens import FleetRole, OperatorToken
 
-MAX_WAITING = 1000
-
 
 @functools.wraps(filter_given)
 def filter_asked(**words: Any) -> Filter:
@@ -47,7 +45,7 @@ def search_router(collector: Collector) -> APIRouter:
         """Return the records of all robots that match, newest first."""
         try:
             with collector.searches.turn(viewer.name) as database:
-                waiting = collector.store.waiting(MAX_WAITING)
+                waiting = collector.store.waiting()
                 page = search_fleet(database, FleetFilter(robot, wanted), cursor, limit, waiting)
         except TooManySearchesError as error:
             raise HTTPException(429, str(error), {"Retry-After": "2"}) from error

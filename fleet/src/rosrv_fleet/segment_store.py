@@ -382,7 +382,7 @@ class SegmentStore:
     def robots_with(self, kind: str) -> list[str]:
         return sorted(os.listdir(self._folder / kind))  # noqa: PTH208  names, not paths
 
-    def waiting(self, most: int) -> int:
+    def waiting(self, most: int = 1000) -> int:
         found = set[SegmentPlace]()  # those that are tried again have two markers
         for kind in ("pending", "large", "damaged"):
             for robot in self.robots_with(kind):

@@ -52,7 +52,6 @@ from rosrv_fleet.search import (
     TooManySearchesError,
     search_fleet,
 )
-from rosrv_fleet.search_routes import MAX_WAITING
 from rosrv_fleet.search_sql import FleetFilter
 from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 
@@ -97,7 +96,7 @@ def _result(collector: Collector, viewer: str, asked: Mapping[str, str]) -> str:
     try:
         wanted = FleetFilter(asked["robot"] or None, filter_given(**words))
         with collector.searches.turn(viewer) as database:
-            waiting = collector.store.waiting(MAX_WAITING)
+            waiting = collector.store.waiting()
             found = search_fleet(database, wanted, asked["cursor"] or None, _ROWS, waiting)
     except (FilterError, TimestampError, SearchTooLongError, IndexDownError, TooManySearchesError) as error:
         return alert(str(error))

@@ -16,7 +16,7 @@ from appliance.base.input_files import open_given
 from rosrv_fleet.config import load_config
 from rosrv_fleet.evidence.store import EvidenceStore
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
-from rosrv_fleet.options import DEFAULT_CONFIG, Config
+from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import say, say_json
 
 evidence = typer.Typer(help="Add evidence bundles of robots, list and get them.", no_args_is_help=True)
@@ -57,9 +57,7 @@ def list_evidence(
     token_file: Token = NO_TOKEN,
     robot: Annotated[str, typer.Option("--robot", help="Name of the robot; default: all")] = "",
     *,
-    as_json: Annotated[
-        bool, typer.Option("--json", metavar="", help="One JSON object a line (NDJSON)")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """List the evidence bundles, latest first.
 

@@ -26,7 +26,7 @@ from prometheus_client.core import Metric
 from rosrv_fleet import collector, indexer, push_routes
 from rosrv_fleet import collector as collector_module
 from rosrv_fleet.access import PEER_CERTIFICATE
-from rosrv_fleet.app import RobotMetrics
+from rosrv_fleet.app import robot_metrics
 from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import FleetConfig, Limits, RetentionConfig
 from rosrv_fleet.enrolment import Robot
@@ -127,7 +127,7 @@ class RunningCollector:
         return robot
 
     def metrics(self) -> list[Metric]:
-        return list(RobotMetrics(health_of(self.parts)).collect())
+        return list(robot_metrics(health_of(self.parts)))
 
     def work(self) -> None:
         """Let the threads of the index and of retention take the turns that are due."""
