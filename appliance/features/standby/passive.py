@@ -67,12 +67,11 @@ from appliance.store.writer_thread import StoreError
 # Check on a standby that control could start if this appliance took over now, and would not give the lease away.
 #
 # The check also writes to the disk of the state and to the audit log, and compiles the specifications, so that a
-# takeover need not. It is repeated, because the appliance's own files, disk and ports may change. While it fails,
-# this
-# appliance does not claim the lease, but still follows the active one and stays in the in-sync set. With little room
-# it claims a lease that the active one has lost, but is given none: as a standby it writes less, so both could pass
-# the lease to and fro. The same holds from a change of the policy or the specifications until the check ends: a
-# takeover compiles what has changed, which can take longer than a new active appliance may need until it serves.
+# takeover need not. It is repeated, because the appliance's own files, disk and ports may change. While it fails, this
+# appliance does not claim the lease, but still follows the active one and stays in the in-sync set. With little room it
+# claims a lease that the active one has lost, but is given none: as a standby it writes less, so both could pass the
+# lease to and fro. The same holds from a change of the policy or the specifications until the check ends: a takeover
+# compiles what has changed, which can take longer than a new active appliance may need until it serves.
 
 _CHECK_AGAIN_SECONDS = 15.0
 

@@ -110,8 +110,7 @@ class WitnessChannel:
 
 # Judge whether the control of an active appliance serves the robot, by its reports.
 #
-# An appliance that holds the lease without serving is worse than none, because the other one sees a healthy holder.
-# So
+# An appliance that holds the lease without serving is worse than none, because the other one sees a healthy holder. So
 # the lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready.
 #
 # A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
@@ -191,8 +190,7 @@ class ServiceWatch:
 
 # The datagrams between two appliances, each authenticated with a shared key.
 #
-# A promise repeats the nonce and the number of its request. An active appliance uses one nonce per epoch, so a
-# request
+# A promise repeats the nonce and the number of its request. An active appliance uses one nonce per epoch, so a request
 # is new only if it has a greater epoch, or the same nonce and a greater number.
 
 PURPOSES: dict[type[PeerMessage], bytes] = {

@@ -28,8 +28,7 @@ from rosrv_fleet.workers import Workers
 
 # Remove old data: whole partitions of the index, and segments from the beginning of a log.
 #
-# The last segment of a log stays. The last removed checkpoint is noted first, so that `verify` can prove the rest.
-# Then
+# The last segment of a log stays. The last removed checkpoint is noted first, so that `verify` can prove the rest. Then
 # segments that were set aside wait for the index again, because the reason may have passed.
 
 _EVERY_SECONDS = 3600.0

@@ -42,8 +42,8 @@ from rosrv_fleet.search_sql import FleetFilter, logs_statement, records_statemen
 # Report the interventions in the safety settings of many robots, from the index, as `rosrv report interventions`.
 #
 # Each robot is one history: the logs of both appliances of a pair, and earlier logs, by time. A record that the
-# collector
-# has twice counts once: retention by size writes it again, and a log that was restored from a copy is sent again.
+# collector has twice counts once: retention by size writes it again, and a log that was restored from a copy is sent
+# again.
 
 _LIVE = "not known to the collector: make the report of one robot on its machine"
 _PAGE = 2000

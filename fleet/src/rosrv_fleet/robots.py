@@ -40,8 +40,7 @@ from rosrv_fleet.enrolment import (
 
 # Record each change of robots, invitations, tokens and evidence with its author (docs/reference/fleet.md, Acts).
 #
-# No change takes effect before its record is on the disk. An act without a second line was cut off by a crash, and
-# may
+# No change takes effect before its record is on the disk. An act without a second line was cut off by a crash, and may
 # or may not have taken effect.
 
 FILE = "acts.ndjson"

@@ -108,8 +108,7 @@ def _alternative_names(certificate: Path) -> x509.SubjectAlternativeName | None:
 
 # Limit the requests of clients that are neither robots nor operators, by address, and check the name in them.
 #
-# The limit is checked before any route, so logins, wrong tokens and health checks count as well. Robots prove who
-# they
+# The limit is checked before any route, so logins, wrong tokens and health checks count as well. Robots prove who they
 # are by a certificate, which no browser sends, so they may use any name.
 
 
