@@ -210,8 +210,7 @@ class SupervisorMessages:
 
 # Return unused memory of control to the system.
 #
-# glibc keeps up to 64 MiB of freed memory for each thread that reads or writes large values. Mapping every large
-# block
+# glibc keeps up to 64 MiB of freed memory for each thread that reads or writes large values. Mapping every large block
 # separately would return it at once, but take twice as long.
 
 _LOOK_SECONDS = 3.0

@@ -21,8 +21,7 @@ from roswire.definitions import Definitions
 
 # Note on which topics each specification acts, and let events on the others read whole messages only.
 #
-# An event reads only the fields of its pattern, so it would take a message that is cut off behind them, or too long,
-# as
+# An event reads only the fields of its pattern, so it would take a message that is cut off behind them, or too long, as
 # evidence. On a topic on which the specification acts this needs no check: subscribers reject what they cannot read.
 
 

@@ -11,8 +11,7 @@ from rosmop.types.messages import nearest, shown
 
 # Order the specifications of a set by their phases and by `order` statements.
 #
-# Without them they keep the order of the text. A phase or statement moves a specification after those that come
-# before
+# Without them they keep the order of the text. A phase or statement moves a specification after those that come before
 # it, no further than necessary.
 
 Phases = frozenset[tuple[str, str]]

@@ -26,10 +26,8 @@ from rosmop.logics.ptltl import SYNTAX as PTLTL
 # - A transition fulfils an until in two cases: the until is not an obligation after it, or the step could also have
 # discharged the until with the same obligations left.
 # - An infinite run is accepting if its transitions fulfil each until infinitely often.
-# - ``live`` keeps exactly the states from which some infinite word is accepted. ``after`` and ``live`` drop a set
-# that
-# includes another set, because only the union of languages counts there. The search for accepting runs keeps such
-# sets.
+# - ``live`` keeps exactly the states from which some infinite word is accepted. ``after`` and ``live`` drop a set that
+# includes another set, because only the union of languages counts there. The search for accepting runs keeps such sets.
 
 # Formulas of linear temporal logic in negation normal form, each stored once and identified by a number.
 #

@@ -18,8 +18,7 @@ from rosmop.types.roles import ROLES
 # The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
 #
 # The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic is allowed and two divisions
-# elsewhere. A C++ parser needs the declared types to distinguish a declaration from an expression; here two names in
-# a
+# elsewhere. A C++ parser needs the declared types to distinguish a declaration from an expression; here two names in a
 # row are a declaration.
 
 _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"

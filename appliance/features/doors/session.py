@@ -61,8 +61,7 @@ from roswire.xmlrpc import Value
 # Count the refusals of the topics of one client, to disconnect a program that does not read them. No I/O, no clock.
 #
 # Some libraries show a program no `status`, so it would go on for hours without an effect. They show the reason of a
-# closing frame. A call that waits for an approval is repeated until the operator answers, so it does not count, and
-# no
+# closing frame. A call that waits for an approval is repeated until the operator answers, so it does not count, and no
 # client is disconnected while one of its calls waits.
 
 MAX_REFUSALS = 100

@@ -22,8 +22,7 @@ from roswire.standard import standard_definitions
 # Compute what the last recorded scans would permit, by running a guard's own text on them in the engine.
 #
 # A copy of the guard gets the scans at their times, as messages of one node, and then a fast command straight ahead.
-# The
-# part of that command that passes is permitted.
+# The part of that command that passes is permitted.
 
 SCAN = "sensor_msgs/LaserScan"
 WITHOUT: Mapping[str, Mapping[str, str]] = {"separation": {"person": "0"}}

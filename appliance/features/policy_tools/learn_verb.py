@@ -58,8 +58,7 @@ from roswire.names import is_global_name
 
 # Extend a policy by questions to a person: one for each kind of right that recorded requests needed and it denies.
 #
-# An answer is a line of the policy, or a test case: what a person denied is a `deny` case, so the next run does not
-# ask
+# An answer is a line of the policy, or a test case: what a person denied is a `deny` case, so the next run does not ask
 # again. Both files are written after each answer.
 
 Answer = Literal["allow", "deny", "wider", "later", "quit"]

@@ -33,8 +33,7 @@ from appliance.features.sso.settings import Sso
 
 # Verify an ID token (OpenID Connect Core 1.0, 3.1.3.7). No I/O; the time is a parameter.
 #
-# Only a key of the provider that fits the token's algorithm in kind, curve and use verifies it. `jwk`, `jku` and
-# `x5u`
+# Only a key of the provider that fits the token's algorithm in kind, curve and use verifies it. `jwk`, `jku` and `x5u`
 # in the token are ignored, and a symmetric key is never used. Issuer, audience, nonce, subject, expiry and time of
 # issue are required. The claims are parsed only after the signature is verified.
 

@@ -37,8 +37,7 @@ from roswire.xmlrpc import Value
 # The drivers of topics with a rank, as the relays last reported them. No I/O.
 #
 # The reports survive a relay, and the next one begins with them. After a start of control, each topic is `unknown`
-# until
-# its relay reports.
+# until its relay reports.
 
 UNKNOWN = RankReported("", "", 0, "unknown")
 
