@@ -205,7 +205,9 @@ class LivenessSection:
     interval: Seconds = key(default=5.0, description="between two checks of a node")
     silent: Seconds = key(default=20.0, description="without an answer until the node is unregistered")
     shadow: Seconds = key(
-        default=600.0, description="for which the registration of a node that is gone can be restored"
+        default=600.0,
+        description="for which the registration of a node that is gone can be restored; for at least a day if the node"
+        " may still run, because it is only out of reach",
     )
 
 

@@ -22,6 +22,10 @@ class RefusedError(CallFailedError):
     """No server listens at the address."""
 
 
+class NoRouteError(RefusedError):
+    """The machine is off, or out of reach."""
+
+
 class UnreachedError(CallFailedError):
     """No connection was made in time: the machine is off, or packets are lost."""
 
@@ -230,7 +234,9 @@ class _Connection(asyncio.Protocol):
 
 
 def _kind(error: OSError) -> type[CallFailedError]:
-    if isinstance(error, ConnectionRefusedError) or error.errno in _UNREACHABLE:
+    if error.errno in _UNREACHABLE:
+        return NoRouteError
+    if isinstance(error, ConnectionRefusedError):
         return RefusedError
     return BrokenOffError if isinstance(error, ConnectionResetError | BrokenPipeError) else CallFailedError
 
@@ -238,4 +244,4 @@ def _kind(error: OSError) -> type[CallFailedError]:
 _HEAD_LIMIT = 64 << 10
 _READ_IN_A_SECOND = 1 << 20  # bytes that a slow machine parses in a second; larger values get more time
 _OFFLOAD = 256 << 10  # the most bytes of a call or answer that the event loop encodes or parses itself
-_UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH
+_UNREACHABLE = frozenset({101, 113})  # ENETUNREACH, EHOSTUNREACH

@@ -2,8 +2,9 @@
 
 A node is *lost* if its API refuses connections several times in a row, if another process answers at its address, or
 after `silent` seconds without an answer. It then keeps its registrations as a shadow until its API answers again,
-because a ROS 1 node never registers twice. If a firewall shuts out the appliance for a moment, all nodes of a host
-look lost, so a lost node is checked more often at first.
+because a ROS 1 node never registers twice: for `shadow` seconds if its address refuses connections or another node has
+its name, and otherwise for a day, because its machine may be suspended or out of reach. If a firewall shuts out the
+appliance for a moment, all nodes of a host look lost, so a lost node is checked more often at first.
 
 A node that only subscribes and was never reached, as behind NAT or a firewall, is there while it has a connection to a
 relay. It is forgotten after `silent` seconds without one, because it cannot answer later.
@@ -31,6 +32,7 @@ from appliance.rpc.fair_queue import Turns
 from appliance.rpc.xmlrpc_client import (
     BrokenOffError,
     CallFailedError,
+    NoRouteError,
     RefusedError,
     UnansweredError,
     UnreachedError,
@@ -58,6 +60,7 @@ _log = structlog.get_logger()
 _REPLACED_SECONDS = 60.0
 _IDLE_SECONDS = 30.0  # longer than any registering call takes
 _LOOK_AGAIN_SECONDS = 0.3
+_AWAY_SECONDS = 86_400.0
 _RECENT_SECONDS = 30.0  # after a loss, during which the node is checked every `RECENTLY_LOST_SECONDS`
 RECENTLY_LOST_SECONDS = 0.5
 _MADE_UP_SECONDS = 1.0  # between two repetitions for a node that keeps failing
@@ -236,7 +239,7 @@ class Liveness:
     async def look(self, incarnation: Incarnation) -> None:
         await self._turns.enter(incarnation.host)
         try:
-            there, why = await self._ask(incarnation)
+            there, why, ended = await self._ask(incarnation)
         finally:
             self._turns.leave(incarnation.host)
         if self.registry.by_key(incarnation.key) is not incarnation:
@@ -256,7 +259,7 @@ class Liveness:
                     self.graph.lost(incarnation, f"{why}, and it has no connection to a relay")
                 self._forget(incarnation)
         elif incarnation.life is not Life.LIVE:
-            self._look_at_retired(incarnation, answered=bool(there), refused=refused)
+            self._look_at_retired(incarnation, answered=bool(there), refused=refused, ended=refused and ended)
         elif refused or (not there and now - since >= self.settings.silent):
             self._lose(incarnation, why)
         elif there:
@@ -280,19 +283,20 @@ class Liveness:
         if missed.parameters:
             self.subscribers.tell_parameters(incarnation)
 
-    async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
+    async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str, bool]:
+        """Return whether the node answers (None: it cannot be called), why not, and whether its process has ended."""
         for attempt in range(1, self.refusals + 1):
             try:
                 await self._call(incarnation)
             except RefusedError as error:
                 if attempt == self.refusals:
-                    return None, f"{incarnation.name}: {error}"
+                    return None, f"{incarnation.name}: {error}", not isinstance(error, NoRouteError)
                 await asyncio.sleep(_LOOK_AGAIN_SECONDS)
             except CallFailedError as error:
-                return False, f"{incarnation.name}: {error}"
+                return False, f"{incarnation.name}: {error}", False
             else:
-                return True, ""
-        return False, ""
+                return True, "", False
+        return False, "", False
 
     async def _call(self, incarnation: Incarnation) -> None:
         """Call a node. Raises `CallFailedError`: as `RefusedError` if another process answers at the node's port.
@@ -318,15 +322,19 @@ class Liveness:
             return
         self.graph.lost(incarnation, why)
 
-    def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
+    def _look_at_retired(
+        self, incarnation: Incarnation, *, answered: bool, refused: bool, ended: bool
+    ) -> None:
         age = clock.now() - incarnation.changed
         if incarnation.life is Life.REPLACED:
             if refused or age > _REPLACED_SECONDS:
                 self._forget(incarnation)
-        elif age > self.settings.shadow:
-            self._forget(incarnation)
-        elif answered and self.registry.occupant(incarnation.name) is None:
+            return
+        replaced = self.registry.occupant(incarnation.name) is not None
+        if answered and not replaced:
             self._bring_back(incarnation)
+        elif age > (self.settings.shadow if ended or replaced else max(self.settings.shadow, _AWAY_SECONDS)):
+            self._forget(incarnation)
 
     def _forget(self, incarnation: Incarnation) -> None:
         self.graph.forgotten(incarnation)

@@ -9,9 +9,10 @@ from appliance.configuration import settings
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reconcile import liveness
 from appliance.master.reconcile.liveness import Presence
-from appliance.rpc.xmlrpc_client import RefusedError
+from appliance.rpc.xmlrpc_client import NoRouteError, RefusedError, UnansweredError
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
+from tests.support.scripted_nodes import Answer
 from tests.support.virtual_clock import ShiftedClock
 
 pytestmark = pytest.mark.anyio
@@ -209,3 +210,49 @@ async def test_a_node_that_answers_later_gets_what_it_missed(registers: bool) ->
         await world.look(node)
     assert node.reached
     assert {method for name, method, _given in world.deliveries.told if name == "/n"} == {"publisherUpdate"}
+
+
+async def _refuses(_node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
+    raise RefusedError("Connection refused")
+
+
+async def _has_no_route(_node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
+    raise NoRouteError("No route to host")
+
+
+async def _is_silent(_node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
+    raise UnansweredError("no answer")
+
+
+async def _is_another_process(_node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
+    return [1, "", 77]
+
+
+@pytest.mark.parametrize(
+    ("answer", "ended"),
+    [(_refuses, True), (_is_another_process, True), (_has_no_route, False), (_is_silent, False)],
+)
+async def test_a_node_that_may_live_is_registered_again_for_a_day(
+    answer: Answer, ended: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A laptop is suspended over lunch, or a robot drives out of reach: their nodes never register again."""
+    monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/a")
+    await world.look(node)
+    answers, world.nodes.answer = world.nodes.answer, answer
+    await world.look(node)
+    assert world.lives == [Life.SHADOW]
+    await asyncio.sleep(world.liveness.settings.shadow + 1.0)
+    await world.look(node)
+    assert world.lives == ([] if ended else [Life.SHADOW])
+    world.nodes.answer = answers
+    await world.look(node)
+    assert world.hidden.has(Kind.PUBLICATION, "/a") == ([] if ended else ["/n"])
+    if not ended:
+        world.nodes.answer = answer
+        await world.look(node)
+        await asyncio.sleep(86_401.0)
+        await world.look(node)
+        assert world.lives == []
