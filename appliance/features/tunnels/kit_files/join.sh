@@ -136,9 +136,9 @@ WantedBy=timers.target
 UNIT
 }
 
-# Where there is no systemd: a program in the background, by its pid file.
 run=/run/rosrv
 @stop@
+# Where there is no systemd: a program in the background, by its pid file.
 background() {
     what=$1
     shift
@@ -147,8 +147,16 @@ background() {
     setsid "$@" </dev/null >>"$run/$what.log" 2>&1 &
     echo $! > "$run/$what.pid"
 }
+# The keeper would ask for tunnels beside this script: it is stopped. That of an earlier run comes back however this ends.
+keep() {
+    trap - EXIT
+    if systemd; then systemctl restart rosrv-tunnel.service; else background keep /etc/rosrv/keep.sh; fi
+}
+keep_at_exit() {
+    trap keep EXIT
+    trap 'exit 1' HUP INT TERM
+}
 restart_charon() {
-    stop keep  # it would ask for tunnels, too
     stop charon
     rm -f /run/charon.vici
     # charon writes to syslog, which a container does not have.
@@ -174,18 +182,21 @@ CONF
     done
 }
 
-if [ -d /run/systemd/system ]; then
+if systemd; then
     why="journalctl -u strongswan"
     write_units
     systemctl daemon-reload
     systemctl enable --quiet rosrv-protect.service
     systemctl restart rosrv-protect.service
     systemctl enable --quiet strongswan.service
-    systemctl stop --quiet rosrv-tunnel.service  # it would ask for tunnels, too
+    if systemctl is-enabled --quiet rosrv-tunnel.service 2>/dev/null; then keep_at_exit; fi
+    systemctl stop --quiet rosrv-tunnel.service
     systemctl restart strongswan.service
 else
     why="/run/rosrv/charon.log"
     nft -f /etc/rosrv/protect.nft
+    if [ -e "$run/keep.pid" ]; then keep_at_exit; fi
+    stop keep
     restart_charon
 fi
 
@@ -213,19 +224,15 @@ fi
 if ! ping -q -n -c 5 -i 0.3 -W 2 -I @address@ @appliance@ >/dev/null 2>&1; then
     die "the appliance answers no ping through the tunnel; keep.sh needs it: allow ICMP echo in this machine's firewall"
 fi
-if [ -d /run/systemd/system ]; then
-    systemctl enable --quiet rosrv-tunnel.service
-    systemctl restart rosrv-tunnel.service
-else
-    background keep /etc/rosrv/keep.sh
-fi
+if systemd; then systemctl enable --quiet rosrv-tunnel.service; fi
+keep
 if [ -z "@rest@" ]; then
     say "warning: the appliance's REST is not reached through tunnels: the certificate cannot be renewed by itself"
-elif [ -d /run/systemd/system ]; then
+elif systemd; then
     systemctl enable --quiet rosrv-renew.timer
     systemctl restart rosrv-renew.timer
 fi
-if ! [ -d /run/systemd/system ]; then
+if ! systemd; then
     background renew sh -c 'while sleep 3600; do
         [ -z "@rest@" ] || /etc/rosrv/renew.sh
         for log in /run/rosrv/*.log; do [ "$(wc -c < "$log")" -lt 1000000 ] || : > "$log"; done

@@ -6,7 +6,6 @@ set -eu
 [ "$(id -u)" = 0 ] || { echo "leave.sh: run it as root: sudo ./leave.sh" >&2; exit 1; }
 cd /
 
-systemd() { [ -d /run/systemd/system ]; }
 @stop@
 
 if systemd; then

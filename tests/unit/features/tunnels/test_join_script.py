@@ -1,10 +1,12 @@
-"""The part of the kit's `join.sh` that decides which certificate stays, with a folder in place of `/etc/swanctl`.
+"""The kit's `join.sh`, with folders in place of `/etc` and `/run`.
 
-The real `openssl` runs, with the spelling of the tested version.
+The real `openssl` reads certificates, with the spelling of the tested version.
 """
 
 import os
+import re
 import shutil
+import socket
 import subprocess
 import time
 from collections import defaultdict
@@ -19,6 +21,7 @@ from appliance.ipsec.requests import make_key, signing_request
 from appliance.network.close_ports import RANGE_FILE, protection
 from appliance.network.firewall.firewall_rules import PortRange
 from tests.support.virtual_clock import VirtualClock
+from tests.support.waiting import eventually
 
 pytestmark = pytest.mark.nightly
 
@@ -144,3 +147,68 @@ def test_a_long_log_begins_again(tmp_path: Path) -> None:
         subprocess.run(["dash", "-eu", "-c", line.replace("/run/rosrv", str(tmp_path))], check=True)
         writer.write(b"next")
     assert (long.read_bytes(), short.stat().st_size) == (b"next", 999_999)
+
+
+PROGRAM = """\
+#!/bin/sh
+call="${{0##*/}} $*"
+echo "$call" >> calls
+case $call in
+{failure};;
+"id -u") echo 0;;
+"dpkg-query "*) echo install ok installed;;
+"systemctl is-enabled "*) [ -e {root}/run/rosrv/keep.pid ];;
+"setsid charon-systemd") ln -s {root}/socket {root}/run/charon.vici;;
+"swanctl --list-sas "*) echo INSTALLED;;
+esac
+"""
+FAILURES = {
+    "charon": '"systemctl restart strongswan.service" | "setsid charon-systemd") exit 1',
+    "configuration": '"swanctl --load-all "*) exit 1',
+    "tunnel": '"swanctl --list-sas "*) exit 1',
+    "answer": '"ping "*) exit 1',
+    "terminal": '"ping "*) kill -HUP $PPID',
+    "none": '"") exit 1',
+}
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.parametrize("joined", [True, False], ids=["joined before", "first"])
+@pytest.mark.parametrize("systemd", [True, False], ids=["systemd", "container"])
+def test_a_failed_run_leaves_a_joined_host_its_keeper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, systemd: bool, joined: bool, failure: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("bin", "etc/strongswan.d/charon", "etc/systemd/system", "run/rosrv", "swanctl/private"):
+        Path(folder).mkdir(parents=True)
+    for folder in ("swanctl/x509", "swanctl/x509ca", *(["run/systemd/system"] if systemd else [])):
+        Path(folder).mkdir(parents=True)
+    for file in ("private/rosrv.key", "x509/rosrv.pem", "x509ca/rosrv-ca.pem", "swanctl.conf"):
+        Path("swanctl", file).touch()
+    for file in ("keep.sh", "renew.sh", "leave.sh", *(["run/rosrv/keep.pid"] if joined else [])):
+        Path(file).touch()
+    Path("protect.nft").write_text(protection(["10.113.11.1"], PortRange(1, 65535), ()))
+    for name in ("id", "dpkg-query", "nft", "ip", "systemctl", "setsid", "swanctl", "ping", "curl", "sleep"):
+        Path("bin", name).write_text(PROGRAM.format(failure=FAILURES[failure], root=tmp_path))
+        Path("bin", name).chmod(0o755)
+    script = filled("join.sh", defaultdict(str, name="laptop", connections="rosrv"))
+    Path("join.sh").write_text(re.sub(r"(?<![\w/])/(?=(etc|run)/)", f"{tmp_path}/", script))
+    with socket.socket(socket.AF_UNIX) as charon:
+        charon.bind("socket")
+        done = subprocess.run(
+            ["dash", "join.sh"],
+            env={"PATH": f"{tmp_path}/bin:{os.environ['PATH']}"},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (done.returncode == 0) == (failure == "none"), done.stderr
+    keeper = "systemctl restart rosrv-tunnel.service" if systemd else f"setsid {tmp_path}/etc/rosrv/keep.sh"
+    times = int(joined or failure == "none")  # a container's keeper starts in the background
+    eventually(lambda: Path("calls").read_text().splitlines().count(keeper) == times, lambda: done.stderr)
+    calls = Path("calls").read_text().splitlines()
+    charon_calls = [place for place, call in enumerate(calls) if call.startswith(("swanctl", "ping"))]
+    assert keeper not in calls[: max(charon_calls, default=0)], (
+        "the keeper asks for tunnels beside the script"
+    )
