@@ -107,11 +107,18 @@ def test_the_default_range_is_the_kernels() -> None:
     assert 1 <= found.first < found.last <= 65535
 
 
-def test_the_rules_are_loaded_after_the_firewalls_that_flush_all_rules() -> None:
-    for place in ("docs/close-the-ports.md", "appliance/features/tunnels/kit_files/join.sh"):
-        units = re.findall(r"^\[Unit\]\n.*?^UNIT$", (ROOT / place).read_text(), re.DOTALL | re.MULTILINE)
-        (ours,) = [unit for unit in units if "ExecStart=/usr/sbin/nft -f " in unit]
-        assert "\nAfter=nftables.service netfilter-persistent.service ufw.service\n" in ours
+def test_units_that_come_before_the_network_fit_into_the_boot() -> None:
+    """They come after the firewalls that flush all rules. Default dependencies close a cycle through cloud-init."""
+    places = [path for root in ("appliance", "distribution", "docs") for path in (ROOT / root).rglob("*.*")]
+    texts = [path.read_text() for path in places if path.suffix in (".service", ".sh", ".md")]
+    units = [unit for text in texts for unit in re.split(r"^(?=\[Unit\]\n)", text, flags=re.MULTILINE)[1:]]
+    early = [unit for unit in units if re.search(r"^Before=.*\bnetwork-pre\.target", unit, re.MULTILINE)]
+    assert len(early) >= 4
+    for unit in early:
+        assert "\nDefaultDependencies=no\n" in unit
+        assert re.search(
+            r"^After=.*\bnftables\.service netfilter-persistent\.service ufw\.service$", unit, re.MULTILINE
+        )
 
 
 def test_no_page_flushes_the_rules_of_a_machine() -> None:

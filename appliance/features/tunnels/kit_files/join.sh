@@ -84,10 +84,12 @@ write_units() {
     cat > /etc/systemd/system/rosrv-protect.service <<'UNIT'
 [Unit]
 Description=Closes the ROS ports of this machine to all but the ROSRV appliance
-After=nftables.service netfilter-persistent.service ufw.service
+DefaultDependencies=no
+Conflicts=shutdown.target
+After=local-fs.target nftables.service netfilter-persistent.service ufw.service
 PartOf=nftables.service
 ReloadPropagatedFrom=nftables.service
-Before=network-pre.target
+Before=network-pre.target shutdown.target
 Wants=network-pre.target
 
 [Service]
@@ -147,7 +149,7 @@ background() {
     setsid "$@" </dev/null >>"$run/$what.log" 2>&1 &
     echo $! > "$run/$what.pid"
 }
-# The keeper would ask for tunnels beside this script: it is stopped. That of an earlier run comes back however this ends.
+# The keeper is stopped, as it would ask for tunnels, too. That of an earlier run comes back however this one ends.
 keep() {
     trap - EXIT
     if systemd; then systemctl restart rosrv-tunnel.service; else background keep /etc/rosrv/keep.sh; fi
