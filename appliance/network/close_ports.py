@@ -216,8 +216,8 @@ def remove() -> None:
     _nft(["-f", "-"], f"table inet {TABLE}\ndelete table inet {TABLE}\n")
 
 
-def is_applied() -> bool:
-    return f"table inet {TABLE}" in _nft(["list", "tables"], "").splitlines()
+def is_applied(table: str = TABLE) -> bool:
+    return f"table inet {table}" in _nft(["list", "tables"], "").splitlines()
 
 
 def applied() -> str:

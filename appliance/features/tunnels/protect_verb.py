@@ -202,6 +202,11 @@ def _remove(as_json: bool) -> None:
     was = protection.is_applied()
     protection.remove()
     words = "The ROS ports of this machine are open again.\n" if was else "There was nothing to remove.\n"
+    if protection.is_applied(protection.TUNNEL_TABLE):
+        words = (
+            "The kit of this machine's tunnel closes the ROS ports again within 15 s. To open them, leave the tunnel:"
+            " sudo /etc/rosrv/leave.sh\n"
+        )
     _say(as_json, {"event": "removed", "was_applied": was}, words)
 
 

@@ -286,6 +286,13 @@ def test_applying_and_removing_can_be_repeated(robot: Host, gateway: Host) -> No
     assert "nothing to remove" in protect(robot, "--remove")
 
 
+def test_removing_names_a_tunnel_that_closes_the_ports_again(robot: Host, gateway: Host) -> None:
+    close(robot, gateway)
+    robot.popen(["nft", "add", "table", "inet", "rosrv_tunnel"]).wait(timeout=20)
+    assert "/etc/rosrv/leave.sh" in protect(robot, "--remove")
+    assert "rosrv_protect" not in rules(robot)
+
+
 def test_the_printed_file_can_be_loaded(robot: Host, gateway: Host, tmp_path: Path) -> None:
     text = protect(robot, "--appliance", gateway.address, "--ports", FEW)
     assert rules(robot) == ""

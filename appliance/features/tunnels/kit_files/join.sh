@@ -87,8 +87,6 @@ Description=Closes the ROS ports of this machine to all but the ROSRV appliance
 DefaultDependencies=no
 Conflicts=shutdown.target
 After=local-fs.target nftables.service netfilter-persistent.service ufw.service
-PartOf=nftables.service
-ReloadPropagatedFrom=nftables.service
 Before=network-pre.target shutdown.target
 Wants=network-pre.target
 
@@ -96,7 +94,6 @@ Wants=network-pre.target
 Type=oneshot
 RemainAfterExit=yes
 ExecStart=/usr/sbin/nft -f /etc/rosrv/protect.nft
-ExecReload=/usr/sbin/nft -f /etc/rosrv/protect.nft
 ExecStop=-/usr/sbin/nft delete table inet rosrv_protect
 ExecStop=-/usr/sbin/nft delete table inet rosrv_tunnel
 
@@ -105,7 +102,7 @@ WantedBy=multi-user.target
 UNIT
     cat > /etc/systemd/system/rosrv-tunnel.service <<'UNIT'
 [Unit]
-Description=Asks for the tunnel to the ROSRV appliance whenever it is not there
+Description=Keeps the tunnel to the ROSRV appliance and the rules of rosrv-protect.service
 After=strongswan.service
 
 [Service]

@@ -2,6 +2,7 @@
 # Keeps a tunnel to the appliance. Of two appliances only the active one answers, at the same address in the tunnel.
 # When no answer comes, each is asked for a tunnel at the same time; the tunnel that opens replaces the earlier one,
 # which stays until then. So a lost packet ends no tunnel. Arguments are passed to swanctl.
+# It also loads the rules of join.sh again that another firewall removed.
 
 answers() { ping -q -n -c 1 -W "$1" -I @address@ @appliance@ >/dev/null 2>&1; }
 quiet() { swanctl "$@" 2>/dev/null; }
@@ -64,6 +65,19 @@ attempt() {
     end "$open" "$@"
 }
 
+# Loads each table again that does not name the appliance. One of `rosrv protect` that does is as good.
+protect() {
+    for table in rosrv_protect rosrv_tunnel; do
+        nft list table inet "$table" 2>/dev/null | grep -qFw @appliance@ && continue
+        sed -n "/^table inet $table\$/,/^}/p" /etc/rosrv/protect.nft | nft -f - \
+            && echo "keep.sh: the rules of the table $table were removed; they are in force again"
+    done
+}
+while [ -e /etc/rosrv/protect.nft ]; do
+    protect
+    sleep 10
+done &
+
 # The connection of the last tunnel, until that ends.
 last=$(tunnels "$@" | awk '$3 == "INSTALLED" { print $2; exit }')
 rounds=0      # without an answer
@@ -74,11 +88,13 @@ while :; do
     [ "$unanswered" -lt 4 ] || seconds=4
     answers "$seconds" &
     check=$!
+    pause=$check
     [ "$rounds" -le 20 ] || seconds=20
     attempts=""
     if [ "$unanswered" -gt 0 ]; then
         before=$(connections)
         sleep "$seconds" &  # a refusal comes at once
+        pause=$!
         for name in @connections@; do
             attempt "$name" "$seconds" "$@" &
             attempts="$attempts $name:$!"
@@ -99,7 +115,7 @@ while :; do
         sleep 0.5
         continue
     fi
-    wait
+    wait "$pause"
     rounds=$((rounds + 1))
     unanswered=$((unanswered + 1))
     # An appliance that was restarted does not know its earlier tunnel, which prevents another one.
