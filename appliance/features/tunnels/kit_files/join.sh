@@ -87,15 +87,14 @@ Description=Closes the ROS ports of this machine to all but the ROSRV appliance
 DefaultDependencies=no
 Conflicts=shutdown.target
 After=local-fs.target nftables.service netfilter-persistent.service ufw.service
-Before=network-pre.target shutdown.target
+# Stored rules of `rosrv protect` replace these. If they do not admit the appliance, keep.sh loads these again.
+Before=rosrv-ports.service network-pre.target shutdown.target
 Wants=network-pre.target
 
 [Service]
 Type=oneshot
 RemainAfterExit=yes
 ExecStart=/usr/sbin/nft -f /etc/rosrv/protect.nft
-ExecStop=-/usr/sbin/nft delete table inet rosrv_protect
-ExecStop=-/usr/sbin/nft delete table inet rosrv_tunnel
 
 [Install]
 WantedBy=multi-user.target
@@ -187,6 +186,7 @@ if systemd; then
     systemctl daemon-reload
     systemctl enable --quiet rosrv-protect.service
     systemctl restart rosrv-protect.service
+    systemctl try-restart rosrv-ports.service 2>/dev/null || true
     systemctl enable --quiet strongswan.service
     if systemctl is-enabled --quiet rosrv-tunnel.service 2>/dev/null; then keep_at_exit; fi
     systemctl stop --quiet rosrv-tunnel.service

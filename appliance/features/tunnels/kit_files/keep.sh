@@ -65,12 +65,15 @@ attempt() {
     end "$open" "$@"
 }
 
-# Loads each table again that does not name the appliance. One of `rosrv protect` that does is as good.
+admits() { nft list table inet "$1" 2>/dev/null | grep -qFw @appliance@; }
+# Loads each table again that does not name the appliance. Rules of `rosrv protect` that do are as good: stored ones
+# come first.
 protect() {
     for table in rosrv_protect rosrv_tunnel; do
-        nft list table inet "$table" 2>/dev/null | grep -qFw @appliance@ && continue
-        sed -n "/^table inet $table\$/,/^}/p" /etc/rosrv/protect.nft | nft -f - \
-            && echo "keep.sh: the rules of the table $table were removed; they are in force again"
+        admits "$table" && continue
+        [ "$table" = rosrv_tunnel ] || systemctl try-restart rosrv-ports.service 2>/dev/null
+        admits "$table" || sed -n "/^table inet $table\$/,/^}/p" /etc/rosrv/protect.nft | nft -f - || continue
+        echo "keep.sh: the rules of the table $table were removed or replaced; they are in force again"
     done
 }
 while [ -e /etc/rosrv/protect.nft ]; do

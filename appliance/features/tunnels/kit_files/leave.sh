@@ -36,11 +36,14 @@ else
     rm -f /run/charon.vici /run/charon.ctl /run/charon.dck /run/charon.lkp /run/charon.wlst /run/charon.enfy
     rm -rf /run/rosrv
 fi
+# Rules of `rosrv protect` that do not admit this appliance stay, and stored ones come back.
 for table in rosrv_protect rosrv_tunnel; do
-    if command -v nft >/dev/null && nft list table inet "$table" >/dev/null 2>&1; then
-        nft delete table inet "$table"
-    fi
+    if nft list table inet "$table" 2>/dev/null | grep -qFw @appliance@; then nft delete table inet "$table"; fi
 done
+if systemd; then systemctl try-restart rosrv-ports.service 2>/dev/null || true; fi
 rm -rf /etc/rosrv/protect.nft /etc/rosrv/keep.sh /etc/rosrv/renew.sh /etc/rosrv/leave.sh "/etc/rosrv/@name@"
 rmdir /etc/rosrv 2>/dev/null || true
 echo "leave.sh: this machine (@name@) has left. On the appliance: rosrv host revoke @name@"
+if ! nft list table inet rosrv_protect >/dev/null 2>&1; then
+    echo "leave.sh: its ROS ports are open to all; to close them: rosrv protect"
+fi
