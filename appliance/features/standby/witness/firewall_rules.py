@@ -40,10 +40,10 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
             ]
     followers = [settings.followers[name].address for name in sorted(settings.followers)]
     addresses = ", ".join([settings.appliances[name].address for name in names] + followers)
-    requests = ["udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses)]
+    request = "ip daddr %s udp dport %d" % settings.listen  # at other addresses, the port is that of DDS
+    requests = ["%s ip saddr != { %s } drop" % (request, addresses)]
     requests += [
-        "ip saddr %s udp dport %d @th,64,32 != 0x%s drop"
-        % (peer.address, settings.listen[1], tag_of(peer.key).hex())
+        "%s ip saddr %s @th,64,32 != 0x%s drop" % (request, peer.address, tag_of(peer.key).hex())
         for _name, peer in sorted({**settings.appliances, **settings.followers}.items())
         if peer.key  # a follower has no keys of the appliances
     ]
@@ -97,7 +97,7 @@ def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, 
     peers = [settings.appliances[name].address for name in names]
     peers += [settings.followers[name].address for name in sorted(settings.followers)]
     requests = ["-s %s -j RETURN" % peer for peer in peers]
-    requests.append("-p udp --dport %d -j DROP" % settings.listen[1])
+    requests.append("-d %s -p udp --dport %d -j DROP" % settings.listen)
     chains = {
         "in": [
             "-i lo -d %s -p udp --dport %d -j DROP" % settings.listen,
