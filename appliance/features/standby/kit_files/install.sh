@@ -62,14 +62,14 @@ fi
 
 systemctl daemon-reload
 systemctl enable --quiet rosrv-witness-shut.service "$unit.service"
-systemctl restart "$unit.service"
+# It has started when the program has written its rules and answers or follows; until then, systemd tries again.
+systemctl restart "$unit.service" || true
 sync
-
-applied() { nft list table ip rosrv_witness >/dev/null 2>&1 || iptables-save 2>/dev/null | grep -q '^:rosrv-witness-in '; }
 tries=0
-until applied; do
+until systemctl is-active --quiet "$unit.service"; do
     tries=$((tries + 1))
-    [ "$tries" -lt 100 ] || die "the firewall rules are missing: journalctl -u $unit -u rosrv-witness-shut"
+    [ "$tries" -lt 100 ] || die "$unit does not run: $(journalctl -q -o cat -n 1 "_SYSTEMD_UNIT=$unit.service" || true)
+install.sh: repair that; systemd tries again until then. All lines: journalctl -u $unit -u rosrv-witness-shut"
     sleep 0.1
 done
 if command -v ip >/dev/null && ! ip route get @fixed@ >/dev/null 2>&1; then

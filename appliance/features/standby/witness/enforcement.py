@@ -3,6 +3,7 @@
 import contextlib
 import os
 import select
+import socket
 import threading
 import time
 from typing import Any, Callable, Iterable, List, Optional, Tuple
@@ -87,6 +88,13 @@ def write_error(text: str) -> None:
     """Write to standard error; a text that cannot be written is lost, because it must not end the enforcement."""
     with contextlib.suppress(OSError):
         os.write(2, text.encode("utf-8", "backslashreplace"))
+
+
+def report_ready() -> None:
+    """Let systemd, if it runs this program, count the service as started."""
+    address = os.environ.get("NOTIFY_SOCKET", "").replace("@", "\0", 1)
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        notify.sendto(b"READY=1", socket.MSG_DONTWAIT, address)
 
 
 class LeaseEnforcement:

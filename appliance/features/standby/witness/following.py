@@ -13,6 +13,7 @@ from appliance.features.standby.witness.enforcement import (
     CHECK_SECONDS,
     BoundedLog,
     enforcement_of,
+    report_ready,
     write_error,
 )
 from appliance.features.standby.witness.errors import WitnessError
@@ -47,6 +48,7 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         log.add(
             "%s follows the witness at %s:%d and uses %s" % (settings.follows_as, *settings.listen, backend)
         )
+        report_ready()
         enforcement.start_checks()
         writing, saving = Wake(), Wake()
         _start(lambda: _ask_always(asking, settings.listen, follower, (writing, saving)))

@@ -11,6 +11,7 @@ from appliance.features.standby.witness.enforcement import (
     BoundedLog,
     RegularCheck,
     enforcement_of,
+    report_ready,
     write_error,
 )
 from appliance.features.standby.witness.errors import WitnessError
@@ -45,6 +46,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     enforcement.start_checks()
     with RequestSockets(settings.listen) as requests:
         log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
+        report_ready()
         rejected = 0
         while True:  # until the process is ended; each turn is bounded
             for one, most in requests.ready():
@@ -121,9 +123,10 @@ class RequestSockets:
             one.setsockopt(socket.SOL_IP, FREEBIND, 1)
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)  # only for sockets of the same user
             one.bind(self._listen)
-        except OSError:
+        except OSError as error:
             one.close()
-            raise
+            text = "UDP %s:%d: %s; another program may have the port: sudo ss -lunp"
+            raise OSError(error.errno, text % (*self._listen, error.strerror)) from error
         one.setblocking(False)
         return one
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.features.standby.first_join import WITNESS_PORT
 from appliance.features.standby.membership import Membership, load_membership, path_of
 from examples.landshark.lab import Host, Lab
 from tests.support.command import ROSRV, rosrv
@@ -40,7 +41,7 @@ stop() {
     pid=$(cat $state/$1.pid)
     kill -- -$pid 2>/dev/null || true
     while kill -0 $pid 2>/dev/null; do sleep 0.05; done
-    rm -f $state/$1.pid
+    rm -f $state/$1.pid $state/$1.ready $state/$1.notify
 }
 start() {
     for wanted in $(sed -n 's/^Wants=//p' $units/$1.service); do
@@ -50,7 +51,14 @@ start() {
     if grep -q ^Type=oneshot $units/$1.service; then
         [ -e $state/$1.done ] || { $line && : > $state/$1.done; }
     elif [ ! -e $state/$1.pid ]; then
-        setsid $line </dev/null >>$state/$1.log 2>&1 &
+        python3 -c 'if True:
+            import pathlib, socket, sys
+            manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            manager.settimeout(20)
+            manager.bind(sys.argv[1] + ".notify")
+            pathlib.Path(sys.argv[1] + ".ready").write_bytes(manager.recv(99))' $state/$1 >/dev/null 2>&1 &
+        while [ ! -S $state/$1.notify ]; do sleep 0.05; done
+        NOTIFY_SOCKET=$state/$1.notify setsid $line </dev/null >>$state/$1.log 2>&1 &
         echo $! > $state/$1.pid
     fi
 }
@@ -63,9 +71,16 @@ for name in $names; do
             if [ -n "$now" ]; then stop $name; fi ;;
         restart) stop $name; start $name ;;
         stop) stop $name ;;
+        is-active) kill -0 $(cat $state/$name.pid) && grep -q READY=1 $state/$name.ready || exit 3 ;;
         *) exit 1 ;;
     esac
 done
+"""
+
+_JOURNALCTL = """\
+#!/bin/sh
+for word; do case $word in _SYSTEMD_UNIT=*.service) unit=${word#*=} ;; esac; done
+exec tail -n 1 /run/rosrv/${unit%.service}.log
 """
 
 
@@ -76,8 +91,9 @@ class RobotSite:
         self.attacker = lab.host("attacker", "10.77.0.66/24")
         programs = folder / "bin"
         programs.mkdir()
-        (programs / "systemctl").write_text(_SYSTEMCTL)
-        (programs / "systemctl").chmod(0o755)
+        for name, text in (("systemctl", _SYSTEMCTL), ("journalctl", _JOURNALCTL)):
+            (programs / name).write_text(text)
+            (programs / name).chmod(0o755)
         self._programs = programs
         self._path = f"{programs}:{os.environ['PATH']}:/usr/sbin"
         self.robot = self._host(lab.host("robot", f"{ROBOT}/24"), folder / "robot")
@@ -210,6 +226,21 @@ def test_a_follower_and_the_robot_are_installed_in_any_order(site: RobotSite) ->
     site.script(follower, "/etc/rosrv/remove-witness.sh")
     assert site.rules(follower) == ""
     assert site.connects(site.hosts["b"], FOLLOWER, NODE)
+
+
+def test_a_program_that_ends_at_its_start_is_not_reported_as_running(site: RobotSite) -> None:
+    def fails(host: ScriptHost, kit: str, reason: str) -> None:
+        done = site.script(host, site.kit / kit / "install.sh", check=False)
+        assert done.returncode == 1 and reason in done.stderr
+        assert " runs" not in done.stdout and "rosrv_witness" in site.rules(host)
+
+    with site.robot.outer.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as taken:
+        taken.bind(("0.0.0.0", WITNESS_PORT))  # as a process of ROS 2 has it
+        fails(site.robot, "witness", f"UDP {ROBOT}:{WITNESS_PORT}: Address already in use")
+    assert " runs" in site.script(site.robot, site.kit / "witness" / "install.sh").stdout
+    assert " runs" in site.script(site.follower, site.kit / "follower-arm" / "install.sh").stdout
+    (site.kit / "follower-arm" / "witness.json").write_text("damaged")
+    fails(site.follower, "follower-arm", "witness.json cannot be used")
 
 
 def test_a_new_kit_begins_a_new_lease_with_the_first_appliance_alone_in_sync(site: RobotSite) -> None:
