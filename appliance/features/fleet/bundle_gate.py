@@ -282,13 +282,16 @@ class BundleGate:
     @property
     def _waiting(self) -> str:
         """Return why the bundle that the last poll offered waits, or ""."""
-        ended = self._waits == _UNCONFIRMED_CHANGE and not self._unconfirmed
-        return "" if ended or not self._poll.offered else self._waits
+        if not self._poll.offered:
+            return ""
+        if self._unconfirmed:
+            return self._waits and _UNCONFIRMED_CHANGE
+        return "" if self._waits == _UNCONFIRMED_CHANGE else self._waits
 
     @property
     def _waiting_for_order(self) -> str:
         """Return the bundle that waits for an order, or ""."""
-        return self._for_order.path if self._for_order is not None and self._waiting else ""
+        return self._for_order.path if self._for_order is not None and self._waiting == self._waits else ""
 
     @property
     def _changed(self) -> bool:
@@ -344,7 +347,8 @@ class BundleGate:
             return
         self._waits, self._for_order = "", None
         if held:
-            self._waits = f"{offered.path} waits until no message passes for a minute: {held[0]}"
+            again = "; it then needs another order" if ordered else ""
+            self._waits = f"{offered.path} waits until no message passes for a minute: {held[0]}{again}"
             return
         if self._fleet.bundles.wait_for_order and not ordered:
             self._for_order = offered

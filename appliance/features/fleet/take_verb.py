@@ -33,5 +33,6 @@ def take(appliance: Appliance, *, when_standing: WhenStanding = False, within: W
     if appliance.as_json:
         say_json(body)
         return
-    say(printable(f"{body.path} is tried, and stays if the robot is healthy for {body.confirm_seconds:g} s"))
-    say("rosrv status shows whether it is in force")
+    healthy = f"stays if the robot is healthy for {body.confirm_seconds:g} s"
+    say(printable(f"{body.path} is checked again and tried, and {healthy}"))
+    say("rosrv status shows whether it is in force, or why not")

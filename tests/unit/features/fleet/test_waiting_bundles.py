@@ -194,3 +194,43 @@ async def test_a_bundle_that_may_no_longer_be_taken_waits_for_no_order(
         await asyncio.sleep(2)
         assert not ordered.state.for_order
         assert not ordered.gate.order(OFFER.path, "olga")
+
+
+@pytest.mark.parametrize("reason", ["policies", "monitors", "held", "refused"])
+async def test_an_order_is_tried_or_the_state_has_the_reason(
+    reason: str, ordered: BundleRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only a check after the order finds that topics would be held, or that the bundle is refused."""
+
+    async def refuse(*_content: object) -> None:
+        raise PolicyRefusedError([])
+
+    revisions = {"policies": ordered.policies, "monitors": ordered.monitors}.get(reason)
+    async with ordered.running():
+        ordered.poll(offered=True)
+        await asyncio.sleep(2)
+        if revisions is not None:
+            revisions.confirm_by = 100.0
+        elif reason == "held":
+            ordered.monitors.would_hold = ["/cmd_vel"]
+        else:
+            monkeypatch.setattr(ordered.policies, "attempt", refuse)
+        assert ordered.gate.order(OFFER.path, "olga") is (revisions is None)
+        await asyncio.sleep(2)
+        assert (ordered.state.trying, ordered.state.for_order) == ("", "")
+        if reason == "refused":
+            assert ordered.state.refused == OFFER.path
+            return
+        if reason == "held":
+            assert "waits until no message passes for a minute: /cmd_vel" in ordered.state.trouble
+            assert "needs another order" in ordered.state.trouble
+            ordered.monitors.would_hold = []
+            ordered.poll(offered=True)
+            await asyncio.sleep(2)
+        elif revisions is not None:
+            assert ordered.stated[-1].waits == ordered.state.trouble
+            assert "waits for its confirmation" in ordered.state.trouble
+            revisions.confirm_by = None
+        assert ordered.gate.order(OFFER.path, "olga")
+        await asyncio.sleep(2)
+        assert ordered.state.trying == OFFER.path
