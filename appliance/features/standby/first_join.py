@@ -19,7 +19,8 @@ from msgspec.structs import replace
 
 from appliance.base.atomic_files import write_whole
 from appliance.base.owner_access import acting_as_owner
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.connection.admin_client import QUICK_SECONDS, AdminSocket, NotRunningError
+from appliance.cli.output import moment, say_json, usage_error
 from appliance.cli.up_inputs import read_node_ports
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings, load_resolved
@@ -33,13 +34,14 @@ from appliance.features.standby.membership import (
     save_membership,
 )
 from appliance.features.standby.process import EPOCH, stored_epoch
+from appliance.features.standby.requests import StandbyWanted
 from appliance.features.standby.witness.one_file import witness_program
 from appliance.features.standby.witness.settings import settings_of
 from appliance.ipsec.authority_key import is_encrypted
 from appliance.ipsec.brought_authority import FOLDER
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.state_directory import foreign
+from appliance.supervisor.state_directory import ADMIN_SOCKET, STORED, foreign
 from rosmop.tool.terminal import refused, say
 
 # Bring the key of an authority, encrypted with a passphrase, to the other appliance.
@@ -229,6 +231,8 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
                 f" ({earlier.other_address}); --force makes new keys, and all machines must be set up again"
             ]
         )
+    if earlier is not None:
+        _require_all_data(options.state, earlier)
     plan = _plan(options, _settings(options), earlier or left)
     try:
         kits = make_kits(plan)
@@ -242,6 +246,33 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
         shutil.rmtree(options.out)
         raise refused([f"{_VERB}: {path}: {error.strerror}; nothing was changed"]) from None
     _report(plan, options, as_json=as_json)
+
+
+def _require_all_data(state: Path, earlier: Membership) -> None:
+    """Refuse on a running standby. For a stopped appliance, print the age of what becomes the state of both."""
+    answer = None
+    if (state / ADMIN_SOCKET).exists():
+        with contextlib.suppress(NotRunningError):  # its last process was killed
+            answer = AdminSocket(state, QUICK_SECONDS).ask(StandbyWanted())
+    if answer is None:
+        _report_age(state, earlier)
+        return
+    if answer.ok and answer.given().role == "standby":
+        raise usage_error(
+            f"this appliance is the standby: run this on the active one, {earlier.other} ({earlier.other_address})."
+            " If that machine is lost, stop this appliance first",
+            _VERB,
+        )
+    if not answer.ok and answer.trouble != "unknown":  # a single one, before its restart, has all data
+        raise refused([f"{_VERB}: {answer.error}; try again, or stop this appliance first"])
+
+
+def _report_age(state: Path, earlier: Membership) -> None:
+    with acting_as_owner(state / STORED.parent):
+        stored = [path.stat().st_mtime for path in (state / STORED.parent).glob(f"{STORED.name}*")]
+    if stored:
+        text = f"this appliance last wrote its state on {moment(max(stored))}; it replaces that of {earlier.other}"
+        typer.echo(f"{_VERB}: {text}", err=True)
 
 
 def _with_authority(other: Membership, state: Path) -> Membership:

@@ -4,11 +4,16 @@ from pathlib import Path
 
 import pytest
 
+from appliance.channel.admin import AdminAnswer, Trouble
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.configuration.config_sources import plain, resolve
+from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.membership import Membership, load_membership, path_of
 from appliance.features.standby.process import EPOCH, stored_epoch
+from appliance.features.standby.requests import StandbyWanted
 from appliance.features.standby.witness.settings import read_settings
-from appliance.supervisor.state_directory import StateDirectory
+from appliance.supervisor.state_directory import ADMIN_SOCKET, STORED, StateDirectory
+from tests.support.answers import example
 from tests.support.command import rosrv
 
 FIRST = (
@@ -177,3 +182,41 @@ def test_a_failed_write_leaves_neither_kit_nor_membership(monkeypatch: pytest.Mo
     done = rosrv("standby", "join", "--state", "first", *FIRST, "--output", "kit")
     assert done.returncode == 1 and "No space left on device; nothing was changed" in done.stderr
     assert not Path("kit").exists() and not path_of(Path("first")).exists()
+
+
+@pytest.mark.parametrize("role", ["active", "standby", "single", "unknown", "crashed", "stopped"])
+def test_only_an_appliance_that_may_have_all_data_becomes_the_first_again(
+    role: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors: dict[str, tuple[Trouble, str]] = {
+        "single": ("unknown", "not one"),
+        "unknown": ("failed", "it starts"),
+    }
+
+    def ask(_socket: AdminSocket, _request: StandbyWanted) -> AdminAnswer[StandbyState]:
+        if role == "crashed":
+            raise NotRunningError
+        if role in errors:
+            trouble, error = errors[role]
+            return AdminAnswer(False, error=error, trouble=trouble)
+        return AdminAnswer(True, example(StandbyState, role=role))
+
+    monkeypatch.setattr(AdminSocket, "ask", ask)
+    join_first()
+    stored = Path("first", STORED)
+    stored.parent.mkdir()
+    stored.touch()
+    os.utime(stored, (1_772_359_200, 1_772_359_200))
+    if role != "stopped":
+        Path("first", ADMIN_SOCKET).touch()
+    before = joined("first")
+    done = rosrv("standby", "join", "--state", "first", *FIRST, "--output", "new", "--force")
+    aged = "this appliance last wrote its state on 2026-03-01 10:00Z; it replaces that of b"
+    status, text = {
+        "standby": (2, "this appliance is the standby: run this on the active one, b (192.0.2.3)"),
+        "unknown": (1, "it starts; try again, or stop this appliance first"),
+        "crashed": (0, aged),
+        "stopped": (0, aged),
+    }.get(role, (0, ""))
+    assert (done.returncode, joined("first") == before) == (status, status > 0), done.stderr
+    assert text in done.stderr and bool(text) is bool(done.stderr)
