@@ -223,7 +223,7 @@ class Verifier:
     """The verification of a bundle: its faults (`findings`), and the claims that it does not prove (`notes`)."""
 
     def __init__(
-        self, place: Path, key: Path | None, folder: Path, copies: dict[int, dict[str, Any]]
+        self, place: Path, key: Path | None, folder: Path, copies: dict[tuple[str, int], list[dict[str, Any]]]
     ) -> None:
         self.names, self.open, self.foreign = opened(place)
         self.key, self.copies = folder / "key", copies
@@ -319,6 +319,8 @@ class Verifier:
         if missing:
             records = "record of its runs is" if missing == 1 else "records of its runs are"
             self.findings.append(f"records.ndjson: {missing} {records} missing")
+        if self.copies and self.manifest["log"] not in {log for log, _number in self.copies}:
+            self.findings.append("the checkpoints kept elsewhere: are of other logs, and none of this one")
         first, last = runs.first[0], runs.last[-1]
         if not beside[first - 1] and first > 1:
             self.notes.append(f"records before {first}: removed by retention")
@@ -397,15 +399,15 @@ class Verifier:
             )
         if not self.is_signed(given) or {*given} - {*Checkpoint._fields, "signature", "key"}:
             self.findings.append(f"checkpoint {number}: is not signed with the key")
-        copy = self.copies.get(number)
-        if copy and any(copy.get(field) != given.get(field) for field in Checkpoint._fields):
-            but = "" if self.is_signed(copy) else ", which is not signed with the key"
-            self.findings.append(f"checkpoint {number}: differs from the one kept elsewhere{but}")
-        self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + (copy is not None)
+        copies = self.copies.get((self.manifest["log"], number), [])
+        for copy in copies:
+            if stated(copy) != stated(given):
+                but = "" if self.is_signed(copy) else ", which is not signed with the key"
+                self.findings.append(f"checkpoint {number}: differs from the one kept elsewhere{but}")
+        self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + bool(copies)
 
     def is_signed(self, given: dict[str, Any]) -> bool:
-        fields: Any = (given.get(field) for field in Checkpoint._fields)
-        made = Checkpoint(*fields)
+        made = stated(given)
         try:
             same = parse_checkpoint(made.text()) == made
             fault = signature_fault(
@@ -424,10 +426,24 @@ class Verifier:
         return subprocess.run([*order, *files], capture_output=True).returncode == 0
 
 
-def kept_copies(path: Path) -> dict[int, dict[str, Any]]:
+def stated(given: dict[str, Any]) -> Checkpoint:
+    fields: Any = (given.get(field) for field in Checkpoint._fields)
+    return Checkpoint(*fields)
+
+
+def kept_copies(path: Path) -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """Return all checkpoints of a file by log and number: root may have added some later. Skip other lines."""
+    kept: dict[tuple[str, int], list[dict[str, Any]]] = defaultdict(list)
     with regular(path) as file:
-        lines = iter(lambda: file.readline(MAX), b"")
-        return {copy["number"]: copy for copy in map(json.loads, lines)}
+        for line in iter(lambda: file.readline(MAX), b""):
+            try:
+                copy = json.loads(line)
+                bytes.fromhex(copy["signature"] + copy["key"])
+                made = parse_checkpoint(stated(copy).text())
+            except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+                continue
+            kept[made.log, made.number].append(copy)
+    return kept
 
 
 def main(arguments: list[str]) -> int:

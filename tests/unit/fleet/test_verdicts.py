@@ -308,7 +308,7 @@ def of_store(site: Site, folder: Path, changes: dict[int, Lines], further: Lines
 class InProcess(Verifier):
     """The bundle's verifier without `openssl`, as on a collector."""
 
-    def __init__(self, bundle: Path, key: bytes, copies: dict[int, dict[str, Any]]) -> None:
+    def __init__(self, bundle: Path, key: bytes, copies: dict[tuple[str, int], list[dict[str, Any]]]) -> None:
         self._key = key
         super().__init__(bundle, None, Path(), copies)
 
@@ -322,7 +322,7 @@ class InProcess(Verifier):
 def of_evidence(site: Site, folder: Path, lines: Lines, copies: list[SignedCheckpoint]) -> Iterator[str]:
     for name, parts in ({**site.evidence, "records.ndjson": lines}).items():
         (folder / name).write_bytes(b"".join(parts))
-    kept = {one.number: json.loads(one.as_json()) for one in copies}
+    kept = {(one.log, one.number): [json.loads(one.as_json())] for one in copies}
     verifier = InProcess(folder, site.public, kept)
     verifier.run()
     yield f"evidence: {verifier.checkpoints} checkpoints, {verifier.agreeing} kept elsewhere"

@@ -73,7 +73,7 @@ class _RobotVerifier(Verifier):
             places: list[SegmentPlace] = self._store.numbered(self._robot.name, log, number)
             ends = [self._store.header(place).end for place in places]
             ends.sort(key=lambda end: end.hash != given["hash"])  # of a fork, one history is enough
-            self.copies = {end.number: msgspec.to_builtins(end) for end in ends[:1]}
+            self.copies = {(self.manifest["log"], end.number): [msgspec.to_builtins(end)] for end in ends[:1]}
         super().look_at_checkpoint(given, walk)
 
 

@@ -21,7 +21,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from appliance.audit.log.retention import Retention
-from appliance.audit.proof.copies import signed_checkpoints
+from appliance.audit.proof.copies import read_copies, signed_checkpoints
+from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.base import clock
@@ -29,6 +30,7 @@ from appliance.base.clock import wall_ns
 from appliance.features.evidence import bundle as bundles
 from appliance.features.evidence.bundle import BundleError, TimeSpan, export, verifier_program
 from appliance.formats import bundle_verifier
+from appliance.signing.log_proof import Checkpoint
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
 from tests.support.engines import open_log
@@ -540,6 +542,48 @@ def test_copied_checkpoints_show_a_rewritten_history(
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
     assert reviewer.status(bundle, "--checkpoints", kept) == 1
     assert "differs from the one kept elsewhere, which is not signed with the key" in reviewer.said
+
+
+Copies = list[dict[str, Any]]
+
+
+def _lines(copies: Copies) -> str:
+    return "".join(json.dumps(copy) + "\n" for copy in copies)
+
+
+def _elsewhere(copies: Copies) -> Copies:
+    return [{**copy, "log": "0" * 32, "hash": "cd" * 32} for copy in copies]
+
+
+KEPT: dict[str, Callable[[Copies, Copies], str]] = {
+    "honest": lambda own, _others: _lines(own),
+    "forged later": lambda own, others: _lines(others + own),
+    "forged earlier": lambda own, others: _lines(own + others),
+    "other log first": lambda own, _others: _lines(_elsewhere(own) + own),
+    "other log last": lambda own, _others: _lines(own + _elsewhere(own)),
+    "other log alone": lambda own, _others: _lines(_elsewhere(own)),
+    "torn in the middle": lambda own, _others: _lines(own)[:100] + "\n" + _lines(own),
+    "torn at the end": lambda own, _others: _lines(own)[:-50],
+    "lines of something else": lambda own, _others: f"[]\n7\n{{}}\n{'[' * 9999}\n" + _lines(own),
+}
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kept", KEPT)
+def test_kept_checkpoints_have_one_verdict(
+    bundle: Path, control: Control, key: Ed25519PrivateKey, tmp_path: Path, reviewer: Reviewer, *, kept: str
+) -> None:
+    """Root can add checkpoints to the other machine's copies, but not remove those that it got before."""
+    own = [json.loads(checkpoint.as_json()) for checkpoint in signed_checkpoints(control.log.path)]
+    other = [{**copy, "hash": "ab" * 32} for copy in own]
+    for copy in other:
+        fields: Any = (copy.get(field) for field in Checkpoint._fields)
+        copy["signature"] = key.sign(Checkpoint(*fields).text()).hex()
+    place = tmp_path / "copies.ndjson"
+    place.write_text(KEPT[kept](own, other))
+    found = verify(control.log.path, key.public_key().public_bytes_raw(), copies=read_copies(place)).findings
+    assert bool(found) is (kept.startswith("forged") or kept == "other log alone")
+    assert reviewer.status(bundle, "--checkpoints", place) == bool(found), reviewer.said
 
 
 @pytest.mark.nightly
