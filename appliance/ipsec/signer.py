@@ -167,7 +167,7 @@ def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
 def _create_key(directory: Path) -> None:
     if (directory / PUBLIC_KEY_FILE).exists():
         raise SignerKeyError(f"{directory / KEY_FILE}: missing, but its public half is there; restore it from"
-                             f" a backup, or remove {PUBLIC_KEY_FILE} to start with a new key")  # fmt: skip
+                             " a backup, or remove control/audit.* and signer/* to begin a new log")  # fmt: skip
     key = Ed25519PrivateKey.generate()
     write_whole(
         directory / KEY_FILE, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600

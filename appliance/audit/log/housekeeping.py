@@ -6,6 +6,7 @@ A failed step is repeated later. Only a failure to write records counts as a fai
 import asyncio
 import contextlib
 import itertools
+import re
 import sqlite3
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -187,10 +188,14 @@ class Housekeeping:
         self._failing: str | None = None
         self._waiting: list[Waiter] = []  # waiters for a seal of the records written so far
         self.unsigned: list[tuple[int, Waiter]] = []  # waiters for this checkpoint's signature
+        # Until a signature is kept: the reason for the oldest checkpoint, and the kinds of reasons that have a record.
+        self._refusal: tuple[int, str] | None = None
+        self._recorded: set[str] = set()
 
     @property
     def degraded(self) -> str | None:
-        return self._failing or self.remover.unremoved
+        unsigned = f"checkpoints are not signed: {self._refusal[1]}" if self._refusal else None
+        return self._failing or unsigned or self.remover.unremoved
 
     def attempt(self, step: Callable[[ChainWriter], None]) -> None:
         """Run a step if the database is open. After a failure, skip all steps for a while."""
@@ -247,7 +252,10 @@ class Housekeeping:
         writer.seal(self._clock(), self._report)
         self.remover.due = 0.0  # now the previous checkpoint may be removed
         # Answers may be lost; repeated requests are harmless.
-        self.ask_signatures(writer, again=self._sealed_at - self._asked_at > _ASK_AGAIN_SECONDS)
+        again = self._sealed_at - self._asked_at > _ASK_AGAIN_SECONDS
+        if again and self._signatures.awaited and self._refusal is None:
+            self._refusal = writer.checkpoint_number, "the signer does not answer"
+        self.ask_signatures(writer, again=again)
 
     def _report(self, sealed: Checkpoint) -> AuditRecord:
         detail = {"number": sealed.number, "sequence": sealed.sequence, "hash": sealed.hash}
@@ -262,10 +270,17 @@ class Housekeeping:
         if refusal is not None:
             self.refused(number, refusal)
         else:
+            self._refusal = None
+            self._recorded.clear()
             self._answer(lambda awaited: awaited <= number, None)
 
     def refused(self, number: int, reason: str) -> None:
-        self._hold(self._make("signature refused", Severity.ALARM, reason, {"number": number}))
+        kind = re.sub(r"\d+", "", reason)
+        if kind not in self._recorded:  # each request is repeated every minute
+            self._recorded.add(kind)
+            self._hold(self._make("signature refused", Severity.ALARM, reason, {"number": number}))
+        if self._refusal is None or number <= self._refusal[0]:
+            self._refusal = number, reason
         self._answer(lambda awaited: awaited >= number, reason)
 
     # --- the full-text index ----------------------------------------------------------------------------------

@@ -78,6 +78,10 @@ class Signatures:
     def has_signer(self) -> bool:
         return self._signer is not None
 
+    @property
+    def awaited(self) -> bool:
+        return bool(self._asked)
+
     def ask(self, writer: ChainWriter, *, again: bool = False) -> None:
         """Request the next signatures, at most `ASKED_AT_ONCE` together; `again`: also those requested before."""
         if self._signer is None:
@@ -116,7 +120,8 @@ class Signatures:
         except KeyUnreadableError as error:
             return str(error)
         if pinned != public_key:
-            return f"{what} is signed with {public_key.hex()}, {self._pin} has {pinned.hex()}"
+            keys = f"{public_key.hex()}, {self._pin} has {pinned.hex()}"
+            return f"{what} is signed with {keys}; restore the signer's key and this file from one backup"
         return None
 
 

@@ -5,7 +5,7 @@ import sqlite3
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NoReturn
@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import msgspec
 import pytest
 import structlog
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import log as log_module
 from appliance.audit.log import log_database
@@ -31,6 +32,7 @@ from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog
 
 _LIMIT_SECONDS = 30
+OTHER_KEY = Ed25519PrivateKey.generate()
 
 
 def events(path: Path) -> Counter[str]:
@@ -462,6 +464,54 @@ def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
         return await waiting
 
     assert asyncio.run(asyncio.wait_for(refused(), _LIMIT_SECONDS)) == "it does not follow"
+
+
+UNSIGNED: dict[str, Callable[[int, bytes], tuple[bytes, bytes] | str | None]] = {
+    "signed with": lambda _number, text: (
+        OTHER_KEY.sign(text),
+        OTHER_KEY.public_key().public_bytes_raw(),
+    ),
+    "another checkpoint 6 ": lambda number, _text: (
+        f"another checkpoint {number} of this log was signed before"
+        if number == 6
+        else f"checkpoint {number} does not follow number 6"
+    ),
+    "No space left": lambda _number, _text: "[Errno 28] No space left on device: '/signer/ab.signed'",
+    "does not answer": lambda _number, _text: None,
+}
+
+
+@pytest.mark.parametrize("words", UNSIGNED)
+def test_an_unsigned_log_is_degraded_and_not_flooded(
+    make_log: MakeLog, path: Path, key: Ed25519PrivateKey, words: str
+) -> None:
+    public, faulty = key.public_key().public_bytes_raw(), False
+
+    def sign(number: int, text: bytes, **_: object) -> None:
+        answer = UNSIGNED[words](number, text) if faulty else (key.sign(text), public)
+        if isinstance(answer, str):
+            log.refused(number, answer)
+        elif answer is not None:
+            log.signed(number, *answer)
+
+    def work(minutes: int) -> None:
+        for number in range(minutes):
+            log.record(decision(log, number))
+            let_pass(log, 60)
+
+    log = make_log(signer=sign, checkpoint_seconds=60)
+    work(5)
+    assert log.degraded is None
+    faulty = True
+    work(2)
+    assert words in (log.degraded or "")
+    work(60)
+    assert words in (log.degraded or "")
+    assert events(path)["signature refused"] <= 2
+    faulty = False
+    work(2)
+    assert log.degraded is None
+    assert verify(path).signed_checkpoints > 60
 
 
 def test_abandoned_waits_leave_no_memory(make_log: MakeLog) -> None:
