@@ -44,12 +44,13 @@ from appliance.channel.admin import (
     PolicyWanted,
     Trouble,
 )
+from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.operations import request_named
 from appliance.features.evidence.page import Names, Page, RecordingSummary
 from appliance.features.evidence.requests import EvidenceExported, LogSealed
 from appliance.formats import bundle_verifier
 from appliance.signing import log_proof
-from appliance.signing.fingerprints import file_name
+from appliance.signing.fingerprints import file_name, fingerprint, fingerprint_of_all
 
 FORMAT = "rosrv evidence 1"
 MAX_RECORDS = 1_000_000
@@ -158,17 +159,24 @@ class _Bundle:
         loads = {last_of(log, event, begin) for event in (_POLICY, _SPECIFICATIONS)}
         self._policies: set[int] = set()
         for first, last in self._runs:
-            loads |= {row.sequence for row in records_of(log, _SPECIFICATIONS, after=first - 1, upto=last)}
+            beside = min(last + 1, sealed)  # the verifier also reads the records next to a run
+            for event in (_POLICY, _SPECIFICATIONS):
+                loads |= {row.sequence for row in records_of(log, event, after=first - 2, upto=beside)}
             for revision in policies_of(log, first, last):
                 self._policies.add(revision)
                 loads.add(last_of(log, _POLICY, last + 1, revision))
         alone = {sequence for sequence in loads if sequence is not None}
         self._specifications: set[int] = set()
-        for load in filter(None, (stored_record(log, sequence) for sequence in alone)):
+        self._hashes: dict[str, str | None] = {}  # of the texts: revisions of another state have other texts
+        for load in filter(None, (stored_record(log, sequence) for sequence in sorted(alone))):
+            detail = json.loads(load.detail)
             if load.event == _SPECIFICATIONS:
-                self._specifications.add(json.loads(load.detail)["revision_of_specifications"])
+                revision = detail["revision_of_specifications"]
+                self._specifications.add(revision)
+                self._hashes[f"specifications/{revision}/"] = detail.get("sha256")
             elif load.revision is not None:
                 self._policies.add(load.revision)
+                self._hashes[f"policies/{load.revision}.ini"] = detail.get("sha256")
         if self._recording is not None:
             alone |= {
                 row.sequence
@@ -194,7 +202,7 @@ class _Bundle:
 
     def checked(self, manifest: dict[str, Any]) -> Iterator[Member]:
         left = dict(manifest["members"])
-        for name, pieces in self.members({**manifest, "missing": []}):
+        for name, pieces in self.members({**manifest, "missing": [*manifest["missing"]]}):
             digest = hashlib.sha256()
             yield name, _noted(pieces, digest.update)
             if left.pop(name, {}).get("sha256") != digest.hexdigest():
@@ -207,15 +215,23 @@ class _Bundle:
         yield "audit.pub", [pinned_key_path(self._log).read_bytes()]
         for revision in sorted(self._policies):
             place = f"policies/{revision}.ini"
-            if (policy := self._text(PolicyWanted(revision), place, manifest)) is not None:
+            policy = self._text(
+                PolicyWanted(revision), place, manifest, lambda found: fingerprint(found.text)
+            )
+            if policy is not None:
                 yield place, [policy.text.encode()]
                 yield from _signatures({place: policy.signature})
         for revision in sorted(self._specifications):
             place = f"specifications/{revision}/"
-            if (texts := self._text(MonitorRevisionWanted(revision), place, manifest)) is not None:
-                named = {**texts.files, **{f"msg/{name}": text for name, text in texts.definitions.items()}}
+            texts = self._text(
+                MonitorRevisionWanted(revision),
+                place,
+                manifest,
+                lambda found: fingerprint_of_all(_named(found)),
+            )
+            if texts is not None:
                 yield from (
-                    (place + file_name(name), [text.encode()]) for name, text in sorted(named.items())
+                    (place + file_name(name), [text.encode()]) for name, text in sorted(_named(texts).items())
                 )
                 yield from _signatures(
                     {
@@ -232,9 +248,14 @@ class _Bundle:
         yield "records.ndjson", _noted(_records(self._log, heapq.merge(self._alone, within)), page.add)
         yield "index.html", (page.html(manifest) for _once in "1")
 
-    def _text(self, request: AdminRequest[A], place: str, manifest: dict[str, Any]) -> A | None:
+    def _text(
+        self, request: AdminRequest[A], place: str, manifest: dict[str, Any], hash_of: Callable[[A], str]
+    ) -> A | None:
+        if place in manifest["missing"]:
+            return None
         answer: AdminAnswer[A] = self._ask(request)
-        if answer.trouble == "unknown":
+        wanted = self._hashes.pop(place, None)  # the second time, a text is compared with the first
+        if answer.trouble == "unknown" or (wanted is not None and hash_of(_given(answer)) != wanted):
             manifest["missing"].append(place)
             return None
         return _given(answer)
@@ -244,6 +265,10 @@ def _given(answer: AdminAnswer[A]) -> A:
     if not answer.ok:
         raise BundleError(answer.error, answer.trouble)
     return answer.given()
+
+
+def _named(texts: RevisionTexts) -> dict[str, str]:
+    return {**texts.files, **{f"msg/{name}": text for name, text in texts.definitions.items()}}
 
 
 def _runs(sequences: list[int]) -> list[tuple[int, int]]:

@@ -623,6 +623,39 @@ def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: R
     assert "unproven  record" in reviewer.said
 
 
+OTHER = "[Nodes]\nof_the_other_state = *\n"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("specifications", ["same", "other", "absent"])
+@pytest.mark.parametrize("policy", ["same", "other", "absent"])
+def test_an_unaltered_export_is_valid_whatever_the_state_has(  # noqa: PLR0917  one per dimension
+    control: Control, tmp_path: Path, reviewer: Reviewer, policy: str, specifications: str, again: bool
+) -> None:
+    """Revision numbers belong to a state: to that of the other appliance after a join, or to a new one."""
+    if again:
+        control.load_policy(7, "[Nodes]\n# again seven\n")
+        control.load_specifications(2, {"a.rv": "again() { }"})
+        control.work(5)
+    until = wall_ns() + 1
+    control.load_policy(8, OPEN)  # the record after the period
+    control.load_specifications(3, {"a.rv": "c() { }"})
+    if policy != "same":
+        control.policies[7] = OTHER
+    if specifications != "same":
+        control.specifications[2] = {"a.rv": OTHER}
+    if policy == "absent":
+        del control.policies[7]
+    if specifications == "absent":
+        del control.specifications[2]
+    bundle = control.exported(tmp_path / "a.zip", until=until)
+    assert reviewer.status(bundle) == 0, reviewer.said
+    for place, state in (("policies/7.ini", policy), ("specifications/2/", specifications)):
+        assert any(name.startswith(place) for name in members_of(bundle)) is (state == "same")
+        assert (f"unproven  {place}: the appliance does not have it" in reviewer.said) is (state != "same")
+
+
 def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
     return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
 
