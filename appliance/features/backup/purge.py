@@ -12,18 +12,24 @@ from pathlib import Path
 from appliance.backup.contents import BackupError
 from appliance.base.erasure import write_over
 from appliance.base.user_errors import with_remedy
+from appliance.features.table import members
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def require_state_directory(state: Path) -> None:
-    """Raise `BackupError` if the folder is not a state directory, before an operator is asked to erase it."""
+    """Raise `BackupError` if the folder must not be erased, before an operator is asked to erase it."""
     try:
-        reason = foreign(state.absolute())
+        reason = foreign(state.absolute()) or _needed(state.absolute())
     except OSError as error:
         reason = with_remedy(error, state)
     if reason is not None:
         raise BackupError(reason)
+
+
+def _needed(state: Path) -> str | None:
+    obstacles = (obstacle(state) for obstacle in members("state_files", "obstacle_to_purge"))
+    return next(filter(None, obstacles), None)
 
 
 def purge(state: Path) -> tuple[int, int]:
@@ -44,6 +50,8 @@ def purge(state: Path) -> tuple[int, int]:
     except OSError as error:
         raise BackupError(with_remedy(error, state)) from error
     try:
+        if (reason := _needed(state)) is not None:
+            raise BackupError(reason)
         counts = _write_over(state)
         # The lock is still held, so no appliance can start in between.
         for entry in state.iterdir():
