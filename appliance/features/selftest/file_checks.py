@@ -150,7 +150,7 @@ def _state(state: Path) -> Iterator[SelftestFinding]:
     yield from run_check("secrets", lambda: _secrets(state))
     yield from run_check("space", lambda: _space(state))
     yield from run_check("clock", lambda: _clock(state))
-    yield from run_check("certificates", lambda: _certificates(state))
+    yield from run_check("certificates", lambda: certificates(state))
 
 
 def unfinished_restore(state: Path) -> Iterator[SelftestFinding]:
@@ -232,23 +232,24 @@ def _clock(state: Path) -> Iterator[SelftestFinding]:
         yield ok("clock", clock.utc_now().strftime("%Y-%m-%d %H:%MZ"))
 
 
-def _certificates(state: Path) -> Iterator[SelftestFinding]:
-    for path in (state / "api" / "certificate.pem", state / "signer" / "ca.pem"):
+def certificates(state: Path) -> Iterator[SelftestFinding]:
+    rotate = f"rosrv host authority rotate --state {state}, then new kits for all hosts"
+    advice = {
+        state / "api" / "certificate.pem": "remove it and restart: a new one is created",
+        state / "signer" / "ca.pem": f"restore it from a backup, or stop the appliance: {rotate}",
+    }
+    for path, remedy in advice.items():
         try:
             certificate = x509.load_pem_x509_certificate(read_given(path))
         except (FileNotFoundError, PermissionError):
             continue
         except ValueError:
-            yield fail(
-                "certificate",
-                f"{path} is not a certificate",
-                "restore it, or remove it: a new one is created",
-            )
+            yield fail("certificate", f"{path} is not a certificate", remedy)
             continue
         left = certificate.not_valid_after_utc - clock.utc_now()
         if left.days < 0:
-            yield fail("certificate", f"{path} has expired", "remove it and restart: a new one is created")
+            yield fail("certificate", f"{path} has expired", remedy)
         elif left.days < _SOON_DAYS:
-            yield warn("certificate", f"{path} expires in {left.days} days", "renew it before then")
+            yield warn("certificate", f"{path} expires in {left.days} days", remedy)
         else:
             yield ok("certificate", f"{path.name} of {path.parent.name}: {left.days} days left")

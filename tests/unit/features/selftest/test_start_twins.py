@@ -1,17 +1,25 @@
 """Each reason for which the appliance does not start is one that `rosrv selftest` checks, or is reviewed here."""
 
 import ast
+import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from appliance.api.front.certificate import tls_context
+from appliance.base import clock
+from appliance.cli.main import app
 from appliance.configuration.settings import Settings
 from appliance.features.selftest import file_checks, machine_checks
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.network.namespaces import read_only_settings
 from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import ROS_PROGRAMS
+from appliance.supervisor.state_directory import StateDirectory
 from distribution.fact_cache import functions, statements
+from tests.support.certificates import self_signed
 
 ROOT = Path(__file__).parents[4] / "appliance"
 TWINS = {
@@ -111,3 +119,31 @@ def test_a_container_that_shares_the_network_fails(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("os.geteuid", lambda: 1)
     settings: Any = Settings(isolation="container")
     assert "fail" in [one.outcome for one in machine_checks.kernel(settings) if one.check == "network"]
+
+
+@pytest.mark.parametrize("harm", ["damaged", "expired"])
+@pytest.mark.parametrize("name", ["api/certificate.pem", "signer/ca.pem"])
+def test_the_appliance_starts_after_the_advice_about_a_certificate(
+    tmp_path: Path, name: str, harm: str
+) -> None:
+    def start() -> None:
+        StateDirectory(tmp_path).close()
+        (tmp_path / "signer").mkdir(exist_ok=True)
+        (tmp_path / "api").mkdir(exist_ok=True)
+        CertificateAuthority(tmp_path / "signer")
+        tls_context(tmp_path / "api", [], clock.utc_now())
+
+    start()
+    if harm == "damaged":
+        (tmp_path / name).write_bytes(bytes(600))
+    else:
+        ended = clock.utc_now() - datetime.timedelta(days=1)
+        self_signed(tmp_path / name, "127.0.0.1", ended - datetime.timedelta(days=1), ended)
+    [found] = [one for one in file_checks.certificates(tmp_path) if one.outcome == "fail"]
+    if "remove it" in found.advice:
+        (tmp_path / name).unlink()
+    else:
+        done = CliRunner().invoke(app, ["host", "authority", "rotate", "--state", str(tmp_path), "--yes"])
+        assert (done.exit_code, "host authority rotate" in found.advice) == (0, True), done.output
+    start()
+    assert {one.outcome for one in file_checks.certificates(tmp_path)} == {"ok"}
