@@ -56,8 +56,8 @@ class CheckpointMemory:
         """Remember a checkpoint that may be signed. Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
-        if not path.exists():
-            self._room_for_another()
+        if not path.exists() or path.stat().st_size < _NUMBER + _HASH:  # as in a backup of a log without one
+            self._room_for_another(wanted.log)
             self._may_be_removed(wanted)
             number, now = wanted.number.to_bytes(_NUMBER, "big"), self._clock().to_bytes(_NUMBER, "big")
             write_whole(self._path(wanted.log, "times"), number + now, 0o600)
@@ -133,8 +133,9 @@ class CheckpointMemory:
         finally:
             os.close(descriptor)
 
-    def _room_for_another(self) -> None:
-        kept = [log for log in remembered_logs(self._directory) if not log.is_set_aside]
+    def _room_for_another(self, wanted: str) -> None:
+        others = (log for log in remembered_logs(self._directory) if log.log != wanted)
+        kept = [log for log in others if not log.is_set_aside]
         if len(kept) >= MAX_LOGS:
             raise CheckpointRefusedError(
                 f"{MAX_LOGS} logs were signed before; set old ones aside: rosrv audit acknowledge"

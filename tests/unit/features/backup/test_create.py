@@ -1,3 +1,4 @@
+import asyncio
 import os
 import shutil
 import signal
@@ -97,6 +98,49 @@ def test_a_key_pinned_during_the_backup_is_included(
     assert back_up(state, file)[0] == "control/audit.db"
     restore(file, tmp_path / "other")
     assert verify(tmp_path / "other" / "control" / "audit.db", signer=tmp_path / "other" / "signer").ok
+
+
+@pytest.mark.parametrize("step", range(7))
+@pytest.mark.parametrize("before", [0, 1])
+def test_a_restored_log_is_signed_on(tmp_path: Path, before: int, step: int) -> None:
+    """The appliance seals and signs a checkpoint after any copied file, perhaps its first one."""
+    key, logs = Ed25519PrivateKey.generate(), list[AuditLog]()
+
+    def opened(state: Path) -> AuditLog:
+        memory = CheckpointMemory(state / "signer", wall_ns)
+
+        def sign(number: int, text: bytes, **_: object) -> None:
+            memory.accept(text)
+            logs[-1].signed(number, key.sign(text), key.public_key().public_bytes_raw())
+
+        logs.append(open_log(state / "control" / "audit.db", checkpoint_seconds=3600, signer=sign))
+        logs[-1].request_signatures()
+        return logs[-1]
+
+    def seal(log: AuditLog) -> None:
+        log.record(decision(log))
+        assert asyncio.run(asyncio.wait_for(log.wait_signed(), 10)) is None
+
+    def copied(name: str, _copy: Path) -> None:
+        if len(names) == step:
+            seal(log)
+        names.append(name)
+
+    state, other, names = tmp_path / "state", tmp_path / "other", list[str]()
+    for part in ("control", "signer"):
+        (state / part).mkdir(parents=True)
+    log = opened(state)
+    for _number in range(before):
+        seal(log)
+    assert settle(log) is None
+    back_up(state, tmp_path / "backup.tar.gz", copied)
+    log.close()
+    restore(tmp_path / "backup.tar.gz", other)
+    (other / "signer").mkdir(exist_ok=True)
+    seal(log := opened(other))
+    log.close()
+    result = verify(other / "control" / "audit.db", signer=other / "signer")
+    assert (result.findings, result.signed_checkpoints) == ([], result.checkpoints)
 
 
 _COMES_AND_GOES = ("fleet/segment.gz", f"control/compiled/{'a' * 64}", f"fleet/position.json.{'b' * 8}.new")
