@@ -36,7 +36,6 @@ _REPLACED = (
 )
 _TEXT_ROWS = 256
 _FOREVER = 1 << 63
-_AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
 
 
 @functools.cache
@@ -60,6 +59,8 @@ class ChainWriter:
         Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`.
         """
         self.path = path
+        # The last of the first checkpoints with a time in the future, and the earliest time of these.
+        self._ahead = 0, 0
         with contextlib.ExitStack() as opened:
             opened.callback(os.close, _take_lock(path))
             self.created = not path.exists()
@@ -203,16 +204,19 @@ class ChainWriter:
         ahead, are removed with the following ones.
         """
         execute, first = self._connection.execute, self._first_sequence()
+        passed, earliest = self._ahead if now < self._ahead[1] else (0, _FOREVER)
         rows = execute(
-            "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND"
+            "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND number > ? AND"
             " number < (SELECT max(number) FROM checkpoint) AND (signature IS NOT NULL OR NOT ?)"
-            " ORDER BY number LIMIT ?",
-            (first, signed, step * _AHEAD_STEPS),
+            " ORDER BY number",
+            (first, passed, signed),
         )
         upto: tuple[int, int, bytes] | None = None
         for row in rows:
             made = parse_checkpoint(row[2]).time
             if made > now:
+                earliest = min(earliest, made)
+                self._ahead = (row[0], earliest) if upto is None else self._ahead
                 continue
             if made >= before or (upto is not None and row[1] >= first + step):
                 break
