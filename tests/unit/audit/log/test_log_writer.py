@@ -38,8 +38,12 @@ def test_checkpoints_of_a_clock_that_was_ahead_are_removed_with_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     writer, ids, read = ChainWriter(tmp_path / "audit.db", 0), IdSource(clock=lambda: 0), list[bytes]()
-    parse = parse_checkpoint
-    monkeypatch.setattr(log_writer, "parse_checkpoint", lambda text: parse((read.append(text), text)[1]))
+
+    def parse(text: bytes) -> Checkpoint:
+        read.append(text)
+        return parse_checkpoint(text)
+
+    monkeypatch.setattr(log_writer, "parse_checkpoint", parse)
 
     def seal(time: int) -> None:
         def report(_made: Checkpoint) -> AuditRecord:
