@@ -10,14 +10,12 @@ from functools import partial
 
 from appliance.base import clock
 from appliance.channel.messages import LookEnded, LookWanted, Message, MessageSeen
-from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.connections.relayed_topic import RelayedTopic, Tap
 from appliance.relay.transport.frames import Batch
 from roswire.message_view import PublisherReader
 
 MAX_LOOKS = 8
 MAX_MESSAGES = 20
-
-Tap = Callable[[Batch], None]
 
 
 class TopicTaps:

@@ -1,13 +1,10 @@
 """One publisher of a topic with a rank, as its relayed topic uses it."""
 
-import struct
 from collections.abc import Callable, Mapping
 
 from appliance.relay.ranked_topic import RankedTopic
 from appliance.relay.transport.frames import Batch
 from appliance.relay.velocity_zero import moves_of
-
-_LENGTH = struct.Struct("<I")
 
 
 class RankedPublication:
@@ -30,13 +27,11 @@ class RankedPublication:
 
     def passing(self, batch: Batch, now: float) -> Batch:
         """Return the messages that pass. They are the last ones of a batch: a publisher that is heard stays so."""
-        view, start, dropped = batch.view, 0, 0
-        for _ in range(batch.messages):
-            end = start + _LENGTH.size + _LENGTH.unpack_from(view, start)[0]
-            moves = self._moves(view[start + _LENGTH.size : end])
-            dropped += not self._topic.passes(self._key, moves=moves, now=now)
-            start = end
+        dropped = sum(
+            not self._topic.passes(self._key, moves=self._moves(frame[4:]), now=now)
+            for frame in batch.frames()
+        )
         if not dropped:
             return batch
         left = batch.messages - dropped
-        return batch.tail(left) if left else Batch(view[:0], 0, None)
+        return batch.tail(left) if left else Batch(batch.view[:0], 0, None)

@@ -11,16 +11,18 @@ it instead of them (`supersede`).
 A latching publisher sends its last message again on each connection. On a topic of commands this message is not new, so
 it is not passed (`replayed`), except on the first connection of a new publisher.
 
-If the publisher's host has no memory left, a latched message is not kept. When memory is free again, a later
-subscriber makes the relay reconnect to the publisher; the other subscribers then get the message twice. A latched
-command (a message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after
-it was refused.
-
 A publisher may greet each new subscriber with a message, from its connect callback (costmap_2d). For a later subscriber
 of a topic that is quiet, the relay opens an extra connection for up to two seconds, and passes what comes to the
 newcomers alone, through monitors. It does so at most once a second, and once a minute if no greeting came twice in a
 row; a newcomer that got nothing has a part in the second request. A topic that sends within that time does not greet. A
-command is never requested in this way.
+command (a message of a topic that had a guard, or a goal) is never requested in this way: it would begin a motion long
+after it was sent.
+
+roscpp latches a message of each `ros::Publisher` of a topic. The relay keeps the last one, which a later subscriber
+gets at once. If the publisher has sent more than the kept message on this connection, the subscriber gets the others
+over an extra connection. Monitors do not judge them again, because an older message could then undo a newer one of
+another `ros::Publisher`: those that passed unchanged when they came pass, and no others. In this way, a subscriber also
+gets a message that was not kept because its publisher's host had no memory left.
 
 Messages of a topic with a rank pass while their publisher is heard (`give_rank`). A message that was taken before a
 hand-over, and waits for monitors, does not pass after it; nor does a latched one.
@@ -29,6 +31,7 @@ While *all* subscribers are behind, the relay stops reading the publisher for at
 that the scheduler paused for some milliseconds loses nothing.
 """
 
+import hashlib
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -50,6 +53,12 @@ from roswire.tcpros import encode_frame
 
 _QUIET_SECONDS = 1.0  # without a message before a publisher is asked for a greeting
 _UNGREETED_SECONDS = 60.0  # between two requests to a publisher that does not greet
+_PASSED = 200  # most digests of messages that monitors passed
+
+Through = Callable[[Batch], Batch | None]
+"""Passes frames through monitors, and returns the frames that may pass, or None."""
+
+Tap = Callable[[Batch], None]
 
 # The last message of a latching publisher, kept in the memory of the publisher's host.
 
@@ -67,6 +76,7 @@ class LatchedMessage:
         self._make_room = make_room
         self._refused = refused
         self._refused_size: int | None = None
+        self._passed: dict[bytes, None] = {}
         self.batch: Batch | None = None
         self.is_latching = False
         self.withheld = False
@@ -80,13 +90,27 @@ class LatchedMessage:
     def is_lacking(self) -> bool:
         return self.is_latching and self.withheld
 
-    @property
-    def is_asked_again(self) -> bool:
-        return self._refused_size is not None and not self._share.refusal(self._refused_size)
+    def judge(self, batch: Batch, through: Through) -> Batch | None:
+        """Pass one message through monitors, and note whether they leave it unchanged."""
+        digest = _digest(batch.view)
+        left = through(batch)
+        self._passed.pop(digest, None)
+        if left is not None and _digest(left.view) == digest:
+            self._passed[digest] = None
+            if len(self._passed) > _PASSED:
+                del self._passed[next(iter(self._passed))]
+        return left
 
-    @property
-    def is_refused(self) -> bool:
-        return self._refused_size is not None
+    def others(self, frames: bytes, *, judged: bool) -> Batch | None:
+        """Return the frames besides the kept message; if `judged`, only those that monitors have left unchanged."""
+        kept = b"" if self.batch is None else bytes(self.batch.view)
+        others: list[memoryview] = []
+        for frame in Batch(memoryview(frames), 0, None).frames():
+            if kept and len(frame) == len(kept) and bytes(frame) == kept:
+                kept = b""
+            elif not judged or _digest(frame) in self._passed:
+                others.append(frame)
+        return Batch(memoryview(b"".join(others)), len(others), None, owned=True) if others else None
 
     def keep(self, batch: Batch) -> None:
         self.withheld = False
@@ -130,10 +154,13 @@ class Newcomers:
     """The `members` that may need a greeting, each with the number of the next message when it came."""
 
     def __init__(self) -> None:
-        self.reset()
+        self.reset(1, is_latching=False)
 
-    def reset(self) -> None:
-        self.members: dict[TopicSubscriber, int] = {}
+    def reset(self, following: int, *, is_latching: bool) -> None:
+        """Begin with a connection that brings the message number `following` first."""
+        self.members: dict[TopicSubscriber | Tap, int] = {}
+        self.first = following
+        self._is_latching = is_latching
         self._heard = 0, 0.0  # the number of the next message, and since when it has been that
         self._not_before = 0.0
         self._ungreeted = 0  # requests in a row without a greeting
@@ -144,23 +171,26 @@ class Newcomers:
 
     def due(self, following: int, now: float) -> bool:
         passed, since = self._heard
-        return (
-            bool(self.members)
-            and following == passed
-            and now >= max(since + _QUIET_SECONDS, self._not_before)
-        )
+        is_quiet = self._is_latching or (following == passed and now >= since + _QUIET_SECONDS)
+        return bool(self.members) and is_quiet and now >= self._not_before
 
-    def take(self, following: int, now: float) -> Collection[TopicSubscriber]:
-        """Return the members that have got no message since they came; none is due until `asked`."""
-        self.members = {member: first for member, first in self.members.items() if first == following}
+    def take(self, following: int, now: float) -> Collection[TopicSubscriber | Tap]:
+        """Return the members that lack a greeting; none is due until `asked`.
+
+        A message that came after a member is its greeting, unless the publisher latches several messages.
+        """
+        lacking = (
+            member for member, first in self.members.items() if self._is_latching or first == following
+        )
+        self.members = dict.fromkeys(lacking, following)
         if self.members:
             self._not_before = now + _UNGREETED_SECONDS
         return tuple(self.members)
 
-    def asked(self, members: Collection[TopicSubscriber], now: float, *, greeted: bool) -> None:
+    def asked(self, members: Collection[TopicSubscriber | Tap], now: float, *, greeted: bool) -> None:
         self._ungreeted = 0 if greeted else self._ungreeted + 1
         again = self._ungreeted < 2
-        self._not_before = now + (_QUIET_SECONDS if again else _UNGREETED_SECONDS)
+        self._not_before = now + (_QUIET_SECONDS if again or self._is_latching else _UNGREETED_SECONDS)
         for member in members if greeted or not again else ():
             self.members.pop(member, None)
 
@@ -233,10 +263,6 @@ class Upstream:
 
 def _no_call() -> ModuleCall | None:
     return None
-
-
-Through = Callable[[Batch], Batch | None]
-"""Passes frames through monitors, and returns the frames that may pass, or None."""
 
 
 class TopicState(Enum):
@@ -321,7 +347,7 @@ class RelayedTopic:
         self._header: dict[str, str] | None = None  # as subscribers get it; None while UNKNOWN
         self._waiting: dict[TopicSubscriber, None] = {}
         self._monitoring = _Monitoring()
-        self._taps: tuple[Callable[[Batch], None], ...] = ()
+        self._taps: tuple[Tap, ...] = ()
         self._stream: MessageStream | None = None
         self._replayed = replayed
         new_until = clock() + (APPEARED if fresh else -1)
@@ -366,16 +392,20 @@ class RelayedTopic:
     def header(self) -> Mapping[str, str] | None:
         return self._header
 
-    def tap(self, tap: Callable[[Batch], None], *, latched: bool) -> None:
-        """Call `tap` with each batch, first (if `latched`) with the latched message. The tap must not keep a batch."""
+    def tap(self, tap: Tap, *, latched: bool) -> None:
+        """Call `tap` with each batch, first (if `latched`) with latched messages. The tap must not keep a batch."""
         self._taps += (tap,)
         self.differs()
         if latched and self.latch.batch is not None:
             tap(self.latch.batch)
+        if latched and self._latches_others:
+            self._newcomers.members[tap] = self.counters.following
+            self._greet()
         self.upstream.connect()
 
-    def untap(self, tap: Callable[[Batch], None]) -> None:
+    def untap(self, tap: Tap) -> None:
         self._taps = tuple(other for other in self._taps if other != tap)
+        self._newcomers.members.pop(tap, None)
         self.differs()
         self._spare_unwanted()
 
@@ -487,7 +517,7 @@ class RelayedTopic:
         self.latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
         self._silence.begin(self._clock())
-        self._newcomers.reset()
+        self._newcomers.reset(self.counters.following, is_latching=self.latch.is_latching)
         if self._rank is not None:
             self._rank.opened(header, self._clock())
         # With a rank, a latched message may be older than a hand-back.
@@ -609,7 +639,12 @@ class RelayedTopic:
             self._admit(first, since, divided=False)
             batch.judged = first.judged
             return batch.tail(batch.messages - 1)
-        left = batch if through is None else through(batch)
+        if through is None:
+            left: Batch | None = batch
+        elif self.latch.is_latching and not self._is_command:
+            left = self.latch.judge(batch, through)
+        else:
+            left = through(batch)
         rest = batch.tail(batch.left) if batch.left else None
         if left is None:
             self.latch.withheld = True
@@ -683,30 +718,62 @@ class RelayedTopic:
             self._admit(waiting, now, divided=False)
         self._startup_replay.expire(now)
         if self.latch.batch is not None:
-            for member in self._served.row:
-                if member.missed and member.admits(self.latch.batch):  # only its first refusal is counted
-                    self._served.deliver(self.latch.batch, member)
+            # Only a subscriber's first refusal is counted.
+            late = [one for one in self._served.row if one.missed and one.admits(self.latch.batch)]
+            for member in late:
+                self._served.deliver(self.latch.batch, member)
+                if self._latches_others and not member.missed:
+                    self._newcomers.members[member] = self.counters.following
         self._served.trim(stalled=True)
         self._newcomers.heard(self.counters.following, now)
         self._greet()
         self.upstream.check_stall()
 
+    @property
+    def _latches_others(self) -> bool:
+        """Whether the publisher may have latched other messages than the kept one."""
+        return self.latch.is_latching and (
+            self.counters.following - self._newcomers.first > (self.latch.batch is not None)
+        )
+
+    @property
+    def _may_greet(self) -> bool:
+        if self._is_command or self._superseded or self._rank is not None:
+            return False
+        return self._state is TopicState.OPEN and not self.flow.limits
+
     def _greet(self) -> None:
-        """Ask for a greeting of the served newcomers that have got no message since they came."""
+        """Ask for a greeting of the served newcomers that lack one."""
         following = self.counters.following
         if not self._newcomers.due(following, self._clock()):
             return
-        commands = self._is_command or self._superseded or self._rank is not None
-        if self._state is not TopicState.OPEN or self.latch.is_latching or self.flow.limits or commands:
+        if not self._may_greet:
             self._newcomers.members.clear()
         elif members := self._newcomers.take(following, self._clock()):
             self.upstream.greet(lambda frames: self._on_greeting(members, following, frames))
 
-    def _on_greeting(self, members: Collection[TopicSubscriber], before: int, frames: bytes) -> None:
+    def _on_greeting(self, members: Collection[TopicSubscriber | Tap], before: int, frames: bytes) -> None:
         is_stream = self.counters.following != before  # a message for all, which came over both connections
-        self._newcomers.asked(members, self._clock(), greeted=bool(frames) or is_stream)
-        if is_stream or not frames:
+        is_latching = self.latch.is_latching
+        # A newer message of a `ros::Publisher` may have overtaken its latched one.
+        greeted = bool(frames) and not is_stream if is_latching else bool(frames) or is_stream
+        self._newcomers.asked(members, self._clock(), greeted=greeted)
+        if is_stream or not frames or not self._may_greet:
             return
+        if is_latching:
+            passing = self.latch.others(frames, judged=self._monitoring.through is not None)
+        else:
+            passing = self._greeting_passing(frames, before)
+        if passing is None:
+            return
+        for member in self._served.row:
+            if member in members and (not is_latching or member.admits(passing)):
+                self._served.deliver(passing, member)
+        for tap in self._taps:
+            if tap in members:
+                tap(passing)
+
+    def _greeting_passing(self, frames: bytes, before: int) -> Batch | None:
         batch = Batch(memoryview(frames), walk(memoryview(frames))[1], None, owned=True)
         batch.first = before
         self.counters.add(batch.messages, len(frames))
@@ -715,11 +782,7 @@ class RelayedTopic:
         if self._stream is not None:
             self._stream.write(batch.view, batch.messages, before)
         through = self._monitoring.through
-        passing = batch if through is None else through(batch)
-        if passing is not None:
-            for member in self._served.row:
-                if member in members:
-                    self._served.deliver(passing, member)
+        return batch if through is None else through(batch)
 
     def take_late(self) -> tuple[int, float]:
         """Return the late messages since the last call, and the longest delay or wait in seconds."""
@@ -747,26 +810,21 @@ class RelayedTopic:
         return row
 
     def _serve(self, member: TopicSubscriber, header: Mapping[str, str]) -> bool:
-        """Return whether the subscriber has ended, or has got an earlier message."""
-        given = True
+        """Return whether the subscriber has ended, or has got all earlier messages that are meant for it."""
         if not member.greet(header):
-            return given
+            return True
         self._served.add(member)
         self.differs()
         self.announce()
         self._reported = False
         if self.latch.batch is not None:
-            self._served.deliver(self.latch.batch, member)
-        elif self.latch.is_refused:
-            if self.latch.is_asked_again and not self._is_command:
-                self.upstream.request_latched()
+            batches = [self.latch.batch]
         else:
             batches = self._startup_replay.give(member.caller_id, self._clock())
-            for batch in batches:
-                self._served.deliver(batch, member)
-            given = bool(batches)
+        for batch in batches:
+            self._served.deliver(batch, member)
         self.relieve()
-        return given
+        return not self._latches_others if self.latch.is_latching else bool(batches)
 
     def _forget_header(self) -> None:
         needed = self._served or self._superseded or self.latch.batch is not None
@@ -791,3 +849,7 @@ class RelayedTopic:
 
 def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:
     return tuple(header.get(field) for field in ("type", "md5sum", "message_definition", "latching"))
+
+
+def _digest(frame: memoryview) -> bytes:
+    return hashlib.blake2b(frame, digest_size=16).digest()

@@ -13,6 +13,7 @@ without copying them.
 
 import mmap
 import struct
+from collections.abc import Iterator
 from math import ceil
 
 from appliance.relay.transport.memory import HeldBytes, HostMemory
@@ -71,6 +72,13 @@ class Batch:
         if self._kept is None and LITTLE * (len(self.view) - sent) <= len(self.view):
             return memoryview(bytes(self.view[sent:]))
         return self.keep()[sent:]
+
+    def frames(self) -> Iterator[memoryview]:
+        start = 0
+        while start < len(self.view):
+            end = start + _LENGTH.size + _unpack_length(self.view, start)[0]
+            yield self.view[start:end]
+            start = end
 
     def within(self, size: float, most: int) -> int:
         if size <= 0:

@@ -88,6 +88,20 @@ def test_a_latched_message_reaches_early_and_late_subscribers_once(
     assert len(talker.seen(event="connected")) == 1, "the publisher sees one connection"
 
 
+def test_each_subscriber_gets_the_latched_message_of_each_handle(
+    driver: RelayDriver, ros: RosSession
+) -> None:
+    """A nodelet manager with several static transforms, or rosbag that plays them, has several handles."""
+    ros.talker("roscpp", "/tf_static", "--latch", "--handles", "3", "--rate", "20")
+    listeners = []
+    for client in ("rospy", "roscpp", "rospy"):
+        listeners.append(ros.listener(client, "/tf_static"))
+        listeners[-1].wait_for_count(3, event="received")
+    for listener in listeners:
+        received = [event["data"] for event in listener.seen(event="received")]
+        assert sorted(received) == ["hello 1", "hello 2", "hello 3"]
+
+
 def test_a_stopped_subscriber_neither_delays_others_nor_grows_memory(
     driver: RelayDriver, ros: RosSession
 ) -> None:

@@ -550,7 +550,7 @@ def test_a_command_that_was_not_kept_is_not_asked_for(topic: str) -> None:
     story.receive(batch(b"not kept"))
     story.share.add(-100)
     story.join()
-    assert ("give again" in story.upstream.asked) == (topic == "/map")
+    assert ("greet" in story.upstream.asked) == (topic == "/map")
 
 
 def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
@@ -635,18 +635,139 @@ def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
         story.receive(batch(bytes(60)))
     assert early.received == 2 * bytes(batch(bytes(60)).view)
     assert story.refused == [LatchRefused("k", "/chatter", 64)]
-    assert (story.join().received, story.share.used) == (b"", 50)
-    assert "give again" not in story.upstream.asked
-    story.topic.latch.repeat()
-    assert len(story.refused) == 2
-    story.share.add(-50)
     late = story.join()
-    assert story.upstream.asked.count("give again") == 1
-    story.receive(batch(bytes(60)))
-    assert (late.received, story.share.used) == (bytes(batch(bytes(60)).view), 64)
-    assert story.join().received == late.received
+    assert (late.received, story.share.used) == (b"", 50)
     story.topic.latch.repeat()
     assert len(story.refused) == 2
+    answered(story, batch(bytes(60)))
+    assert late.received == bytes(batch(bytes(60)).view)
+    assert early.received == 2 * late.received
+    story.share.add(-50)
+    story.receive(batch(bytes(60)))
+    assert story.share.used == 64
+    assert story.join().received == bytes(batch(bytes(60)).view)
+    story.topic.latch.repeat()
+    assert len(story.refused) == 2
+
+
+def answered(story: Story, latched: Batch) -> None:
+    """Let three seconds pass, in which each request for a greeting brings the latched messages."""
+    for _second in range(3):
+        if "greet" in story.upstream.asked:
+            story.upstream.asked.clear()
+            story.upstream.greeted(bytes(latched.view))
+        story.now += 1
+        story.topic.tidy()
+
+
+def texts(frames: bytes) -> list[bytes]:
+    return [bytes(frame[4:]) for frame in Batch(memoryview(frames), 0, None).frames()]
+
+
+WAYS = ["plain", "monitored", "masked", "missed", "tap", "relay restarted"]
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "latched"),
+    [
+        (["one"], [], ["one"]),
+        (["one", "two", "three"], [], ["one", "two", "three"]),
+        (["same", "same"], [], ["same", "same"]),
+        (["old", "other"], ["new"], ["new", "other"]),
+        (["one"], ["two", "three"], ["one", "two", "three"]),
+        (["map"], ["not latched"], ["map"]),
+    ],
+)
+@pytest.mark.parametrize("way", WAYS)
+def test_each_subscriber_gets_what_each_publisher_of_a_process_has_latched(
+    way: str, first: list[str], later: list[str], latched: list[str]
+) -> None:
+    """It also gets the last message that was sent. Monitors judge each message once."""
+    story, judged, hidden, shown = Story(fresh=way != "relay restarted"), list[Batch](), [True], list[bytes]()
+    early = story.join()
+    if way == "monitored":
+        story.topic.leave(early)
+        story.topic.monitor(lambda one: judged.append(one) or one, wanted=True)  # type: ignore[func-returns-value]  # the call is noted
+    elif way == "masked":
+        story.topic.withhold(lambda _host: hidden[0])
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    rest: Batch | None = batch(*(text.encode() for text in first))
+    while rest is not None:
+        rest = story.topic.received(rest, story.now)
+    for text in later:
+        story.receive(batch(text.encode()))
+    latched_now = batch(*(text.encode() for text in latched))
+    hidden[0] = False
+    if way == "tap":
+        story.topic.tap(lambda one: shown.append(bytes(one.view)), latched=True)
+    elif way == "missed":
+        early.received, early.missed = b"", True
+        story.topic.tidy()
+    elif way == "masked":
+        story.topic.tidy()
+    else:
+        early = story.join("/late")
+    answered(story, latched_now)
+    got = texts(b"".join(shown) if way == "tap" else early.received)
+    last = [text.encode() for text in (first + later)[-1:] if text not in latched]
+    assert sorted(got) == sorted([*texts(bytes(latched_now.view)), *last])
+    assert len(judged) == (len(first + later) if way == "monitored" else 0)
+
+
+def test_a_newer_message_is_not_followed_by_an_older_one_that_was_latched() -> None:
+    """The publisher is asked again, at most once a second."""
+    story = Story()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"old", b"other"))
+    late = story.join()
+    story.receive(batch(b"new"))
+    story.upstream.greeted(bytes(batch(b"old", b"other").view))
+    assert texts(late.received) == [b"other", b"new"]
+    story.join("/again")
+    assert story.upstream.asked.count("greet") == 1
+    story.now += 1
+    story.topic.tidy()
+    assert story.upstream.asked.count("greet") == 2
+    story.upstream.greeted(bytes(batch(b"new", b"other").view))
+    assert texts(late.received)[:2] == [b"other", b"new"] and b"old" not in texts(late.received)
+
+
+@pytest.mark.parametrize("ends", ["dropped", "changed", "never seen", "later dropped"])
+def test_a_latched_message_that_monitors_did_not_pass_comes_in_no_other_way(ends: str) -> None:
+    story, drops = Story(), [ends == "dropped"]
+
+    def through(one: Batch) -> Batch | None:
+        if bytes(one.view[4:]) != b"secret":
+            return one
+        return None if drops[0] else batch(b"******") if ends == "changed" else one
+
+    story.topic.monitor(through, wanted=True)
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"first" if ends == "never seen" else b"secret"))
+    drops[0] = True
+    if ends == "later dropped":
+        story.receive(batch(b"secret"))
+    story.receive(batch(b"fine"))
+    late = story.join()
+    answered(story, batch(b"secret", b"fine"))
+    assert texts(late.received) == [b"fine"]
+
+
+@pytest.mark.parametrize("becomes", ["guarded", "goal", "guarded during the request", "stopped"])
+def test_latched_commands_are_not_requested(becomes: str) -> None:
+    story = Story("/a/goal" if becomes == "goal" else "/cmd_vel")
+    story.topic.monitor(lambda one: one, wanted=True, guarded=becomes == "guarded")
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    for text in (b"forward", b"back"):
+        story.receive(batch(text))
+    if becomes == "stopped":
+        story.topic.supersede(b"stop")
+    base = story.join()
+    assert ("greet" in story.upstream.asked) == (becomes == "guarded during the request")
+    if becomes == "guarded during the request":
+        story.topic.monitor(lambda one: one, wanted=True, guarded=True)
+        story.upstream.greeted(bytes(batch(b"forward", b"back").view))
+    assert texts(base.received) == [b"stop" if becomes == "stopped" else b"back"]
 
 
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
