@@ -8,8 +8,9 @@ A guard's stop comes over another connection, so it can overtake motions that wa
 the queue or in the kernel. Therefore subscribers also get the stop after these motions, and a later subscriber gets
 it instead of them (`supersede`).
 
-A latching publisher sends its last message again on each connection. On a topic of commands this message is not new, so
-it is not passed (`replayed`), except on the first connection of a new publisher.
+A latching publisher sends its last message again on each connection, roscpp that of each `ros::Publisher`. On a topic
+of commands these messages are not new, so only stops among them pass (`replayed`), except on the first connection of a
+new publisher.
 
 A publisher may greet each new subscriber with a message, from its connect callback (costmap_2d). For a later subscriber
 of a topic that is quiet, the relay opens an extra connection for up to two seconds, and passes what comes to the
@@ -53,6 +54,7 @@ from roswire.tcpros import encode_frame
 
 _QUIET_SECONDS = 1.0  # without a message before a publisher is asked for a greeting
 _UNGREETED_SECONDS = 60.0  # between two requests to a publisher that does not greet
+_REPLAYS = 64  # most latched commands of one read that are judged, the last ones
 _PASSED = 200  # most digests of messages that monitors passed
 
 Through = Callable[[Batch], Batch | None]
@@ -569,11 +571,27 @@ class RelayedTopic:
         batch.first = self.counters.following
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
+        if self._latch_replay.is_replay(self._clock()) and self._is_command:
+            self._pass_stops(batch, since)
+            return None
+        return self._receive(batch, since)
+
+    def _pass_stops(self, batch: Batch, since: float) -> None:
+        """Pass only stops of commands that the publisher had latched before, one by one: others may lie between."""
+        for number, frame in enumerate(batch.frames()):
+            one = Batch(memoryview(bytearray(frame)), 1, 0, owned=True)
+            one.first = batch.first + number
+            if number >= batch.messages - _REPLAYS and self._replayed(self, one.view[4:]):
+                self._receive(one, since)
+                continue
+            self.latch.withheld = True
+            if self._stream is not None:
+                self._stream.write(one.view, 1, one.first)
+
+    def _receive(self, batch: Batch, since: float) -> Batch | None:
         passing = batch
-        if self._latch_replay.awaited:
-            passing = self._without_replay(batch)
         if self._rank is not None:
-            passing = self._rank.passing(passing, self._clock())
+            passing = self._rank.passing(batch, self._clock())
         if passing is not batch:
             if self._stream is not None:
                 dropped = batch.head(batch.messages - passing.messages)
@@ -587,14 +605,6 @@ class RelayedTopic:
             )  # a delayed message could be older than a hand-back
             passing = self.flow.passing(passing, self._clock(), latching=latching)
         return self._take(batch, passing, since)
-
-    def _without_replay(self, batch: Batch) -> Batch:
-        """Leave out the first message of this connection, if it is a command that the publisher had latched before."""
-        latched = self._latch_replay.is_first(self._clock()) and self._is_command
-        if not latched or self._replayed(self, batch.head(1).view[4:]):
-            return batch
-        self.latch.withheld = True
-        return batch.tail(batch.messages - 1)
 
     def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
         """Continue after the pump has passed a batch to the first `number` subscribers, and `sent` bytes to the next.

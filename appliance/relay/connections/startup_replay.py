@@ -18,7 +18,10 @@ APPEARED = 5.0
 SECONDS = 1.0
 SPEECH = 0.25
 REPLAY_SECONDS = 1.0
-"""The time after a connection in which the first message of a latching publisher is the one that it had latched."""
+"""The time after a connection in which the first messages of a latching publisher are those that it had latched."""
+
+REPLAY_GAP = 0.1
+"""The seconds without a message after which the next one is new: a publisher sends all latched ones at once."""
 
 _MESSAGES = 200
 _BYTES = 1 << 20
@@ -79,25 +82,23 @@ class StartupReplay:
 
 
 class LatchReplay:
-    """Finds the message that a latching publisher sends again on a connection: a command of that kind is not new.
+    """Finds the messages that a latching publisher sends again on a connection: a command of that kind is not new.
 
     The publisher counts as new until `new_until` (seconds of the relay's clock).
     """
 
     def __init__(self, new_until: float) -> None:
         self._new_until = new_until
-        self._until = 0.0
+        self._until = self._quiet_at = 0.0
 
     def opened(self, now: float, *, is_latching: bool, may_be_new: bool) -> None:
         is_new = may_be_new and now <= self._new_until
-        self._until = now + REPLAY_SECONDS if is_latching and not is_new else 0.0
+        self._quiet_at = self._until = now + REPLAY_SECONDS if is_latching and not is_new else 0.0
         self._new_until = -1.0  # only the first connection of a new publisher has a new message first
 
-    @property
-    def awaited(self) -> bool:
-        return self._until > 0
-
-    def is_first(self, now: float) -> bool:
-        """Return whether the next message is the one that was latched; call this once for a connection."""
-        until, self._until = self._until, 0.0
-        return now <= until
+    def is_replay(self, now: float) -> bool:
+        """Return whether messages that come now were latched; call this for each read of a connection."""
+        if now > self._quiet_at:
+            self._until = 0.0
+        self._quiet_at = min(self._until, now + REPLAY_GAP)
+        return now <= self._quiet_at

@@ -96,6 +96,7 @@ def test_a_latched_message_never_passes() -> None:
     story.topic.upstream_opened({**VELOCITY, "latching": "1"})
     story.receive(batch(GO))
     assert (member.received, ranked.driver.standing) == (b"", "free")
+    story.now += 0.2
     story.receive(batch(GO))
     assert member.received == bytes(batch(GO).view)
 

@@ -7,13 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
+from appliance.channel.messages.relay_link import RankPlace
 from appliance.relay.connections.message_sink import MessageSink
 from appliance.relay.connections.named_subscribers import ActionServers
+from appliance.relay.connections.ranked_publication import RankedPublication
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
+from appliance.relay.ranked_topic import RankedTopic
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.rate_limit import SharedRateLimit
 from tests.support.relay_memory import share
 from tests.support.steps import steps
+from tests.unit.relay.test_ranked_topic import settle
 
 HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
 
@@ -768,6 +772,54 @@ def test_latched_commands_are_not_requested(becomes: str) -> None:
         story.topic.monitor(lambda one: one, wanted=True, guarded=True)
         story.upstream.greeted(bytes(batch(b"forward", b"back").view))
     assert texts(base.received) == [b"stop" if becomes == "stopped" else b"back"]
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+@pytest.mark.parametrize("stop", [None, 0, 1, 3])
+@pytest.mark.parametrize("reads", ["one", "each", "pairs"])
+@pytest.mark.parametrize("kind", ["goal", "guarded once", "ranked"])
+def test_only_stops_among_latched_commands_pass_on_a_later_connection(
+    kind: str, reads: str, stop: int | None, number: int
+) -> None:
+    """The publisher sends them at once. After a pause, its commands are new. A recording gets each in its place."""
+    recorder = _Recorder()
+    story = Story(
+        "/arm/goal" if kind == "goal" else "/cmd_vel",
+        fresh=False,
+        sink=recorder,
+        replayed=lambda _topic, body: bytes(body) == b"stop",
+    )
+    if kind == "ranked":
+        ranked = RankedTopic(RankPlace(0, 0.3, standing="free"), 0.0, lambda _driver: None)
+        ranked.place("k", 0, 0.3)
+        settle(ranked, 0.0)
+        story.topic.give_rank(RankedPublication(ranked, "k"))
+    elif kind == "guarded once":
+        story.topic.monitor(lambda one: one, wanted=True, guarded=True)
+        story.topic.monitor(None, wanted=False)
+    base = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    sent = [b"stop" if index == stop else b"go %d" % index for index in range(number)]
+    size = {"one": number, "each": 1, "pairs": 2}[reads]
+    for begin in range(0, number, size):
+        story.receive(batch(*sent[begin : begin + size]))
+        story.now += 0.02
+    stops = [text for text in sent if text == b"stop"]
+    assert (texts(base.received), texts(recorder.written)) == (stops, sent)
+    story.now += 0.2
+    story.receive(batch(b"new", b"newer"))
+    assert texts(base.received) == [*stops, b"new", b"newer"]
+
+
+def test_a_stream_of_commands_passes_a_second_after_its_connection() -> None:
+    """Its publisher latches, and is never quiet."""
+    story = Story("/arm/goal", fresh=False, replayed=lambda _topic, _body: False)
+    base = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    for number in range(60):
+        story.receive(batch(b"%d" % number))
+        story.now += 0.02
+    assert texts(base.received)[0] in {b"50", b"51"}
 
 
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
