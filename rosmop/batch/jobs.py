@@ -99,25 +99,24 @@ def unpacked(result: bytes) -> Result | Failure:
 
 def work(job: bytes) -> bytes:
     """Execute a job. Every error becomes a `Failure`, so one recording never ends the work on others."""
-    result: Result | Failure
     try:
         envelope = msgspec.msgpack.decode(job, type=_Envelope)
         if envelope.version != _version():
-            result = Failure(
+            failure = Failure(
                 f"the worker has version {_version()}, the command {envelope.version}; install the same"
             )
         else:
             with _limit(_SECONDS + _SECONDS_PER_MB * envelope.job.recording.size / 1e6) as seconds:
-                result = _result(envelope.job)
+                return msgspec.msgpack.encode(_result(envelope.job))
     except SpecificationError as error:
-        result = Failure(_text(str(error)), [_text(str(finding)) for finding in error.findings])
+        failure = Failure(_text(str(error)), [_text(str(finding)) for finding in error.findings])
     except (RecordingError, LearningError) as error:
-        result = Failure(_text(str(error)))
+        failure = Failure(_text(str(error)))
     except _TooLong:
-        result = Failure(f"it takes more than {seconds:.0f} s of processor time")
+        failure = Failure(f"it takes more than {seconds:.0f} s of processor time")
     except Exception as error:  # noqa: BLE001  a recording may be damaged in ways that no reader knows
-        result = Failure(_text(f"{type(error).__name__}: {error}"))
-    return msgspec.msgpack.encode(result)
+        failure = Failure(_text(f"{type(error).__name__}: {error}"))
+    return msgspec.msgpack.encode(failure)
 
 
 @contextmanager

@@ -422,8 +422,10 @@ class _Proposer:
         if not series.highs.of:
             return
         low, high = -series.lows.top, series.highs.top
+        # The largest numbers of 64 bits are rounded up: they are floats here.
+        least, most = _WHOLE_NUMBERS[self._known.fields[topic][path].startswith("u")]
         if low == high:
-            only = literal(int(low) if integer else low)
+            only = literal(max(min(int(low), most), least) if integer else low)
             same = f"{{v}} != {only}" if not series.nan else f"{{v}} < {only} || {{v}} > {only}"
             yield replace(
                 base, kind="constant", says=f"{place} has a new value", seen=f"always {only}",
@@ -437,7 +439,6 @@ class _Proposer:
         if not all(math.isfinite(2 * one) for one in (top, bottom, width)):
             return  # a bound would be beyond the largest number
         if integer:
-            least, most = _WHOLE_NUMBERS[self._known.fields[topic][path].startswith("u")]
             above, below = number(min(math.ceil(top), most)), number(max(-math.ceil(bottom), least))
         else:
             above, below = rounded_up(top, width), rounded_down(-bottom, width)

@@ -127,8 +127,9 @@ class Series(msgspec.Struct):
         if last is None or value != last:
             self.since = seconds
         if math.isfinite(value):
-            self.highs.add(value, window)
-            self.lows.add(-value, window)
+            # An integer below -2^63, the negative of a large uint64, cannot be sent by a worker.
+            self.highs.add(float(value), window)
+            self.lows.add(-float(value), window)
             if last is not None:
                 self.stays.add(seconds - self.since, window)
                 if value != last:

@@ -1,10 +1,13 @@
 import json
+import math
 import os
 import resource
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
+from struct import pack
 
 import pytest
 from rosbags.rosbag1 import Writer
@@ -18,6 +21,8 @@ from rosmop.batch.runner import JobRunner
 from rosmop.recordings.recording import RecordingError
 from rosmop.tests.acting import message
 from rosmop.tests.batch.test_many_recordings import KIND, ROSMOP, SPECIFICATION, make_bag, rosmop
+from roswire.definitions import Definitions
+from roswire.message_text import PRIMITIVES
 from roswire.standard import standard_definitions
 
 RUN = "run limit.rv --bags bags"
@@ -260,6 +265,41 @@ def test_workers_end_while_they_start(end: signal.Signals, folder: Path) -> None
     else:
         assert (process.returncode, err) == (0, "")
         assert Path("report").read_bytes() == Path("expected").read_bytes()
+
+
+def extremes_of(code: str, size: int) -> list[float]:
+    """Return the smallest, the largest, zero, and what else is no ordinary number."""
+    if code in "fd":
+        return [-(most := 1e38 if code == "f" else sys.float_info.max), most, 0.0, math.nan, math.inf]
+    if code.islower():
+        return [-1 << 8 * size - 1, (1 << 8 * size - 1) - 1, 0, 0, 0]
+    return [0, 1 if code == "?" else (1 << 8 * size) - 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "head", "count"), [("", b"", 1), ("[1]", b"", 1), ("[]", pack("<I", 7), 7)]
+)
+def test_each_value_of_each_primitive_can_be_learnt(
+    shape: str, head: bytes, count: int, tmp_path: Path
+) -> None:
+    primitives = sorted(PRIMITIVES.keys() - {"time", "duration"})
+    for seed in range(2):
+        with Writer(tmp_path / f"{seed}.bag") as writer:
+            for part, names in enumerate((primitives[::2], primitives[1::2])):  # one topic has limits
+                known = Definitions.from_files({"test/All.msg": "\n".join(f"{n}{shape} {n}_" for n in names)})
+                text, digest = known.full_text("test/All"), known.md5sum("test/All")
+                for place in range(6):
+                    connection = writer.add_connection(
+                        f"/part{part}_{place}", f"test/msg/All{part}", msgdef=text, md5sum=digest
+                    )
+                    for second in range(20):
+                        data = b""
+                        for code, size in map(PRIMITIVES.__getitem__, names):
+                            value = extremes_of(code, size)[second % 5 if place == 5 else place]
+                            data += head + pack(f"<{count}{code}", *[value] * count)
+                        writer.write(connection, (seed * 1000 + second + 1) * 10**9, data)
+    status, out, err = rosmop(f"learn --workers 1 --bags {tmp_path}")
+    assert (status, out.count("uint64_ is") + out.count("uint64_ has") > 5) == (0, True), err
 
 
 @pytest.mark.nightly
