@@ -105,22 +105,21 @@ class _CaseReader:
 
     def _give(self, node: _Node) -> None:
         given = self._mapping(node, "given", ("robot", "hosts"))
-        robot: list[Address] = list(self._addresses(given["robot"][1])) if "robot" in given else []
+        robot: list[Address] = list(self._addresses(given["robot"][1], "robot")) if "robot" in given else []
         hosts: dict[str, Address] = {}
         if "hosts" in given:
             for name, (_, value) in self._mapping(given["hosts"][1], "hosts", None).items():
-                hosts.update((name, address) for address in self._addresses(value))
+                hosts.update((name, address) for address in self._addresses(value, quoted(name)))
         policy = compile_policy(self._policy.text, file=self._policy.file, hosts=hosts, robot=robot)
         self._policy = policy.at_any_time()
 
-    def _addresses(self, node: _Node) -> Iterator[Address]:
-        for scalar in node.value if isinstance(node, yaml.SequenceNode) else [node]:
+    def _addresses(self, node: _Node, what: str) -> Iterator[Address]:
+        for scalar in self._one_or_more(node, what):
             text = self._text(scalar, "an address")
             try:
                 yield canonical_address(ipaddress.ip_address(text))
             except ValueError:
-                if text:
-                    self._error(scalar, f"{quoted(text)} is not an IP address")
+                self._error(scalar, f"{quoted(text)} is not an IP address")
 
     def _case(self, node: _Node) -> Iterator[CaseResult]:
         case = self._mapping(node, "a case", ("host", "node", "at", *_EXPECTED))
@@ -148,8 +147,7 @@ class _CaseReader:
         if "host" not in case:
             self._error(node, "a case needs host: an address, robot or host:NAME")
             return
-        value = case["host"][1]
-        for scalar in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+        for scalar in self._one_or_more(case["host"][1], "host"):
             text = self._text(scalar, "host")
             try:
                 yield from find_hosts(text, self._policy)
@@ -186,6 +184,7 @@ class _CaseReader:
             expected = f" with {', '.join(keys)}" if keys else ""
             self._error(node, f"{what} is a mapping{expected}")
             return pairs
+        self._not_empty(node, what)
         for key, value in node.value:
             text = self._text(key, "a key")
             if keys is not None and text not in keys:
@@ -199,10 +198,18 @@ class _CaseReader:
 
     def _sequence(self, node: _Node, what: str) -> list[_Node]:
         if isinstance(node, yaml.SequenceNode):
+            self._not_empty(node, what)
             items: list[_Node] = node.value
             return items
         self._error(node, f"{what} is a list")
         return []
+
+    def _one_or_more(self, node: _Node, what: str) -> list[_Node]:
+        return self._sequence(node, what) if isinstance(node, yaml.SequenceNode) else [node]
+
+    def _not_empty(self, node: yaml.CollectionNode, what: str) -> None:
+        if not node.value:  # it would test less than its author believes
+            self._error(node, f"{what} is empty: fill it, or remove it")
 
     def _text(self, node: _Node, what: str) -> str:
         if isinstance(node, yaml.ScalarNode):

@@ -1,4 +1,7 @@
+from typing import Any
+
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -59,6 +62,32 @@ def test_a_mistake_in_the_cases_is_an_error_with_its_place(text: str, expected: 
         run(text)
     shown = [f"{f.line}:{f.column}: {f.text}" for f in caught.value.findings]
     assert any(line.startswith(expected) for line in shown)
+
+
+FULL = """
+given: {robot: [192.0.2.1], hosts: {ocu-1: [10.77.0.11]}}
+cases:
+  - {host: [ocu, robot], node: /joystick, allow: [publish /cmd], deny: [call /a], ask: [call /b]}
+  - {host: 10.0.0.5, deny: [call /a]}
+"""
+PLACES = (
+    "", "given", "given robot", "given hosts", "given hosts ocu-1", "cases", "cases 0", "cases 0 host",
+    "cases 0 allow", "cases 0 deny", "cases 0 ask",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("value", [{}, [], None])
+def test_an_empty_part_is_an_error_and_never_fewer_checks(value: object, place: str) -> None:
+    assert len(run(FULL)) == 10
+    tree = {"file": yaml.safe_load(FULL)}
+    *path, last = (int(word) if word.isdigit() else word for word in f"file {place}".split())
+    inner: Any = tree
+    for step in path:
+        inner = inner[step]
+    inner[last] = value
+    with pytest.raises(PolicyError):
+        run(yaml.safe_dump(tree["file"]))
 
 
 def test_yaml_aliases_cannot_multiply_cases() -> None:
