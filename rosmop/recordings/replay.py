@@ -3,7 +3,9 @@
 Messages are dropped if their topic's definition differs from that of the specifications.
 """
 
+import struct
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -49,11 +51,9 @@ class OutputBag:
         self._definitions = definitions
         self._connections: dict[_Header, Connection] = {}
         self._last, self._published = 0, False
-        try:
+        with self._errors():
             self._writer = Writer(path)
             self._writer.open()
-        except (WriterError, OSError) as error:
-            raise RecordingError(f"cannot write the bag {path}: {error}") from error
 
     def __enter__(self) -> "OutputBag":
         return self
@@ -61,7 +61,8 @@ class OutputBag:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._writer.close()
+        with self._errors():  # also after an error, what was written gets its index
+            self._writer.__exit__(None, None, None)
 
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
         sent = connection.topic, connection.msgtype, connection.msgdef.data, connection.digest
@@ -77,14 +78,22 @@ class OutputBag:
             self.publish(judged)
 
     def _write(self, header: _Header, time_ns: int, data: bytes, *, published: bool) -> None:
-        if header not in self._connections:
-            topic, kind, text, digest, caller, latching = header
-            self._connections[header] = self._writer.add_connection(
-                topic, kind, msgdef=text, md5sum=digest, callerid=caller, latching=latching
-            )
         time_ns = max(time_ns, self._last + (published or self._published))
         self._last, self._published = time_ns, published
-        self._writer.write(self._connections[header], time_ns, data)
+        with self._errors():
+            if header not in self._connections:
+                topic, kind, text, digest, caller, latching = header
+                self._connections[header] = self._writer.add_connection(
+                    topic, kind, msgdef=text, md5sum=digest, callerid=caller, latching=latching
+                )
+            self._writer.write(self._connections[header], time_ns, data)
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (WriterError, OSError, ValueError, struct.error) as error:
+            raise RecordingError(f"cannot write the bag {self._path}: {error}") from error
 
 
 def replay(

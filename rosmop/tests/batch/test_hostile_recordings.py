@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from struct import pack
 
@@ -18,7 +19,8 @@ from rosmop.batch.jobs import Failure, SurveyJob, packed, unpacked, work
 from rosmop.batch.journal import JournalError, ResumeJournal
 from rosmop.batch.recording_list import recordings_of
 from rosmop.batch.runner import JobRunner
-from rosmop.recordings.recording import RecordingError
+from rosmop.recordings.recording import RecordingError, open_recording
+from rosmop.recordings.replay import OutputBag
 from rosmop.tests.acting import message
 from rosmop.tests.batch.test_many_recordings import KIND, ROSMOP, SPECIFICATION, make_bag, rosmop
 from roswire.definitions import Definitions
@@ -220,6 +222,27 @@ def test_a_full_disk_is_reported(option: str, folder: Path) -> None:
     assert Path("file").exists() is (option == "--resume")
     subprocess.run(words, check=True, capture_output=True)
     assert Path("file").stat().st_size > 1000
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("room", [0, 4000, 1_200_000, -1])  # -1: all but the last byte
+def test_an_output_without_room_is_reported(room: int, tmp_path: Path) -> None:
+    with closing(open_recording(make_bag(tmp_path / "one.bag", 1, 1))) as reader:
+        ((connection, time_ns, _data),) = reader.in_order()
+
+    def write(name: str) -> int:
+        with OutputBag(tmp_path / name, standard_definitions()) as output:
+            for number in range(4):
+                output.relay(connection, time_ns + number, bytes(600_000))
+        return (tmp_path / name).stat().st_size
+
+    size, limits = write("whole.bag"), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room % size, limits[1]))
+    try:
+        with pytest.raises(RecordingError, match=r"cannot write the bag .*/cut\.bag: .*File too large"):
+            write("cut.bag")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_a_report_without_a_folder_is_refused_first(folder: Path) -> None:
