@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import (
     Chunk,
@@ -27,6 +27,8 @@ from rosbags.rosbag1.reader import (
     IndexData,
     RecordType,
     decompressors,
+    normalize,
+    normalize_msgtype,
     read_bytes,
     read_uint32,
 )
@@ -65,6 +67,20 @@ class BoundedReader(Reader):
     @property
     def message_count(self) -> int:
         return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
+
+    def read_connection(self) -> Connection:
+        """Read a connection; bytes outside UTF-8, as in names and comments of old nodes, become U+FFFD."""
+        assert self.bio is not None  # noqa: S101  the reader is open
+        number = (record := Header.read(self.bio, RecordType.CONNECTION)).get_uint32("conn")
+        header = Header.read(self.bio)
+        for fields in (record, header):
+            fields.update({name: data.decode("utf-8", "replace").encode() for name, data in fields.items()})
+        latching = int(header["latching"] == b"1") if "latching" in header else None
+        caller = header.get_string("callerid") if "callerid" in header else None
+        text = MessageDefinition(MessageDefinitionFormat.MSG, header.get_string("message_definition"))
+        topic, kind = record.get_string("topic"), normalize_msgtype(header.get_string("type"))
+        sender = ConnectionExtRosbag1(caller, latching)
+        return Connection(number, normalize(topic), kind, text, header.get_string("md5sum"), 0, sender, self)
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
         """Do nothing: `in_order` reads the index of a chunk when its time has come."""

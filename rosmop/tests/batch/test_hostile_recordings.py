@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 
 from rosmop.batch import jobs
 from rosmop.batch.executor import ThisProcess
-from rosmop.batch.jobs import Failure, SurveyJob, packed, unpacked, work
+from rosmop.batch.jobs import Failure, Survey, SurveyJob, packed, unpacked, work
 from rosmop.batch.journal import JournalError, ResumeJournal
 from rosmop.batch.recording_list import recordings_of
 from rosmop.batch.runner import JobRunner
@@ -222,6 +222,35 @@ def test_a_full_disk_is_reported(option: str, folder: Path) -> None:
     assert Path("file").exists() is (option == "--resume")
     subprocess.run(words, check=True, capture_output=True)
     assert Path("file").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("field", ["topic", "type", "md5sum", "message_definition", "callerid", "latching"])
+def test_bytes_outside_utf8_in_a_connection_leave_its_recording(field: str, tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "any.bag", 1, 5)
+    other = {"topic": "/odd", "type": "odd/Odd", "md5sum": "odd", "message_definition": "int32 x # odd",
+             "callerid": "/odd", "latching": "odd"}  # fmt: skip
+    with Writer(tmp_path / "odd.bag") as writer, closing(open_recording(path)) as reader:
+        (known,) = reader.connections
+        row = writer.add_connection("/n", known.msgtype, msgdef=known.msgdef.data, md5sum=known.digest)
+        odd = writer.add_connection(
+            other["topic"], "odd/msg/Odd", msgdef=other["message_definition"], md5sum=other["md5sum"],
+            callerid=other["callerid"], latching=other["latching"],  # type: ignore[arg-type]
+        )  # fmt: skip
+        for _connection, time_ns, data in reader.in_order():
+            writer.write(row, time_ns, data)
+            writer.write(odd, time_ns, data)
+    before = (tmp_path / "odd.bag").read_bytes()
+    value = f"{field}={other[field]}".encode()
+    after = before.replace(value, value[:-3] + b"o\xff\xb0")
+    assert after != before
+    (tmp_path / "odd.bag").write_bytes(after)
+    (tmp_path / "limit.rv").write_text(SPECIFICATION)
+    specification = tmp_path / "limit.rv"
+    status, out, err = rosmop(f"run {specification} --bag {tmp_path}/odd.bag --output {tmp_path}/out.bag")
+    assert (status, out.splitlines()[-1].partition(":")[0], err) == (0, "10 messages", "")
+    (recording,) = recordings_of([], [f"{tmp_path}/odd.bag"])
+    survey = unpacked(work(packed(SurveyJob(recording, ["*"]))))
+    assert isinstance(survey, Survey) and len(survey.topics) == 2
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
