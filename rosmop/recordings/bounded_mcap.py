@@ -88,7 +88,7 @@ class BoundedMcap:
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         chunks: list[_ChunkPlace] = []
-        count = 0
+        count: int | None = None
         for record in self._stream(self._file):
             if isinstance(record, Schema):
                 schemas[record.id] = record
@@ -100,17 +100,15 @@ class BoundedMcap:
                 )
             elif isinstance(record, Statistics):
                 count = record.message_count
-        if count and not chunks:
-            raise ValueError("its messages are in no chunk; `mcap recover` writes chunks")
+        ros = [channel for _number, channel in sorted(channels.items()) if channel.message_encoding == "ros1"]
+        # Writers may leave out each part of an index.
+        if (count != 0 and not (chunks and channels)) or any(row.schema_id not in schemas for row in ros):
+            raise ValueError("its index lacks chunks, channels or schemas; `mcap recover` writes them")
         self._chunks = sorted(chunks)
         self.message_count = count or len(chunks)
         self.start_time = min((chunk.first for chunk in chunks), default=0)
         self.end_time = max((chunk.last + 1 for chunk in chunks), default=0)
-        self.connections = [
-            self._connection(channel, schemas[channel.schema_id])
-            for _number, channel in sorted(channels.items())
-            if channel.message_encoding == "ros1" and channel.schema_id in schemas
-        ]
+        self.connections = [self._connection(channel, schemas[channel.schema_id]) for channel in ros]
         if channels and not self.connections:
             encodings = ", ".join(sorted({channel.message_encoding for channel in channels.values()}))
             raise ValueError(f"it has no messages of ROS 1, only of encoding {encodings}")

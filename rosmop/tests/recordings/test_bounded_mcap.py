@@ -1,9 +1,11 @@
 import random
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from rosmop.recordings import bounded_mcap, regular_files
 from rosmop.recordings.recording import RecordedFile, RecordingError
@@ -13,12 +15,11 @@ def make_mcap(
     path: Path,
     rows: Sequence[tuple[int, bytes]],
     *,
-    chunk: int = 200,
-    compression: CompressionType = CompressionType.NONE,
     encoding: str = "ros1",
+    **options: Any,
 ) -> Path:
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=chunk, compression=compression)
+        writer = Writer(file, **{"chunk_size": 200, "compression": CompressionType.NONE, **options})
         writer.start(profile="ros1")
         schema = writer.register_schema("std_msgs/String", "ros1msg", b"string data")
         channel = writer.register_channel("/t", encoding, schema)
@@ -45,7 +46,7 @@ def test_messages_are_in_the_order_of_time(tmp_path: Path) -> None:
 def test_a_chunk_is_unpacked_up_to_a_limit(
     compression: CompressionType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = make_mcap(tmp_path / "x.mcap", [(1, bytes(100_000))], chunk=200_000, compression=compression)
+    path = make_mcap(tmp_path / "x.mcap", [(1, bytes(100_000))], chunk_size=200_000, compression=compression)
     assert len(next(RecordedFile(path, ["*"]).messages())[2]) == 100_000
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 50_000)
     reason = "exceeds limit 50000" if compression is CompressionType.NONE else "more than 50000 bytes"
@@ -54,14 +55,14 @@ def test_a_chunk_is_unpacked_up_to_a_limit(
 
 def test_chunks_of_one_time_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [(time, bytes(1000)) for _chunk in range(40) for time in (1, 1000)]
-    path = make_mcap(tmp_path / "x.mcap", rows, chunk=1500)
+    path = make_mcap(tmp_path / "x.mcap", rows, chunk_size=1500)
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 20_000)
     assert "sort the file by time" in refusal(path)
 
 
 def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [(time, bytes(10_000)) for time in range(50)]
-    path = make_mcap(tmp_path / "x.mcap", rows, chunk=20_000, compression=CompressionType.ZSTD)
+    path = make_mcap(tmp_path / "x.mcap", rows, chunk_size=20_000, compression=CompressionType.ZSTD)
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 50_000)
     monkeypatch.setattr(bounded_mcap, "PER_BYTE", 1)
     assert "unpacks to more than 1 times its size" in refusal(path)
@@ -74,6 +75,35 @@ def test_other_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(whole[:-20])
     assert "cannot read the MCAP file" in refusal(tmp_path / "cut.mcap")
     assert "has no messages" in refusal(make_mcap(tmp_path / "0.mcap", []))
+
+
+@pytest.mark.parametrize(
+    ("option", "values"),
+    [
+        ("chunk_size", [1, 200, 10**6]),
+        ("compression", list(CompressionType)),
+        ("index_types", [IndexType.NONE, *IndexType, IndexType.ALL]),
+        *((f"repeat_{part}", [False]) for part in ("channels", "schemas")),
+        *((f"use_{part}", [False]) for part in ("chunking", "statistics", "summary_offsets")),
+        *((f"enable_{part}", [False, True]) for part in ("crcs", "data_crcs")),
+    ],
+)
+def test_each_writer_s_messages_are_read_or_the_file_is_refused(
+    option: str, values: Sequence[Any], tmp_path: Path
+) -> None:
+    rows = [(time, bytes(20)) for time in range(1, 60)]
+    others: list[dict[str, Any]] = [
+        {},
+        {"use_statistics": False},
+        {"repeat_schemas": False},
+        {"use_chunking": False},
+    ]
+    for count, value, other in product((0, len(rows)), values, others):
+        path = make_mcap(tmp_path / "x.mcap", rows[:count], **{**other, option: value})
+        try:
+            assert [row[1:] for row in RecordedFile(path, ["*"]).messages()] == rows[:count]
+        except RecordingError as error:
+            assert "`mcap recover`" in str(error) or (not count and "has no messages" in str(error))
 
 
 def test_damage_gives_messages_or_the_reason(tmp_path: Path) -> None:
