@@ -20,7 +20,7 @@ from rosmop.form.findings import SpecificationError
 from rosmop.learn.exercised import covered
 from rosmop.learn.passes import AlarmFacts, AnyStep, ContentFacts, TimeFacts, facts_of
 from rosmop.learn.recordings import LearningError
-from rosmop.recordings.recording import RecordedFile, RecordingError, open_recording
+from rosmop.recordings.recording import RecordedFile, RecordingError, definitions_of, open_recording
 from rosmop.recordings.replay import refusals
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
@@ -35,13 +35,17 @@ class SurveyJob(msgspec.Struct, frozen=True, tag=True):
 
 
 class Survey(msgspec.Struct, frozen=True, tag=True):
-    """The first and last time in nanoseconds, the types of the topics, and the definitions by type."""
+    """The first and last time in nanoseconds, the types of the topics, and the definitions by type.
+
+    `notes` names the connections whose messages are left out.
+    """
 
     name: str
     began: int
     ended: int
     topics: dict[str, str]
     definitions: dict[str, str]
+    notes: list[str]
 
 
 class LearnJob(msgspec.Struct, frozen=True, tag=True):
@@ -60,9 +64,10 @@ class CoverageJob(msgspec.Struct, frozen=True, tag=True):
 
 
 class Coverage(msgspec.Struct, frozen=True, tag=True):
-    """How often each item of `exercised.items_of` was covered, in that order."""
+    """How often each item of `exercised.items_of` was covered, in that order. `notes` are reasons of drops."""
 
     counts: list[int]
+    notes: list[str]
 
 
 class Failure(msgspec.Struct, frozen=True, tag=True):
@@ -141,28 +146,33 @@ def _limit(seconds: float) -> Iterator[float]:
 
 
 def _result(job: Job) -> Result:
+    name = Path(job.recording.uri).name
     with local_file(job.recording) as path:
         if isinstance(job, ReplayJob):
             return replayed(job, path)
         if isinstance(job, SurveyJob):
-            recording = RecordedFile(path, job.topics, _name(job.recording))
+            recording = RecordedFile(path, job.topics, name)
             kinds = recording.definitions.message_types
             definitions = {kind: recording.definitions.message(kind).text for kind in kinds}
-            return Survey(recording.name, recording.began, recording.ended, recording.topics, definitions)
+            return Survey(
+                recording.name, recording.began, recording.ended, recording.topics, definitions, recording.notes
+            )  # fmt: skip
         if isinstance(job, LearnJob):
-            recording = RecordedFile(path, list(job.step.topics), _name(job.recording))
-            known = definitions_by_type(job.definitions)
-            return facts_of(job.step, recording, standard_definitions().extended(known))
-        return _coverage(job, path, RecordedFile(path, ["*"], _name(job.recording)))
+            known = standard_definitions().extended(definitions_by_type(job.definitions))
+            topics = job.step.topics
+            return facts_of(job.step, RecordedFile(path, list(topics), name, topics, known), known)
+        return _coverage(job, path, name)
 
 
-def _coverage(job: CoverageJob, path: Path, recording: RecordedFile) -> Coverage:
-    known = job.specifications.known(recording.definitions)
-    monitors = MonitorSet.of(compiled_from(job.specifications.texts, known))
+def _coverage(job: CoverageJob, path: Path, name: str) -> Coverage:
     with closing(open_recording(path)) as reader:
-        for text in refusals(monitors, reader):
-            raise RecordingError(f"{job.recording.uri}: {text}")
-    return Coverage(covered(job.specifications.texts, known, recording))
+        known = job.specifications.known(definitions_of(reader))
+        monitors = MonitorSet.of(compiled_from(job.specifications.texts, known))
+        notes = [
+            f"{job.recording.uri}: {text}" for text in refusals(monitors, reader, strict=job.recording.uri)
+        ]
+    recording = RecordedFile(path, ["*"], name, monitors.topics, known)
+    return Coverage(covered(job.specifications.texts, known, recording), notes)
 
 
 def definitions_by_type(texts: dict[str, str]) -> Definitions:
@@ -183,10 +193,6 @@ def local_file(recording: RecordingName) -> Iterator[Path]:
     now = local_recording(path)
     if (now.size, now.version) != (recording.size, recording.version):
         raise RecordingError(f"{recording.uri} changed after the command began")
-
-
-def _name(recording: RecordingName) -> str:
-    return Path(recording.uri).name
 
 
 def _version() -> str:

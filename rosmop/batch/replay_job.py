@@ -11,7 +11,7 @@ import msgspec
 from rosmop.batch.recording_list import RecordingName
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import fast_path_of
-from rosmop.recordings.recording import Reader, RecordingError, definitions_of, open_recording
+from rosmop.recordings.recording import Reader, definitions_of, open_recording
 from rosmop.recordings.replay import ReplayStep, refusals, replay
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome, Verdict, bound, why_of
@@ -56,8 +56,8 @@ class Specifications(msgspec.Struct, frozen=True):
 class ReplayJob(msgspec.Struct, frozen=True, tag=True):
     """Runs specifications on the topics that match a pattern, between two times in nanoseconds.
 
-    The first `most` occurrences are kept for each monitor, topic and kind. A topic of another type is an
-    error if the job is `strict`; otherwise its messages are dropped.
+    The first `most` occurrences are kept for each monitor, topic and kind. Messages of another
+    type are dropped; if the job is `strict`, a topic that has no others is an error.
     """
 
     recording: RecordingName
@@ -133,9 +133,7 @@ class Found(NamedTuple):
 def replayed(job: ReplayJob, path: Path) -> Replayed:
     with closing(open_recording(path)) as reader:
         monitors = job.specifications.monitors(definitions_of(reader), margins=job.margins)
-        notes = refusals(monitors, reader, job.topics)
-        if notes and job.strict:
-            raise RecordingError(f"{job.recording.uri}: {notes[0]}")
+        notes = refusals(monitors, reader, job.topics, strict=job.recording.uri if job.strict else None)
         return _Summary(job).of(monitors, reader, notes)
 
 

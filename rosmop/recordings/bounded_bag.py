@@ -28,10 +28,10 @@ from rosbags.rosbag1.reader import (
     RecordType,
     decompressors,
     normalize,
-    normalize_msgtype,
     read_bytes,
     read_uint32,
 )
+from rosbags.typesys.msg import normalize_msgtype
 
 from rosmop.recordings import regular_files
 
@@ -66,7 +66,15 @@ class BoundedReader(Reader):
 
     @property
     def message_count(self) -> int:
-        return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
+        return sum(self.message_counts.values())
+
+    @property
+    def message_counts(self) -> Counter[int]:
+        """Count the messages of each connection, by its id."""
+        counts = Counter[int]()
+        for info in self.chunk_infos:
+            counts.update(info.connection_counts)
+        return counts
 
     def read_connection(self) -> Connection:
         """Read a connection; bytes outside UTF-8, as in names and comments of old nodes, become U+FFFD."""

@@ -5,6 +5,7 @@ of such chunks have at most `LARGEST_CHUNK` bytes in total.
 """
 
 import heapq
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from io import SEEK_END
@@ -89,6 +90,9 @@ class BoundedMcap:
         channels: dict[int, Channel] = {}
         chunks: list[_ChunkPlace] = []
         count: int | None = None
+        self.message_counts = Counter[
+            int
+        ]()  # by the id of a connection; empty if the file does not have them
         for record in self._stream(self._file):
             if isinstance(record, Schema):
                 schemas[record.id] = record
@@ -99,7 +103,7 @@ class BoundedMcap:
                     _ChunkPlace(record.message_start_time, record.chunk_start_offset, record.message_end_time)
                 )
             elif isinstance(record, Statistics):
-                count = record.message_count
+                count, self.message_counts = record.message_count, Counter(record.channel_message_counts)
         ros = [channel for _number, channel in sorted(channels.items()) if channel.message_encoding == "ros1"]
         # Writers may leave out each part of an index.
         if (count != 0 and not (chunks and channels)) or any(row.schema_id not in schemas for row in ros):

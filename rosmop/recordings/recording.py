@@ -1,7 +1,7 @@
 """Open recordings: bags and MCAP files, distinguished by their first bytes. Errors are a `RecordingError`."""
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -69,15 +69,32 @@ def _text_of(error: Exception) -> str:
 
 
 def definitions_of(reader: Reader) -> Definitions:
+    return _definitions_of(by_size(reader))
+
+
+def by_size(reader: Reader) -> list[Connection]:
+    """Return the connections, those with the most messages first: they determine a type that has two definitions."""
+    counts = reader.message_counts
+    return sorted(reader.connections, key=lambda row: -counts[row.id])
+
+
+def _definitions_of(connections: Iterable[Connection]) -> Definitions:
     found: dict[str, MessageDefinition] = {}
-    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
+    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in connections)
     for name, text in sent:
         try:
             own = Definitions.from_full_text(name, text)
         except DefinitionError:
             continue
-        found |= {kind: own.message(kind) for kind in own.message_types}
+        found = {kind: own.message(kind) for kind in own.message_types} | found
     return Definitions(found)
+
+
+def _md5sum(definitions: Definitions, kind: str, unknown: str) -> str:
+    try:
+        return definitions.md5sum(kind)
+    except DefinitionError:
+        return unknown
 
 
 def sender_of(connection: Connection) -> ConnectionExtRosbag1:
@@ -92,10 +109,19 @@ def fits(topic: str, patterns: Sequence[str]) -> bool:
 class RecordedFile:
     """The messages of a recording on topics that match a pattern, read again for each pass.
 
-    The recording must have messages, and one type on each topic. `name` is for messages to the user.
+    The recording must have messages. Connections are left out, and named in `notes`, if their type is not that of
+    their topic in `kinds`, or if its definition is not in `known`; topics that `kinds` lacks may have any. Without
+    those, the connections with the most messages determine both. `name` is for messages to the user.
     """
 
-    def __init__(self, path: Path, patterns: Sequence[str], name: str | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        patterns: Sequence[str],
+        name: str | None = None,
+        kinds: Mapping[str, str] | None = None,
+        known: Definitions | None = None,
+    ) -> None:
         self._path = path
         self.name = name or path.name
         self.topics: dict[str, str] = {}
@@ -105,18 +131,29 @@ class RecordedFile:
             self.message_count = reader.message_count
             if not self.message_count:
                 raise RecordingError(f"the bag {path} has no messages")
-            self.definitions = definitions_of(reader)
-            for connection in reader.connections:
-                if not fits(connection.topic, patterns):
+            rows = [row for row in by_size(reader) if fits(row.topic, patterns)]
+            self.definitions = known or _definitions_of(rows)
+            wanted = dict(kinds or {})
+            self._connections: set[int] = set()
+            self.notes: list[str] = []
+            for row in rows:
+                kind = ros_type(row.msgtype)
+                other = wanted.get(row.topic, kind)
+                is_free = kinds is not None and row.topic not in kinds
+                digests = "*", _md5sum(self.definitions, kind, row.digest)
+                if is_free or (other == kind and row.digest in digests):
+                    self.topics[row.topic] = wanted[row.topic] = kind
+                    self._connections.add(row.id)
                     continue
-                kind = ros_type(connection.msgtype)
-                other = self.topics.setdefault(connection.topic, kind)
-                if other != kind:
-                    raise RecordingError(f"{path}: {connection.topic} carries both {other} and {kind}")
+                why = f"{kind} instead of {other}" if kind != other else f"another definition of {kind}"
+                sender = sender_of(row).callerid or "a node"
+                self.notes.append(
+                    f"{self.name}: {sender} sends {why} on {row.topic}; its messages are left out"
+                )
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
         with closing(open_recording(self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
-                if connection.topic in self.topics:
+                if connection.id in self._connections:
                     self.caller = sender_of(connection).callerid or ""
                     yield connection.topic, time_ns, data

@@ -214,8 +214,20 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
     return None
 
 
-def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
-    found = [
-        _refusal(monitors, connection) for connection in reader.connections if fits(connection.topic, topics)
+def refusals(
+    monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",), *, strict: str | None = None
+) -> list[str]:
+    """Return why connections are not judged.
+
+    With `strict`, the recording's name, raise `RecordingError` if none of a topic's connections is.
+    """
+    rows = [
+        (connection.topic, _refusal(monitors, connection))
+        for connection in reader.connections
+        if fits(connection.topic, topics)
     ]
-    return sorted({text for text in found if text is not None})
+    judged = {topic for topic, text in rows if text is None}
+    for topic, text in sorted(rows, key=lambda row: row[1] or ""):
+        if strict is not None and topic not in judged:
+            raise RecordingError(f"{strict}: {text}")
+    return sorted({text for _topic, text in rows if text is not None})

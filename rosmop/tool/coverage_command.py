@@ -66,6 +66,8 @@ def _covered(
     for number, result in session.results("reading", jobs):
         if isinstance(result, Coverage):
             counts = merged(counts, result.counts)
+            for note in result.notes:
+                session.program.warn(f"{note}; its messages are left out")
         elif isinstance(result, Failure):
             failures[number] = result
     ordered = sorted(failures.items())

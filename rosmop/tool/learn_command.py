@@ -27,7 +27,7 @@ from rosmop.tool.terminal import say, say_json
 from roswire.counted import counted
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
-from roswire.message_text import BUILTINS
+from roswire.message_text import BUILTINS, MessageDefinition
 from roswire.standard import standard_definitions
 
 
@@ -71,6 +71,8 @@ def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, 
     for number, result in enumerate(session.in_order("reading headers", jobs)):
         if isinstance(result, Survey):
             surveys.append((number, result))
+            for note in result.notes:
+                session.program.warn(note)
         elif isinstance(result, Failure):
             failures[number] = result
     session.require(list(failures.values()))
@@ -84,14 +86,18 @@ def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definiti
     recorded = Definitions({})
     for survey in surveys:
         own = definitions_by_type(survey.definitions)
-        for kind in set(survey.topics.values()) & set(own.message_types) & set(recorded.message_types):
-            if recorded.fingerprint(kind) != own.fingerprint(kind):
+        for kind in sorted(set(own.message_types) & set(recorded.message_types)):
+            if _lines(recorded.message(kind)) != _lines(own.message(kind)):
                 raise program.usage_error(
                     f"{survey.name} has a different definition of {kind} than the recordings before it"
                 )
         if not set(own.message_types) <= set(recorded.message_types):
             recorded = recorded.extended(own)
     return recorded
+
+
+def _lines(message: MessageDefinition) -> tuple[object, ...]:
+    return message.fields, [(constant.type, constant.name, constant.text) for constant in message.constants]
 
 
 @dataclass(frozen=True)

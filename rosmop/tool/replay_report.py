@@ -40,6 +40,8 @@ class ReplayReport:
             self.failures.append(result)
             return rows
         self.messages += result.messages
+        for note in () if self._as_json else result.notes:
+            say(f"{recording}: {note}; its messages are dropped", "yellow")
         for occurrence in result.occurrences:
             self._say(recording, occurrence)
         for effect in result.effects:

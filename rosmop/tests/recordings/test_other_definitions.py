@@ -1,0 +1,88 @@
+import json
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from struct import pack
+
+import pytest
+from rosbags.rosbag1 import Writer
+
+from rosmop.batch.jobs import packed, unpacked, work
+from rosmop.batch.recording_list import recordings_of
+from rosmop.batch.replay_job import EVER, Replayed, ReplayJob, Specifications
+from rosmop.tests.batch.test_many_recordings import rosmop
+from roswire.definitions import Definitions
+
+RULE = "=" * 80
+OWN = f"pkg/N n\n{RULE}\nMSG: pkg/N\nfloat64 x\nfloat64 y\n"
+Sent = tuple[str, str, str, bytes]  # topic, type, text, message
+
+OTHERS: dict[str, Sent] = {
+    "same topic, equal size": ("/a", "pkg/A", OWN.replace("x", "z").replace("y", "x"), bytes(16)),
+    "same topic, other size": ("/a", "pkg/A", OWN + "float64 z\n", bytes(24)),
+    "same topic, other type": ("/a", "std_msgs/Int8", "int8 data", b"\1"),
+    "nested type, equal size": (
+        "/b",
+        "pkg/B",
+        OWN.replace("64 x", "64 z").replace("64 y", "64 x"),
+        bytes(16),
+    ),
+    "nested type, other size": ("/b", "pkg/B", OWN + "float64 z\n", bytes(24)),
+    "other topic, equal size": ("/b", "pkg/N", "float64 y\nfloat64 x\n", bytes(16)),
+    "other topic, other size": ("/b", "pkg/N", "float64 z\n", bytes(8)),
+}
+SPECIFICATION = """
+m() { event e(double x) /a pkg/A '{n.x:x}' { if (x > 100.9) { ROS_WARN("high"); return; } } }
+"""
+
+
+def record(path: Path, others: Sequence[Sent], *, first: bool) -> None:
+    sent = [*others, ("/a", "pkg/A", OWN, b"")] if first else [("/a", "pkg/A", OWN, b""), *others]
+    with Writer(path) as writer:
+        rows = []
+        for number, (topic, kind, text, data) in enumerate(sent):
+            digest = Definitions.from_full_text(kind, text).md5sum(kind)
+            row = writer.add_connection(
+                topic, kind.replace("/", "/msg/"), msgdef=text, md5sum=digest, callerid=f"/node{number}"
+            )
+            rows.append((row, data))
+        for tick in range(400):
+            own = pack("<dd", 100 + math.sin(tick), math.sin(tick))
+            for row, data in rows:
+                if not data or tick in (50, 51):
+                    writer.write(row, 10**12 + tick * 10**8, data or own)
+
+
+@pytest.mark.parametrize("first", [False, True])
+@pytest.mark.parametrize("other", OTHERS)
+def test_a_connection_that_does_not_fit_changes_nothing_and_is_named(
+    other: str, first: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("m.rv").write_text(SPECIFICATION)
+    Path("alone").mkdir()
+    Path("beside").mkdir()
+    record(Path("alone/x.bag"), [], first=first)
+    record(Path("beside/x.bag"), [OTHERS[other]], first=first)
+    for command in ("run m.rv --json", "coverage m.rv", "learn"):
+        results = []
+        for folder in ("alone", "beside"):
+            status, out, err = rosmop(f"{command} --bags {folder}")
+            assert status == 0, err
+            if folder == "beside" and (OTHERS[other][0] == "/a" or command == "learn"):
+                assert "/a" in err + out if OTHERS[other][0] == "/a" else "/b" in err
+                assert re.search("carries|different definition|another definition|instead of", err + out)
+            rows = [json.loads(line) for line in out.splitlines()] if "--json" in command else []
+            counts = [
+                (row["effect"], row["count"], row["first"])
+                for row in rows
+                if row.get("monitor") == "m" and "effect" in row
+            ]
+            results.append(counts or out)
+        assert results[0] == results[1]
+    (recording,) = recordings_of([], ["beside"])
+    specifications = Specifications({"m.rv": SPECIFICATION}, {})
+    strict = ReplayJob(recording, specifications, ["*"], EVER, 1, margins=False, strict=True)
+    result = unpacked(work(packed(strict)))
+    assert isinstance(result, Replayed) and bool(result.notes) == (OTHERS[other][0] == "/a")
