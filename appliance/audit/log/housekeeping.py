@@ -275,7 +275,7 @@ class Housekeeping:
             self._answer(lambda awaited: awaited <= number, None)
 
     def refused(self, number: int, reason: str) -> None:
-        kind = re.sub(r"\d+", "", reason)
+        kind = re.sub(r"\d", "", reason)
         if kind not in self._recorded:  # each request is repeated every minute
             self._recorded.add(kind)
             self._hold(self._make("signature refused", Severity.ALARM, reason, {"number": number}))
