@@ -620,14 +620,14 @@ def test_requests_pass_only_from_appliances_and_followers(tmp_path: Path) -> Non
     settings = read_settings(str(written(tmp_path)))
     rules = nft_rules(settings, "a")
     assert rules.count('iif "lo" ip daddr 10.0.0.1 udp dport 7411 drop\n        iif "lo" accept') == 1
-    assert "udp dport 7411 ip saddr != { 10.0.0.2, 10.0.0.3, 10.0.0.20 } drop" in rules
+    assert "ip daddr 10.0.0.1 udp dport 7411 ip saddr != { 10.0.0.2, 10.0.0.3, 10.0.0.20 } drop" in rules
     tag = seal(REQUEST, "arm", KEY, {})[:4].hex()
     assert rules.count("@th,64,32") == 1, "a follower knows no key but its own"
-    assert f"ip saddr 10.0.0.20 udp dport 7411 @th,64,32 != 0x{tag} drop" in rules
+    assert f"ip daddr 10.0.0.1 udp dport 7411 ip saddr 10.0.0.20 @th,64,32 != 0x{tag} drop" in rules
     lines = iptables_rules(settings, "a", {}).splitlines()
     own = [line for line in lines if line.startswith("-A rosrv-witness-in ")]
     assert own[0] == "-A rosrv-witness-in -i lo -d 10.0.0.1 -p udp --dport 7411 -j DROP"
     assert own[-2:] == [
         "-A rosrv-witness-in -s 10.0.0.20 -j RETURN",
-        "-A rosrv-witness-in -p udp --dport 7411 -j DROP",
+        "-A rosrv-witness-in -d 10.0.0.1 -p udp --dport 7411 -j DROP",
     ]
