@@ -15,6 +15,7 @@ from appliance.network.firewall.firewall_rules import PortRange
 from examples.landshark.lab import Lab
 from tests.support.requirements import need_program, need_root
 from tests.support.script_host import ScriptHost
+from tests.support.sources import ROOT
 from tests.support.waiting import eventually
 
 APPLIANCE = "10.113.11.1"
@@ -82,7 +83,7 @@ systemctl start "rosrv-$first.service"
 systemctl start "rosrv-$second.service"
 [ -z "$kept" ] || systemctl restart rosrv-tunnel.service
 """
-DOCUMENTED = Path(__file__).parents[3] / "docs/close-the-ports.md"
+DOCUMENTED = ROOT / "docs/close-the-ports.md"
 
 
 class Enrolled(ScriptHost):
