@@ -302,7 +302,7 @@ class AdoptWork:
 def wanted_record(record: AdoptRecord, found: RobotMaster | None) -> AdoptRecord:
     """Return the record of a wanted adoption of the graph of `found`. Raises `NetworkError` without a master.
 
-    The recorded master stays if an adoption is already wanted, or if a stand-in has the graph.
+    Keep the recorded master if an adoption is already wanted, or if a stand-in has the graph.
     """
     if record.wanted:
         return record
