@@ -430,8 +430,8 @@ NODE_PORTS = QuotaRow(
     thing="ports of `[Ports]`: one for each node, and one for each node and relay",
     bounds=Bounds(whole=7000, host=5250, unknown=0, kept=0),
     at_limit="the registration is rejected with the reason",
-    between="a host gets at most three times what is left for all others; nodes without a registration make room at"
-    " once",
+    between="a host gets at most three times what is left for all others; nodes without a registration, and"
+    " those lost for ten minutes, make room at once",
     counting="hosts that the policy names as one network count as one",
     alarm="`decision`: the record of the rejected call",
     setting="[Ports] range",

@@ -32,6 +32,7 @@ from roswire.names import ROSOUT
 
 _CONNECT_SECONDS = 1.0
 _PATIENT_SECONDS = 3.0  # also after the loss of a packet
+_AWAY_SECONDS = 600.0  # after which a lost node makes room for those of other hosts: it may be away for a day
 _OF_EVERY_NODE = ("get_loggers", "set_logger_level", "tf2_frames")  # private services of the client libraries
 
 _NOT_REGISTERED = "Because this node cannot be called"
@@ -157,7 +158,7 @@ class Arrivals:
             try:
                 return self.places.open(host)
             except NoPortError:
-                evicted = self.registry.evictable_for(host)
+                evicted = self.registry.evictable_for(host, lost_before=clock.now() - _AWAY_SECONDS)
                 if evicted is None:
                     raise
                 self.graph.forgotten(evicted)

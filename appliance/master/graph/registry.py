@@ -265,11 +265,14 @@ class Registry:
         gone = (incarnation for incarnation in mine if incarnation.life is not Life.LIVE)
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
-    def evictable_for(self, host: Address) -> Incarnation | None:
-        """Return an evictable or lost incarnation of this host, or else an evictable one of another host."""
-        return self._evictable_of(host) or next(
-            (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
-        )
+    def evictable_for(self, host: Address, *, lost_before: float) -> Incarnation | None:
+        """Return an evictable or lost incarnation of this host, or else one of another host: evictable, or lost longest
+        and before `lost_before` (monotonic seconds).
+        """
+        known = self._by_key.values()
+        idle = next((incarnation for incarnation in known if incarnation.evictable), None)
+        away = (one for one in known if one.life is Life.SHADOW and one.changed < lost_before)
+        return self._evictable_of(host) or idle or min(away, key=lambda one: one.changed, default=None)
 
     @property
     def registrations(self) -> int:

@@ -108,17 +108,18 @@ def test_a_node_without_registrations_makes_room_first() -> None:
         registry.add(one)
         registry.register(one, Kind.PUBLICATION, "/x", "t")
     registry.overshadow(lost, 5.0)
-    assert registry.evictable_for(HOSTS[1]) is None
+    assert registry.evictable_for(HOSTS[1], lost_before=5.0) is None
     for one in (idle, busy):
         registry.unregister(one, Kind.PUBLICATION, "/x")
     busy.calls = 1
-    assert registry.evictable_for(HOSTS[0]) is idle
-    assert registry.evictable_for(HOSTS[1]) is idle
+    assert registry.evictable_for(HOSTS[0], lost_before=5.0) is idle
+    assert registry.evictable_for(HOSTS[1], lost_before=5.0) is idle
     registry.forget(idle)
-    assert registry.evictable_for(HOSTS[1]) is None
-    assert registry.evictable_for(HOSTS[0]) is lost
+    assert registry.evictable_for(HOSTS[1], lost_before=5.0) is None
+    assert registry.evictable_for(HOSTS[0], lost_before=5.0) is lost
+    assert registry.evictable_for(HOSTS[1], lost_before=5.1) is lost
     busy.calls = 0
-    assert registry.evictable_for(HOSTS[1]) is busy
+    assert registry.evictable_for(HOSTS[1], lost_before=5.0) is busy
 
 
 def test_forgetting_one_incarnation_keeps_the_next() -> None:
