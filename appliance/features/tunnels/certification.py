@@ -174,7 +174,6 @@ class Certification:
             raise HostRefusedError(str(error), ours=not error.refused) from error
 
     def enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
-        self.awaited.forget(name)
         self.keep(name, address, made)
         self.trail.happened(
             "host enrolled",

@@ -14,7 +14,7 @@ from functools import partial
 from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.base.withdrawal import WithdrawnError, take_effect
+from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
 from appliance.channel.messages import EndpointFound
@@ -23,7 +23,7 @@ from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.certification import NO_TUNNELS, Certification
 from appliance.features.tunnels.enrolment_kit import filled
-from appliance.features.tunnels.enrolment_tokens import MAX, BadEnrolmentTokenError
+from appliance.features.tunnels.enrolment_tokens import MAX, USED, BadEnrolmentTokenError
 from appliance.features.tunnels.host_view import HostView, span
 from appliance.features.tunnels.tunnel_answers import Endpoint, KitParts, NewCertificate, PortsReport, Renewed
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
@@ -36,9 +36,8 @@ from appliance.store.host_tables import EnrolmentTokenRow, HostRow, PortsRow
 
 # Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
 #
-# 1. A token is used up before the authority is asked, so if two hosts send the same token, only one gets a
-# certificate.
-#    If no certificate is issued, the token becomes valid again, unless its name was revoked in between.
+# 1. If two hosts send the same token, only one gets a certificate: enrolments are carried out one by one, and each uses
+#    its token up. A host to which the answer was lost gets it again for the same signing request.
 # 2. A host that renews must send from the virtual address of its name, which the firewall accepts only through IPsec.
 #    The signer checks the signature by the name's present key.
 # 3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses
@@ -67,11 +66,13 @@ class HostSelfService:
     async def enrol(self, request: host_requests.HostEnrol) -> KitParts:
         async with self._certification.changing:
             try:
-                awaited = self._certification.awaited.take(request.token)
+                awaited = self._certification.awaited.find(request.token, request.request, self._table.rows)
             except BadEnrolmentTokenError as error:
                 self._trail.happened("enrolment refused", str(error), decision="deny", host=request.peer)
                 raise HostForbiddenError(str(error)) from error
             name = awaited.name
+            if USED in awaited.kit:
+                return await self._certification.finish(name, awaited.kit)
             try:
                 address = awaited.address
                 if not self._table.is_for_hosts(address):
@@ -85,12 +86,10 @@ class HostSelfService:
                     "enrolment refused", str(error), decision="deny", host=request.peer, id=awaited.id
                 )
                 raise
-            except (HostRefusedError, WithdrawnError):
-                self._certification.awaited.give_back(awaited)
-                raise
             self._certification.enrolled(
                 name, address, made, awaited.who, token=awaited.id, peer=request.peer
             )
+            self._certification.awaited.use(awaited, request.request, made.serial)
             return await self._certification.finish(name, awaited.kit)
 
     async def renew(self, request: host_requests.HostRenewItself) -> NewCertificate:
@@ -305,6 +304,7 @@ class HostEnrolment(TunnelHosts):
                 await self._tunnels.open()
                 made = await self._certification.issue(name, request.request, request.days)
             take_effect()
+            self._awaited.forget(name)
             self._certification.enrolled(name, wanted, made, who)
             return await self._certification.finish(name)
 
@@ -375,7 +375,7 @@ class HostEnrolment(TunnelHosts):
         name = request.name
         self._table.require(request.expected)
         begun = self._certification.revoked(name)
-        awaited = self._awaited.rows().get(name)
+        awaited = None if begun else self._awaited.rows().get(name)
         self._awaited.forget(name)
         if (begun or awaited is not None) and (
             name not in self._table.rows or self._table.rows[name].revoked is not None

@@ -2,15 +2,21 @@
 
 1. Only the hash of a token's secret is stored.
 2. A token is valid once, for one name, until it expires or a newer token for the name replaces it.
+3. A used token's row stays until its end, for a host to which the answer was lost: with the same signing request, it
+   gets the same certificate. The row's hash is then of the secret and this request.
 """
 
+from collections.abc import Mapping
+
 from appliance.base import clock
-from appliance.signing.bearer_secrets import SecretForm, hash_of
+from appliance.signing.bearer_secrets import SecretForm, hash_of, is_hash_of
 from appliance.store.ends import EndKind, EndTable
-from appliance.store.host_tables import EnrolmentTokenRow, HostTables
+from appliance.store.host_tables import EnrolmentTokenRow, HostRow, HostTables
 
 _FORM = SecretForm("rosrv-enrol_")
 MAX = 1000
+USED = "serial"
+"""The key in `EnrolmentTokenRow.kit` that a used token has: with the serial number of its certificate."""
 ENROLMENT = EndKind("enrolment", dated=True)
 
 
@@ -28,11 +34,12 @@ class EnrolmentTokens:
         ends.when_due(ENROLMENT, self._due)
 
     def rows(self) -> dict[str, EnrolmentTokenRow]:
-        """Return the tokens by the names of their hosts, with their ends by the present system clock."""
+        """Return the unused tokens by the names of their hosts, with their ends by the present system clock."""
         self._due([name for name in self._rows if self._ends.passed(ENROLMENT, name)])
         return {
             name: row._replace(expires=self._ends.date(ENROLMENT, name) or row.expires)
             for name, row in self._rows.items()
+            if USED not in row.kit
         }
 
     def addresses(self) -> dict[str, str]:
@@ -49,29 +56,39 @@ class EnrolmentTokens:
             self._tables.save_awaited(row)
         return row, text
 
-    def take(self, text: str) -> EnrolmentTokenRow:
-        row = _FORM.find(text, {row.id: row for row in self.rows().values()})
-        if row is None:
+    def find(self, text: str, request: str, hosts: Mapping[str, HostRow]) -> EnrolmentTokenRow:
+        """Return the row of an unused token, or of one that was used with this request for the host's certificate.
+
+        Raises `BadEnrolmentTokenError`.
+        """
+        self.rows()  # forgets those that have ended
+        number, secret = _FORM.parse(text) or ("", "")
+        row = next((row for row in self._rows.values() if row.id == number), None)
+        serial = None if row is None else row.kit.get(USED)
+        if serial is not None:
+            secret = hash_of(secret).hex() + request
+        if (
+            row is None
+            or not is_hash_of(secret, row.hash)
+            or (serial is not None and serial != hosts[row.name].serial)
+        ):
             raise BadEnrolmentTokenError(
                 "the token is wrong, already used, or expired: ask for another one (rosrv host add NAME --token)"
             )
-        self._take_out(row.name)  # its end stays, for `give_back`
         return row
 
-    def give_back(self, row: EnrolmentTokenRow) -> None:
-        """Make a token valid again, unless its name has a newer one, because no certificate was issued."""
-        if row.name not in self._rows:
-            self._rows[row.name] = row
-            self._tables.save_awaited(row)
+    def use(self, row: EnrolmentTokenRow, request: str, serial: str) -> None:
+        """Let a token be valid only with this request, for which the certificate was issued."""
+        if row is self._rows.get(row.name):  # otherwise it has ended
+            used = row._replace(hash=hash_of(row.hash.hex() + request), kit=row.kit | {USED: serial})
+            self._rows[row.name] = used
+            self._tables.save_awaited(used)
 
     def forget(self, name: str) -> None:
         self._due([name])
 
-    def _take_out(self, name: str) -> None:
-        if self._rows.pop(name, None) is not None:
-            self._tables.forget_awaited(name)
-
     def _due(self, ended: list[str]) -> None:
         for name in ended:
-            self._take_out(name)
+            if self._rows.pop(name, None) is not None:
+                self._tables.forget_awaited(name)
         self._ends.forget(ENROLMENT, *ended)

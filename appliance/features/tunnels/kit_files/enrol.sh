@@ -34,7 +34,8 @@ made() { [ "$(cat "$1/token" 2>/dev/null)" = "$token_id" ]; }
 take() { rm -rf "$kit"; mv "$new/rosrv-@name@" "$kit"; rm -rf "$new"; }
 
 if made "$new/rosrv-@name@"; then take; fi
-if [ -z "${1-}" ] && made "$kit" && [ "$(fingerprint "$kit/swanctl/x509ca/rosrv-ca.pem")" = "$authority" ]; then
+case ${1-} in "" | *_"${token_id}"_*) again=yes ;; *) again= ;; esac
+if [ "$again" ] && made "$kit" && [ "$(fingerprint "$kit/swanctl/x509ca/rosrv-ca.pem")" = "$authority" ]; then
     echo "join.sh: @name@ is already enrolled; with a new token it enrols again"
 else
     token=${1-${ROSRV_ENROL_TOKEN-}}
@@ -42,11 +43,15 @@ else
         printf 'one-time token: ' >&2
         read -r token
     fi
-    # All that is new is made beside what is there, and takes its place when it is complete.
-    rm -rf "$new"
-    mkdir "$new"
-    openssl ecparam -name secp384r1 -genkey -noout -out "$new/rosrv.key"
-    openssl req -new -key "$new/rosrv.key" -subj "/CN=@name@" -out "$new/rosrv.csr"
+    # All that is new is made beside what is there, and takes its place when it is complete. If the answer is lost, the
+    # token is good for the same request only.
+    if ! made "$new"; then
+        rm -rf "$new"
+        mkdir "$new"
+        openssl ecparam -name secp384r1 -genkey -noout -out "$new/rosrv.key"
+        openssl req -new -key "$new/rosrv.key" -subj "/CN=@name@" -out "$new/rosrv.csr"
+        echo "$token_id" > "$new/token"
+    fi
     # The token goes through a file: what stands in a command's arguments, others on this machine can read.
     printf '{"token":"%s","request":"%s"}' "$token" "$(awk '{printf "%s\\n", $0}' "$new/rosrv.csr")" > "$new/body"
     status=$(curl --silent --show-error --max-time 60 --insecure --pinnedpubkey "$pin" -o "$new/answer" \
@@ -63,7 +68,7 @@ else
         die "the certificate of the authority is another than the one this script was made for"
     fi
     mkdir -p "$new/rosrv-@name@/swanctl/private"
-    mv "$new/rosrv.key" "$new/rosrv-@name@/swanctl/private/rosrv.key"
+    cp "$new/rosrv.key" "$new/rosrv-@name@/swanctl/private/rosrv.key"
     echo "$token_id" > "$new/rosrv-@name@/token"
     take
     rm -f "$folder/rosrv.key" "$folder/rosrv.csr"  # of an earlier script

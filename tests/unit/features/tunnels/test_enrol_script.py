@@ -24,15 +24,24 @@ from appliance.ipsec.certificate_authority import CertificateAuthority
 
 home, given = Path(os.environ["HOME"]), sys.argv
 body = json.loads(Path(given[given.index("--data-binary") + 1][1:]).read_text())
+answer, cut = Path(given[given.index("-o") + 1]), home / "cut"
+place = cut.read_text() if cut.exists() else ""
+cut.unlink(missing_ok=True)
+if place == "the request":
+    sys.exit(7)
 with (home / "tokens").open("a") as tokens:
     tokens.write(body["token"] + "\\n")
-if body["token"] == "wrong":
-    Path(given[given.index("-o") + 1]).write_text("no")
+used = home / ("used-" + body["token"])
+if body["token"] == "wrong" or (used.exists() and used.read_text() != body["request"]):
+    answer.write_text("no")
     print(403, end="")
     sys.exit()
+used.write_text(body["request"])
 authority = CertificateAuthority(home / "ca")
 made = authority.issue(body["request"].encode(), "laptop", 90).certificate
-with tarfile.open(given[given.index("-o") + 1], "w:gz") as kit:
+if place == "the answer":
+    sys.exit(52)
+with tarfile.open(answer, "w:gz") as kit:
     for name, text in (
         ("swanctl/x509ca/rosrv-ca.pem", authority.certificate),
         ("swanctl/x509/rosrv.pem", made),
@@ -41,6 +50,8 @@ with tarfile.open(given[given.index("-o") + 1], "w:gz") as kit:
         entry = tarfile.TarInfo("rosrv-laptop/" + name)
         entry.size = len(text)
         kit.addfile(entry, io.BytesIO(text))
+if place == "half of the answer":
+    os.truncate(answer, answer.stat().st_size // 2)
 print(200, end="")
 """
 
@@ -77,6 +88,10 @@ class Host:
             timeout=60,
             check=False,
         )
+
+    def cut(self, place: str) -> None:
+        """Lose a part of the next connection."""
+        (self._home / "cut").write_text(place)
 
     @property
     def key(self) -> bytes:
@@ -127,6 +142,27 @@ def test_a_refused_token_takes_nothing_away(host: Host, what: str) -> None:
     assert host.run("bb", "wrong").returncode == 1
     assert host.key == key
     assert "joined with the kit of first" in host.run("aa").stdout
+
+
+@pytest.mark.parametrize("place", ["the request", "the answer", "half of the answer"])
+def test_a_lost_connection_costs_neither_the_token_nor_the_key(host: Host, place: str) -> None:
+    host.run("aa", "first")
+    host.cut(place)
+    token = "rosrv-enrol_bb_x"  # noqa: S105  its form matters
+    assert host.run("bb", token).returncode != 0
+    wanted = (host.folder / "new/rosrv.key").read_bytes()
+    assert f"joined with the kit of {token}" in host.run("bb", token).stdout
+    assert host.key == wanted
+    again = host.run("bb", token)
+    assert "already enrolled" in again.stdout and host.key == wanted
+    assert sorted(path.name for path in host.folder.iterdir()) == ["rosrv-laptop"]
+
+
+def test_another_key_with_a_used_token_is_refused(host: Host) -> None:
+    host.cut("the answer")
+    assert host.run("aa", "first").returncode == 1
+    shutil.rmtree(host.folder)
+    assert "the appliance refused (403)" in host.run("aa", "first").stderr
 
 
 @pytest.mark.parametrize("program", ["rm", "mv"])

@@ -379,6 +379,47 @@ async def test_a_one_time_token_enrols_once(bench: Bench, tmp_path: Path) -> Non
             assert secret not in file.read_bytes(), file
 
 
+@pytest.mark.parametrize("new", [True, False])
+def test_a_host_that_lost_the_answer_gets_it_again(tmp_path: Path, *, new: bool) -> None:
+    request, token = request_of("a"), []
+
+    async def first(bench: Bench) -> None:
+        if not new:
+            await bench.add("a")
+        token.append((await bench.token("a", new=new)).token)
+        await bench.hosts.itself.enrol(HostEnrol(token[0], request, "10.9.9.9"))
+        assert bench.hosts.rows()[0].state != "awaited"
+
+    async def again(bench: Bench) -> None:
+        given = HostEnrol(token[0], request, "10.9.9.9")
+        present = bench.hosts.rows()[0].serial
+        kit = await bench.hosts.itself.enrol(given)
+        assert (kit.serial, kit.kept["endpoint"]) == (present, "10.0.0.1")
+        assert len(bench.store.hosts.revoked()) == (not new)
+        with pytest.raises(HostForbiddenError, match="already used"):  # with another key
+            await bench.enrol(token[0], "a")
+
+    run(tmp_path, first)
+    run(tmp_path, again)
+
+
+@pytest.mark.parametrize("by", ["a new kit", "a new token", "a revocation", "its end"])
+async def test_a_used_token_ends(bench: Bench, by: str) -> None:
+    given = HostEnrol((await bench.token("a", seconds=0.2)).token, request_of("a"), "10.9.9.9")
+    assert await bench.hosts.itself.enrol(given)
+    match by:
+        case "a new kit":
+            await bench.renew("a")
+        case "a new token":
+            await bench.token("a", new=False)
+        case "a revocation":
+            await bench.revoke("a")
+        case _:
+            await asyncio.sleep(0.21)
+    with pytest.raises(HostForbiddenError, match="already used, or expired"):
+        await bench.hosts.itself.enrol(given)
+
+
 async def test_two_simultaneous_uses_of_a_token_get_one_certificate(bench: Bench) -> None:
     text = (await bench.token("a")).token
     both = await asyncio.gather(

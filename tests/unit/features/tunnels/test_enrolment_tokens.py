@@ -25,7 +25,9 @@ def test_a_token_of_an_earlier_version_enrols_its_host_once(tmp_path: Path) -> N
         tokens = EnrolmentTokens(store.hosts, ends_of(store, tmp_path))
         text = f"rosrv-enrol_5c0f3d2b9a11_{'A' * 43}"
         with pytest.raises(BadEnrolmentTokenError):
-            tokens.take(text[:-1] + "B")
-        assert tokens.take(text) == row
+            tokens.find(text[:-1] + "B", "request", {})
+        found = tokens.find(text, "request", {})
+        assert found == row
+        tokens.use(found, "request", "serial")
         with pytest.raises(BadEnrolmentTokenError):
-            tokens.take(text)
+            tokens.find(text, "another request", {})
