@@ -11,7 +11,7 @@ import msgspec
 from rosmop.batch.recording_list import RecordingName
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import fast_path_of
-from rosmop.recordings.recording import Reader, definitions_of, open_recording
+from rosmop.recordings.recording import OWN, Reader, definitions_of, open_recording
 from rosmop.recordings.replay import ReplayStep, refusals, replay
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome, Verdict, bound, why_of
@@ -56,6 +56,7 @@ class Specifications(msgspec.Struct, frozen=True):
 class ReplayJob(msgspec.Struct, frozen=True, tag=True):
     """Runs specifications on the topics that match a pattern, between two times in nanoseconds.
 
+    Monitors published the recorded messages of the node `own`.
     The first `most` occurrences are kept for each monitor, topic and kind. Messages of another
     type are dropped; if the job is `strict`, a topic that has no others is an error.
     """
@@ -67,6 +68,7 @@ class ReplayJob(msgspec.Struct, frozen=True, tag=True):
     most: int
     margins: bool
     strict: bool
+    own: str = OWN
 
 
 class EffectCount(msgspec.Struct, frozen=True):
@@ -133,7 +135,8 @@ class Found(NamedTuple):
 def replayed(job: ReplayJob, path: Path) -> Replayed:
     with closing(open_recording(path)) as reader:
         monitors = job.specifications.monitors(definitions_of(reader), margins=job.margins)
-        notes = refusals(monitors, reader, job.topics, strict=job.recording.uri if job.strict else None)
+        strict = job.recording.uri if job.strict else None
+        notes = refusals(monitors, reader, job.topics, own=job.own, strict=strict)
         return _Summary(job).of(monitors, reader, notes)
 
 
@@ -146,7 +149,7 @@ class _Summary:
 
     def of(self, monitors: MonitorSet, reader: Reader, notes: list[str]) -> Replayed:
         counts = {"passed": 0, "changed": 0, "dropped": 0}
-        for step in replay(monitors, reader, None, self._job.topics, self._job.span):
+        for step in replay(monitors, reader, None, self._job.topics, self._job.span, own=self._job.own):
             if step.index is not None:
                 counts[step.outcome.result] += 1
             for found in _found(step.outcome):

@@ -19,6 +19,8 @@ from roswire.errors import DefinitionError
 from roswire.message_text import MessageDefinition
 
 Reader = BoundedReader | BoundedMcap
+OWN = "/rosrv"
+"""The caller id of messages that monitors published, by default; monitors do not receive them."""
 # The exceptions that the libraries and their decompressors raise for a damaged file.
 _DAMAGE = (
     ReaderError, McapError, zstandard.ZstdError, ValueError, LookupError, AssertionError, struct.error, MemoryError,
@@ -102,12 +104,17 @@ def sender_of(connection: Connection) -> ConnectionExtRosbag1:
     return connection.ext
 
 
-def fits(topic: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatchcase(topic, pattern) for pattern in patterns)
+def received(reader: Reader, patterns: Sequence[str], own: str = OWN) -> list[Connection]:
+    """Return the connections of nodes on topics that match a pattern. Monitors publish as `own`."""
+    return [
+        row
+        for row in by_size(reader)
+        if sender_of(row).callerid != own and any(fnmatchcase(row.topic, pattern) for pattern in patterns)
+    ]
 
 
 class RecordedFile:
-    """The messages of a recording on topics that match a pattern, read again for each pass.
+    """The messages of nodes in a recording on topics that match a pattern, read again for each pass.
 
     The recording must have messages. Connections are left out, and named in `notes`, if their type is not that of
     their topic in `kinds`, or if its definition is not in `known`; topics that `kinds` lacks may have any. Without
@@ -131,7 +138,7 @@ class RecordedFile:
             self.message_count = reader.message_count
             if not self.message_count:
                 raise RecordingError(f"the bag {path} has no messages")
-            rows = [row for row in by_size(reader) if fits(row.topic, patterns)]
+            rows = received(reader, patterns)
             self.definitions = known or _definitions_of(rows)
             wanted = dict(kinds or {})
             self._connections: set[int] = set()

@@ -14,12 +14,18 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer
 from rosbags.rosbag1.writer import WriterError
 
-from rosmop.recordings.recording import Reader, RecordingError, fits, messages_of, ros_type, sender_of
+from rosmop.recordings.recording import (
+    OWN,
+    Reader,
+    RecordingError,
+    messages_of,
+    received,
+    ros_type,
+    sender_of,
+)
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import DROPPED, MessageSender, Outcome, Verdict, bound
 from roswire.definitions import Definitions
-
-_OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not receive them
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class OutputBag:
         for message in (one for one in outcome.sent() if not one.is_call):
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
-            header = (message.topic, f"{package}/msg/{kind}", text, digest, _OWN, None)
+            header = (message.topic, f"{package}/msg/{kind}", text, digest, OWN, None)
             self._write(header, outcome.time, message.data, published=True)
         for judged in outcome.judged.values():
             self.publish(judged)
@@ -102,17 +108,16 @@ def replay(
     output: OutputBag | None,
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
+    *,
+    own: str = OWN,
 ) -> Iterator[ReplayStep]:
     """Run monitors on a recording in its order, with its times as their clock.
 
-    `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch.
+    `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch; `own` is the node name
+    under which monitors published.
     """
     started: Outcome | None = None
-    refusals = {
-        connection.id: _refusal(monitors, connection)
-        for connection in reader.connections
-        if fits(connection.topic, topics) and sender_of(connection).callerid != _OWN
-    }
+    refusals = {connection.id: _refusal(monitors, connection) for connection in received(reader, topics, own)}
     expected = frozenset(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
     )
@@ -215,16 +220,19 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
 
 
 def refusals(
-    monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",), *, strict: str | None = None
+    monitors: MonitorSet,
+    reader: Reader,
+    topics: Sequence[str] = ("*",),
+    *,
+    own: str = OWN,
+    strict: str | None = None,
 ) -> list[str]:
     """Return why connections are not judged.
 
     With `strict`, the recording's name, raise `RecordingError` if none of a topic's connections is.
     """
     rows = [
-        (connection.topic, _refusal(monitors, connection))
-        for connection in reader.connections
-        if fits(connection.topic, topics)
+        (connection.topic, _refusal(monitors, connection)) for connection in received(reader, topics, own)
     ]
     judged = {topic for topic, text in rows if text is None}
     for topic, text in sorted(rows, key=lambda row: row[1] or ""):

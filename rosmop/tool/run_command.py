@@ -74,12 +74,13 @@ def run_spans(
     spans: Sequence[tuple[str, Path, tuple[int, int]]],
     report: ReplayReport,
     topics: list[str],
+    own: str,
     *,
     margins: bool,
 ) -> None:
     for name, path, span in spans:
         recording = RecordingName(name, path.stat().st_size, "")
-        job = ReplayJob(recording, specifications, topics, span, MAX_IN_ROWS, margins, strict=True)
+        job = ReplayJob(recording, specifications, topics, span, MAX_IN_ROWS, margins, strict=True, own=own)
         report.add(name, replayed(job, path))
     report.show(specifications.texts)
 

@@ -161,7 +161,7 @@ def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Sc
         return {}, "this appliance has no flight recorder"
     types = dict.fromkeys(topics, SCAN)
     try:
-        with recorded(appliance, _SINCE, None, types) as spans:
+        with recorded(appliance, _SINCE, None, types) as (spans, _own):
             return last_messages(spans, types, MAX_SCANS), ""
     except typer.Exit:  # no recording of the topic; the reason has been printed
         return {}, "the flight recorder has no scan"

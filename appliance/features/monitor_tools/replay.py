@@ -98,8 +98,8 @@ def replay_monitor(
         recorded = recorded_messages()
         if recorded is None:
             raise MONITOR.usage_error("this appliance has no flight recorder: give --bag FILE or --bags DIR")
-        with recorded(appliance, since, until, _topics(specifications, patterns)) as spans:
-            run_spans(specifications, spans, report, patterns, margins=margins)
+        with recorded(appliance, since, until, _topics(specifications, patterns)) as (spans, own):
+            run_spans(specifications, spans, report, patterns, own, margins=margins)
     except SpecificationError as error:
         raise refused(error.findings) from None
 

@@ -15,7 +15,11 @@ async def begin(core: Core) -> ControlPart:
     rules = core.settings.of(RecorderRules)
     plan = RecordingPlan(rules, core.policy.charged_to, IdSource().next)
     orders = RecordingOrders(
-        rules, core.trail, lambda: (core.trail.revision, core.specifications.revision), plan
+        rules,
+        core.trail,
+        lambda: (core.trail.revision, core.specifications.revision),
+        plan,
+        core.settings.publish_as,
     )
     core.links.attach(ROLE, orders.link, RecorderLink)
     core.limits.provide(orders.limits)

@@ -46,11 +46,13 @@ class RecordingOrders:
         trail: AuditTrail,
         in_force: Callable[[], tuple[int, int]],
         plan: RecordingPlan,
+        publish_as: str,
     ) -> None:
         self._rules = rules
         self._plan = plan
         self._trail = trail
         self._in_force = in_force
+        self._publish_as = publish_as
         self.link = Link(self._heard)
         self._kept: dict[str, Recording] = {}
         self._lent: dict[str, Recording] = {}  # temporary recordings of the data in memory
@@ -77,7 +79,9 @@ class RecordingOrders:
             replace(recording, ends=self._plan.end_of(recording.id) or recording.ends)
             for recording in self._open.values()
         ]
-        return Recordings(kept, list(rules.topics), list(rules.never), rules.before, in_progress)
+        return Recordings(
+            kept, list(rules.topics), list(rules.never), rules.before, in_progress, self._publish_as
+        )
 
     async def recording(self, request: recording_requests.RecordingWanted) -> Recording:
         self._require()

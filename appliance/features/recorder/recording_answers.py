@@ -103,6 +103,7 @@ class Recordings(msgspec.Struct, frozen=True):
     in_progress: Annotated[
         list[OpenRecording], doc("recordings that are still being made: listed above when they have ended")
     ] = []
+    publish_as: Annotated[str, doc("the node name under which monitors publish")] = "/rosrv"
 
 
 class Sender(msgspec.Struct, frozen=True):

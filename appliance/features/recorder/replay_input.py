@@ -103,13 +103,14 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
 @contextmanager
 def recorded_messages(
     appliance: Appliance, since: str | None, until: str | None, topics: Mapping[str, str]
-) -> Iterator[list[tuple[str, Path, tuple[int, int]]]]:
+) -> Iterator[tuple[list[tuple[str, Path, tuple[int, int]]], str]]:
+    """Yield the name, bag and period of each piece, and the node name under which monitors publish."""
     span = span_of(since, until)
     recorded = appliance.ask_or_exit(RecordingsWanted())
     require_recorded(recorded, topics)
     with pieces_of(appliance, recorded, span) as pieces, MONITOR.reports():
         _cover(pieces, span, recorded.in_progress, as_json=appliance.as_json)
-        yield [(piece.name, piece.bag, piece.span) for piece in pieces]
+        yield [(piece.name, piece.bag, piece.span) for piece in pieces], recorded.publish_as
 
 
 def _cover(

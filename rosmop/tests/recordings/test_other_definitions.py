@@ -37,14 +37,15 @@ m() { event e(double x) /a pkg/A '{n.x:x}' { if (x > 100.9) { ROS_WARN("high"); 
 """
 
 
-def record(path: Path, others: Sequence[Sent], *, first: bool) -> None:
+def record(path: Path, others: Sequence[Sent], *, first: bool, caller: str = "/other") -> None:
     sent = [*others, ("/a", "pkg/A", OWN, b"")] if first else [("/a", "pkg/A", OWN, b""), *others]
     with Writer(path) as writer:
         rows = []
-        for number, (topic, kind, text, data) in enumerate(sent):
+        for topic, kind, text, data in sent:
             digest = Definitions.from_full_text(kind, text).md5sum(kind)
+            name = caller if data else "/node"
             row = writer.add_connection(
-                topic, kind.replace("/", "/msg/"), msgdef=text, md5sum=digest, callerid=f"/node{number}"
+                topic, kind.replace("/", "/msg/"), msgdef=text, md5sum=digest, callerid=name
             )
             rows.append((row, data))
         for tick in range(400):
@@ -86,3 +87,27 @@ def test_a_connection_that_does_not_fit_changes_nothing_and_is_named(
     strict = ReplayJob(recording, specifications, ["*"], EVER, 1, margins=False, strict=True)
     result = unpacked(work(packed(strict)))
     assert isinstance(result, Replayed) and bool(result.notes) == (OTHERS[other][0] == "/a")
+
+
+@pytest.mark.parametrize("other", [("/a", "pkg/A", OWN, pack("<dd", 500, 0)), *OTHERS.values()])
+def test_messages_that_monitors_published_change_nothing(
+    other: Sent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("m.rv").write_text(SPECIFICATION)
+    outputs: dict[bool, list[object]] = {}
+    for beside in (False, True):
+        others = [other] if beside else []
+        record(Path("x.bag"), others, first=False, caller="/rosrv")
+        commands = (f"{verb} --bag x.bag" for verb in ("run m.rv", "coverage m.rv", "learn"))
+        outputs[beside] = [re.sub(r"#\d+", "", str(rosmop(command))) for command in commands]
+        Path("x.bag").unlink()
+        record(Path("x.bag"), others, first=False, caller="/guardian")
+        (recording,) = recordings_of([Path("x.bag")], [])
+        specifications = Specifications({"m.rv": SPECIFICATION}, {})
+        job = ReplayJob(
+            recording, specifications, ["*"], EVER, 0, margins=False, strict=True, own="/guardian"
+        )
+        outputs[beside].append(unpacked(work(packed(job))))
+        Path("x.bag").unlink()
+    assert outputs[False] == outputs[True]

@@ -80,11 +80,11 @@ Recorder = Callable[[], Any] | None
 
 def recorder(bag: Path | None) -> Recorder:
     @contextmanager
-    def spans(_appliance: Any, since: str, until: None, topics: Mapping[str, str]) -> Iterator[list[Any]]:
+    def spans(_appliance: Any, since: str, until: None, topics: Mapping[str, str]) -> Iterator[Any]:
         assert (since, until, topics) == ("5s", None, {"/scan": SCAN})
         if bag is None:
             raise typer.Exit(2)
-        yield [("memory", bag, (0, 1 << 62))]
+        yield [("memory", bag, (0, 1 << 62))], "/rosrv"
 
     return lambda: spans
 

@@ -36,7 +36,7 @@ class Scene:
         self.trail = FakeTrail()
         own = RecorderRules(**{"enabled": True} | rules)
         self.plan = RecordingPlan(own, lambda host: host, IdSource().next)
-        self.orders = RecordingOrders(own, self.trail, lambda: (4, 2), self.plan)
+        self.orders = RecordingOrders(own, self.trail, lambda: (4, 2), self.plan, "/guardian")
 
     @property
     def state(self) -> RecorderState:
@@ -124,7 +124,8 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
     recorder.send(recorder_link.RecordingClosed(KEPT))
     await told(scene, lambda: len(heard) == 2)
     assert heard == [recorder_link.RevisionsStated(4, 2), recorder_link.RecordingNoted(KEPT.id)]
-    assert (await scene.orders.recordings(recording_requests.RecordingsWanted())).recordings == [KEPT]
+    known = await scene.orders.recordings(recording_requests.RecordingsWanted())
+    assert (known.recordings, known.publish_as) == ([KEPT], "/guardian")
     assert await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id)) == KEPT
     [row] = scene.trail.rows
     assert (row["event"], row["recording"], row["sha256"]) == ("recording closed", KEPT.id, "5a")
