@@ -112,11 +112,12 @@ def _methods(request: Request) -> set[str]:
         and route.path is not None
         and route.path_regex.match(request.url.path)
     ]
-    if not matching:
-        return {"GET"}
     # A literal path takes precedence over a path with a parameter.
-    here = min((str(route.path) for route in matching), key=lambda path: path.count("{"))
-    return {method for route in matching if route.path == here for method in route.methods or ()}
+    here = min((str(route.path) for route in matching), key=lambda path: path.count("{"), default="")
+    methods = {method for route in matching if route.path == here for method in route.methods or ()}
+    if not methods or "GET" in methods:
+        methods |= {"GET", "HEAD"}  # `AnswersHead` serves HEAD
+    return methods
 
 
 async def _invalid(request: Request, error: Exception) -> Response:
