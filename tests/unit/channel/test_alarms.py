@@ -68,6 +68,11 @@ def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severit
     assert len(alarm.text) > 5
 
 
+@pytest.mark.parametrize("cause", ["the disk", "the load", "signer"])
+def test_the_remedy_of_a_degraded_log_has_each_cause(cause: str) -> None:
+    assert cause in ALARM_KINDS["audit-degraded"].remedy
+
+
 def test_alarms_that_are_present_together_have_different_names() -> None:
     """An operator handles an alarm by its name, and so never a later one of another process or host."""
     failing = [{"role": role, "failing": "it ends"} for role in ("relay", "relay", "hook", "door", "door")]
