@@ -368,6 +368,18 @@ REST_WORK = QuotaRow(
         beyond="a further one waits",
     ),
 )
+TOPIC_LOOKS = QuotaRow(
+    thing="queries of topics' messages under way",
+    bounds=Bounds(whole=8, host=6, unknown=0, kept=0, share=3),
+    at_limit="503 with the reason",
+    between="a host gets one, and further ones up to three times what it leaves for all others",
+    counting="a host is a token, or all users of `rosrv` on the appliance's machine",
+    alarm="`rest call` with status 503",
+    margin=HonestUse(
+        "a test of a guard that watches the commands and four topics of odometry",
+        5,
+    ),
+)
 AUDIT_KINDS = QuotaRow(
     thing="kinds of folded denials in the audit log",
     bounds=Bounds(whole=8192, host=256, unknown=64, kept=0),
@@ -505,7 +517,7 @@ QUOTA_ROWS = (
     PARAMETER_BYTES, LARGE_WRITES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
     RELAY_QUEUES, RELAY_LATCHED, RELAY_CONNECTIONS, RELAY_HEADERS, RELAY_TURN, LIMITED_TOPIC, RELAY_MESSAGE,
     DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS,
-    REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NODES, NAMES,
-    GRANTS, IKE_HANDSHAKES, DESCRIPTORS,
+    REST_EXPORTS, REST_WORK, TOPIC_LOOKS, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS,
+    NODES, NAMES, GRANTS, IKE_HANDSHAKES, DESCRIPTORS,
 )  # fmt: skip
 """Every row of the core, in the order of the page. A test checks that none is missing. Features add rows."""

@@ -10,11 +10,12 @@ from functools import partial
 
 from appliance.base import clock
 from appliance.channel.messages import LookEnded, LookWanted, Message, MessageSeen
+from appliance.quotas.table import TOPIC_LOOKS
 from appliance.relay.connections.relayed_topic import RelayedTopic, Tap
 from appliance.relay.transport.frames import Batch
 from roswire.message_view import PublisherReader
 
-MAX_LOOKS = 8
+MAX_LOOKS = TOPIC_LOOKS.bounds.whole
 MAX_MESSAGES = 20
 
 

@@ -97,7 +97,7 @@ class ProofTests:
         except GuardError as error:
             raise SenselessError(str(error)) from error
         command = topics["command"]
-        why_not = await self._why_not_sent(row.preset, command, types["command"])
+        why_not = await self._why_not_sent(row.preset, command, types["command"], who)
         wanted = GuardTestWanted(0, row.name, command, made.messages, made.fault, deliver=not why_not)
         take_effect()  # the robot was watched for seconds
         found = await self._relay.test(wanted)
@@ -114,7 +114,7 @@ class ProofTests:
         self._keep(row.name, test, command)
         return test
 
-    async def _why_not_sent(self, preset: str, command: str, kind: str) -> str:
+    async def _why_not_sent(self, preset: str, command: str, kind: str, who: str) -> str:
         """Return why the stop is not sent, or an empty text. Raises `SenselessError` while the robot moves."""
         if preset == "withhold":
             return "this guard sends no stop"
@@ -126,7 +126,9 @@ class ProofTests:
         sources = robots.sources(topic, (_ODOMETRY,)) if kind in VELOCITIES else []
         odometry = [source.name for source in sources][:_MAX_ODOMETRY]
         watched = [command, *odometry]
-        seen = dict(zip(watched, await asyncio.gather(*map(self._watch, watched)), strict=True))
+        seen = dict(
+            zip(watched, await asyncio.gather(*(self._watch(one, who) for one in watched)), strict=True)
+        )
         if kind not in VELOCITIES:
             if seen[command]:
                 raise SenselessError(
@@ -149,10 +151,10 @@ class ProofTests:
             )
         return ""
 
-    async def _watch(self, topic: str) -> list[MessageSeen]:
+    async def _watch(self, topic: str, who: str) -> list[MessageSeen]:
         seen, until = list[MessageSeen](), clock.now() + WATCH_SECONDS
         while (left := until - clock.now()) > 0:
-            found = await self._relay.look(topic, _MESSAGES, left, latched=False)
+            found = await self._relay.look(topic, _MESSAGES, left, who, latched=False)
             if not found:  # all the time is over, or its relay is away
                 break
             seen += found

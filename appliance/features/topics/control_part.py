@@ -32,7 +32,9 @@ class TopicLooks:
         failure = await self._trail.durable()
         if failure is not None:
             raise UnavailableError(f"no message is shown while the look cannot be recorded: {failure}")
-        seen = await self._relay.look(topic.name, request.messages, request.seconds, latched=request.latched)
+        seen = await self._relay.look(
+            topic.name, request.messages, request.seconds, who, latched=request.latched
+        )
         rows = [
             TopicMessage(
                 message.time, self._graph.name_of(message.key), message.size, message.fields, message.why

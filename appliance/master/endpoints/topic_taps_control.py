@@ -6,16 +6,15 @@ from collections.abc import Callable
 import msgspec
 
 from appliance.channel import messages
-
-MAX = 8
-"""The most taps at once; relays have the same limit."""
+from appliance.quotas.pool import Pool, QuotaClass
+from appliance.quotas.table import TOPIC_LOOKS
 
 _STOP_SECONDS = 5.0
 _TEST_SECONDS = 20.0
 
 
 class TooManyTapsError(Exception):
-    """The maximum number of taps is already open."""
+    """The maximum number of taps, or the person's share, is already open."""
 
 
 class TapRequests:
@@ -27,15 +26,19 @@ class TapRequests:
     def __init__(self, sender: Callable[[str], Callable[[messages.Message], bool]]) -> None:
         self._sender = sender
         self._number = 0
+        self._people: Pool[str] = Pool("queries", TOPIC_LOOKS.bounds, lambda _who: QuotaClass.REGISTERED)
         self._open: dict[int, tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
         self._asked: dict[int, asyncio.Future[messages.StopBegun | messages.GuardTested]] = {}
 
     async def look(
-        self, topic: str, count: int, seconds: float, *, latched: bool
+        self, topic: str, count: int, seconds: float, who: str, *, latched: bool
     ) -> list[messages.MessageSeen]:
-        """Return up to `count` messages, or those that came in time. Raises `TooManyTapsError`."""
-        if len(self._open) >= MAX:
-            raise TooManyTapsError(f"{MAX} queries of topics' messages are running: try again")
+        """Return up to `count` messages, or those that came in `seconds`. Raises `TooManyTapsError`."""
+        if self._people.take(who):
+            mine, total = self._people.held(who), self._people.total
+            raise TooManyTapsError(
+                f"{total} queries of topics' messages are running, {mine} of {who}: try again"
+            )
         send = self._sender(topic)
         self._number += 1
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()
@@ -48,6 +51,7 @@ class TapRequests:
             pass
         finally:
             del self._open[number]
+            self._people.give_back(who)
             send(messages.LookEnded(number))
         return seen
 

@@ -229,7 +229,9 @@ async def test_only_a_robot_that_is_known_to_stand_is_tested(
     ]  # fmt: skip
     tested: list[GuardTestWanted] = []
 
-    async def look(topic: str, _count: int, _seconds: float, *, latched: bool) -> list[MessageSeen]:
+    async def look(
+        topic: str, _count: int, _seconds: float, _who: str, *, latched: bool
+    ) -> list[MessageSeen]:
         assert not latched
         return [MessageSeen(1, "k", 0, "", 48, fields) for fields in said.pop(topic, [])]
 
