@@ -269,7 +269,7 @@ def test_the_removal_stops_the_service_before_it_gives_back_what_is_left(
     (tmp_path / "statuses").write_text("".join(f"{status}\n" for status in statuses))
     environment = f"LANG=C ROSRV_STATE={state} X=1" if moved else "LANG=C"
     programs = {
-        "systemctl": f'echo "{environment}"',
+        "systemctl": f'case "$*" in *=Environment\\ *) echo "{environment}" ;; esac',
         "nft": f"exit {int(not closed)}",
         "deb-systemd-invoke": 'echo "$*" >>calls',
         "rosrv": 'echo "$*" >>calls\nstatus=$(head -n 1 statuses)\nsed -i 1d statuses\nexit "$status"',
@@ -288,3 +288,40 @@ def test_the_removal_stops_the_service_before_it_gives_back_what_is_left(
     ], done.stderr
     assert done.returncode == (statuses or [0])[-1]
     assert ("nft delete table inet rosrv_protect" in done.stderr) is (closed and done.returncode == 0)
+
+
+@pytest.mark.parametrize("place", ["Environment", "EnvironmentFiles", "MainPID", "ExecStart"])
+def test_the_removal_finds_the_state_wherever_the_service_has_it(tmp_path: Path, place: str) -> None:
+    state = tmp_path / "moved state" if place in ("EnvironmentFiles", "MainPID") else tmp_path / "moved"
+    for folder in (state, tmp_path / "bin", tmp_path / "booted", tmp_path / "program" / "bin"):
+        folder.mkdir(parents=True)
+    (state / "adopt.json").touch()
+    (tmp_path / "given").write_text(f'LANG=C\nROSRV_STATE="{state}"\n')
+    programs = {
+        "bin/systemctl": f'case "$*" in *={place}\\ *) cat answer ;; esac',
+        "bin/nft": "exit 1",
+        "bin/deb-systemd-invoke": "",
+        "bin/rosrv": 'echo "$*" >>calls',
+        "program/bin/python": f'case "$*" in *"/srv/a.yaml") echo "{state}" ;; *) echo /nothing ;; esac',
+    }
+    for name, lines in programs.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{lines}\n")
+        (tmp_path / name).chmod(0o755)
+    text = (ROOT / "distribution" / "debian" / "rosrv.prerm").read_text()
+    for path, name in {"/usr/lib/rosrv": "program", "/run/systemd/system": "booted"}.items():
+        text = text.replace(path, str(tmp_path / name))
+    with subprocess.Popen(["/bin/sleep", "60"], env={"ROSRV_STATE": str(state)}) as service:
+        answers = {
+            "Environment": f"LANG=C ROSRV_STATE={state} X=1",
+            "EnvironmentFiles": f"{tmp_path}/given (ignore_errors=yes)",
+            "MainPID": f"{service.pid}",
+            "ExecStart": "{ path=/usr/bin/rosrv ; argv[]=/usr/bin/rosrv up --config /srv/a.yaml ; pid=0 }",
+        }
+        (tmp_path / "answer").write_text(answers[place] + "\n")
+        done = subprocess.run(
+            ["sh", "-c", text, "rosrv.prerm", "remove"], cwd=tmp_path, check=False, capture_output=True, text=True,
+            env={"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin"},
+        )  # fmt: skip
+        service.kill()
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "calls").read_text() == f"release --dead --state {state}\n"
