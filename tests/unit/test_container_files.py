@@ -64,6 +64,10 @@ def test_every_process_is_in_the_table_of_processes() -> None:
     documented = {name: (user, set(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
     expected = {role.name: (role.user, set(role.capabilities)) for role in ROLES}
     assert documented == expected | {"supervisor": ("root", granted())}
+    [beyond] = re.findall(
+        r"^Outside the container, the supervisor also has ([A-Z_ ]+)\.$", text, re.MULTILINE
+    )
+    assert set(beyond.split()) == set(SUPERVISOR_CAPABILITIES) - granted()
 
 
 def test_the_container_is_given_what_the_supervisor_knows() -> None:

@@ -23,6 +23,9 @@ _UsageError: Any = typer.BadParameter.__mro__[1]  # which typer does not export
 GIVEN = "\x01"  # a value that the program fills in
 _WORD = r"(?:\\?\"[^\"\n]*\"|'[^'\n]*'|[^\s`\"';()<>|,&]|,(?=\S))+"
 _PROPOSED = re.compile(rf"(?<![\w./-])(rosrv-fleet|rosrv|rosmop) ([a-z][a-z-]*(?: {_WORD})*(?: (?=[\"']))?)")
+_OF_PAGES = re.compile(
+    r"(?:^ *(?:sudo |\$ )?|`(?:sudo )?)((?:rosrv|rosrv-fleet|rosmop) [a-z-][^`\n]*)", re.MULTILINE
+)
 SAMPLES = ("base", "1", "10.0.0.9", "/topic", "1h", "enabled", "f.yaml", "x=1")
 NAMED = {
     "TIME": "1h", "FILE": "f.ini", "ADDRESS": "10.0.0.9", "PORT": "9091", "NUMBER": "1", "N": "1", "A": "state",
@@ -134,15 +137,32 @@ def accepted(words: list[str]) -> str:
     return wrong
 
 
-def test_each_proposed_command_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def collector(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROSRV_FLEET_COLLECTOR", "https://10.0.0.9:8450")  # as its pages ask for
     monkeypatch.setenv("ROSRV_FLEET_CA", "ca.pem")
     monkeypatch.setenv("ROSRV_FLEET_TOKEN_FILE", "token")
+
+
+def test_each_proposed_command_is_accepted() -> None:
     found = proposals()
     wrong = [
         f"{file} proposes: {proposal}: {why}" for proposal, file in found.items() if (why := _wrong(proposal))
     ]
     assert len(found) > 200 and not wrong, "\n".join(wrong)
+
+
+def test_each_command_of_a_page_is_accepted() -> None:
+    wrong, seen = [], 0
+    for page in (*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "SECURITY.md"):
+        for call in _OF_PAGES.findall(page.read_text().replace("\\\n", " ")):
+            if "\u2026" in call or len(shlex.split(call)) == 2:  # shortened, or the name of a group
+                continue
+            seen += 1
+            given = shlex.split(call, comments=True)
+            words = list(itertools.takewhile(lambda word: word not in {"|", ">", "&&", ";"}, given))
+            wrong += [f"{page.name}: {call}: {why}"] if (why := accepted(words)) else []
+    assert seen > 300 and not wrong, "\n".join(wrong)
 
 
 def _wrong(proposal: str) -> str:
