@@ -233,21 +233,25 @@ class RecordingStore:
             return None, refused
         held = self._held(self.recordings, reserved)
         kept_here = {found.charged_to for found in self.recordings}
-        if charged_to not in UNLIMITED and held[charged_to] > self._disk // 4 and charged_to in kept_here:
-            return self._oldest({charged_to}), f"{charged_to} used its quota of recorder.disk"
+        alone = {charged_to} - UNLIMITED
+        if charged_to in kept_here and self._share(self.recordings, reserved, alone) > 1 / 4:
+            return self._oldest({charged_to}), f"{charged_to} used its quota of recordings"
         why = self._excess(self.recordings, reserved)
         if not why:
             return None, ""
         others, own = kept_here - OURS, kept_here & OURS
-        if others and (charged_to not in OURS or not own or _of_guests(held) * 2 > self._disk):
+        if others and (
+            charged_to not in OURS or not own or self._share(self.recordings, reserved, others) > 1 / 2
+        ):
             return self._oldest({max(others, key=lambda name: held[name])}), why
         return self._oldest(own), why
 
     def _excess(self, kept: Sequence[Recording], reserved: Sequence[str]) -> str:
         """Return why a recording of the last host in `reserved` has no room beside `kept` and those in progress."""
         held = self._held(kept, reserved)
-        if reserved[-1] not in OURS and _of_guests(held) > self._disk * 3 // 4:
-            return "hosts other than the robot used their quota of recorder.disk"
+        guests = {*(found.charged_to for found in kept), *reserved} - OURS
+        if reserved[-1] not in OURS and self._share(kept, reserved, guests) > 3 / 4:
+            return "hosts other than the robot used their quota of recordings"
         if sum(held.values()) > self._disk:
             return "recorder.disk is full"
         if len(kept) + len(reserved) > MAX_KEPT:
@@ -255,6 +259,12 @@ class RecordingStore:
         if sum(self._described[found.id] for found in kept) > _MAX_DESCRIBED:
             return f"the descriptions of all recordings have more than {_MAX_DESCRIBED} bytes"
         return ""
+
+    def _share(self, kept: Sequence[Recording], reserved: Sequence[str], of: Collection[str]) -> float:
+        """Return which part these hosts have of the bytes or of the number of recordings, the larger one."""
+        size = sum(size for name, size in self._held(kept, reserved).items() if name in of)
+        number = sum(name in of for name in (*(found.charged_to for found in kept), *reserved))
+        return max(size / self._disk, number / MAX_KEPT)
 
     def _held(self, kept: Sequence[Recording], reserved: Sequence[str]) -> Counter[str]:
         held = _sizes(kept, lambda found: found.charged_to)
@@ -267,10 +277,6 @@ class RecordingStore:
         return next(
             found for found in self.recordings if found.charged_to in charged_to and _kind(found) == fullest
         )
-
-
-def _of_guests(held: Counter[str]) -> int:
-    return sum(size for name, size in held.items() if name not in OURS)
 
 
 def _sizes(recordings: Iterable[Recording], of: Callable[[Recording], str]) -> Counter[str]:

@@ -125,13 +125,17 @@ def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
     assert (held.count("10.0.0.9"), held[:2]) == (2, [ROBOT, "10.0.0.7"])
 
 
-def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("size", "number"), [(8 * MIB, 500), (1, 8)], ids=["bytes", "number"])
+def test_no_guest_displaces_a_recording_of_the_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, number: int
+) -> None:
+    monkeypatch.setattr("appliance.features.recorder.recording_store.MAX_KEPT", number)
     store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
 
     def arrive(number: int, charged_to: str) -> str:
         _gone, why_not = room_for(store, charged_to)
         if not why_not:
-            put(store, recording(number, size=8 * MIB, charged_to=charged_to))
+            put(store, recording(number, size=size, charged_to=charged_to))
         return why_not
 
     for number in range(30):
