@@ -36,8 +36,9 @@ DEFAULT_FILE = Path("appliance.yaml")
 _DEFAULT_STATE = Settings.state
 _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
+_ADDRESS = re.compile(r"\[[^]]*+\]:\d++")
 # Variables that Kubernetes and container links set for a service named `rosrv`.
-_SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*+)|PORT|PORT_\d++_.*+|NAME|ENV_.*+)")
+_SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*+)|PORT|PORT_\d++_.*+|ENV_.*+)")
 
 
 def _paths_of(section: type) -> Iterator[tuple[str, ...]]:
@@ -161,13 +162,18 @@ class _Gathered:
 
     def add_environment(self, environment: Mapping[str, str]) -> None:
         for name in sorted(environment):
-            if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION or _SERVICE_LINK.fullmatch(name):
+            text = environment[name]
+            if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION:
+                continue
+            if _SERVICE_LINK.fullmatch(name) or (
+                name == "ROSRV_NAME" and text.startswith("/")
+            ):  # /ROBOT/rosrv
                 continue
             path: KeyPath = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
-            value: object = environment[name]
-            if environment[name].startswith(("[", "{")):
+            value: object = text
+            if text == "null" or (text.startswith(("[", "{")) and not _ADDRESS.fullmatch(text)):
                 try:
-                    value = yaml.safe_load(environment[name])
+                    value = yaml.safe_load(text)
                 except yaml.YAMLError as error:
                     problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else error
                     self._mistakes.append(Mistake(name, not_yaml(problem)))

@@ -1,13 +1,17 @@
 import re
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @pytest.fixture
@@ -175,11 +179,33 @@ def test_variables_of_other_programs_are_ignored() -> None:
     environment = {
         "ROSRV_SERVICE_HOST": "10.0.0.1",
         "ROSRV_SERVICE_PORT_MASTER": "11311",
+        "ROSRV_NAME": "/robot/rosrv",
         "ROSRV_PORT": "tcp://10.0.0.1:11311",
         "ROSRV_PORT_11311_TCP_ADDR": "10.0.0.1",
         "ROSRV_TOKEN": "secret",
     }
-    assert resolve(None, environment, {}).listen == Settings().listen
+    assert resolve(None, environment, {}) == resolve(None, {}, {})
+
+
+def leaves(settings: "DataclassInstance", *path: str) -> Iterator[tuple[str, object]]:
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            yield from leaves(value, *path, field.name)
+        else:
+            yield "ROSRV_" + "__".join((*path, field.name)).upper(), value
+
+
+def test_each_value_can_be_given_in_the_environment() -> None:
+    """Also the text that a message proposes, and a value that is none."""
+    default = resolve(None, {}, {})
+    given = dict(leaves(default))
+    assert len(given) > 100
+    texts = {name: "null" if value is None else value for name, value in given.items()}
+    plain = {name: str(value) for name, value in texts.items() if isinstance(value, str | int | float)}
+    assert resolve(None, plain | {"ROSRV_NAME": default.name}, {}) == default
+    named = resolve(None, {"ROSRV_NAME": "lift-7", "ROSRV_LISTEN": "[::]:11311"}, {})
+    assert (named.name, named.listen) == ("lift-7", "[::]:11311")
 
 
 def test_a_list_in_the_environment_is_yaml() -> None:

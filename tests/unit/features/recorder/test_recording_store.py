@@ -125,11 +125,11 @@ def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
     assert (held.count("10.0.0.9"), held[:2]) == (2, [ROBOT, "10.0.0.7"])
 
 
-@pytest.mark.parametrize(("size", "number"), [(8 * MIB, 500), (1, 8)], ids=["bytes", "number"])
+@pytest.mark.parametrize(("size", "limit"), [(8 * MIB, 500), (1, 8)], ids=["bytes", "number"])
 def test_no_guest_displaces_a_recording_of_the_robot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, number: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, limit: int
 ) -> None:
-    monkeypatch.setattr("appliance.features.recorder.recording_store.MAX_KEPT", number)
+    monkeypatch.setattr("appliance.features.recorder.recording_store.MAX_KEPT", limit)
     store = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
 
     def arrive(number: int, charged_to: str) -> str:
