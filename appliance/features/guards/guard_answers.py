@@ -215,7 +215,10 @@ class GuardList(msgspec.Struct, frozen=True):
     presets: Annotated[list[PresetRow], doc("all presets")]
     guards: Annotated[list[GuardRow], doc("the loaded guards, in the order in which they see messages")]
     warnings: Annotated[
-        list[str], doc("monitors that were guards before 0.4, and bases on other machines, as sentences")
+        list[str],
+        doc(
+            "monitors that were guards before 0.4, bases on other machines, and drivers that command themselves"
+        ),
     ] = []
 
 

@@ -45,7 +45,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import origin_of
 from appliance.features.guards.robot_graph import RobotGraph
-from appliance.features.guards.suggestions import advice
+from appliance.features.guards.suggestions import advice, inside
 from appliance.features.guards.upgrades import Upgrade, planned, same, upgraded
 from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState, OlderGuard
 from appliance.specifications.specification_files import SpecificationsRefusedError
@@ -96,6 +96,7 @@ class Placement:
         self._report = report
         self._commands, self._graph, self._connections = commands, graph, connections
         self.elsewhere: list[str] = []
+        self.inside: list[str] = []
         self._suspected: dict[GuardedDriver, set[str]] = {}
         self._confirmed: dict[GuardedDriver, list[str]] = {}
         self._unanswered: dict[GuardedDriver, int] = {}
@@ -119,7 +120,7 @@ class Placement:
     def look(self) -> list[GuardedDriver]:
         """Find the drivers, and return those to ask."""
         commands = {*self._commands()}
-        drivers = self._drivers(commands) if commands else []
+        drivers, self.inside = self._drivers(commands) if commands else ([], [])
         self.elsewhere = [*self._sentences(drivers)]
         for known in (self._suspected, self._confirmed, self._unanswered):
             for driver in known.keys() - {*drivers}:
@@ -142,18 +143,20 @@ class Placement:
             self._confirmed.pop(driver, None)
 
     def sentences(self, topic: str) -> list[str]:
-        """Return a sentence for each host of a new guard's base that is another machine."""
-        return [*self._sentences(self._drivers({topic}))]
+        """Return a sentence for each way past a new guard: a cut to another machine, and a driver's own process."""
+        drivers, within = self._drivers({topic})
+        return [*self._sentences(drivers), *within]
 
-    def _drivers(self, commands: set[str]) -> list[GuardedDriver]:
+    def _drivers(self, commands: set[str]) -> tuple[list[GuardedDriver], list[str]]:
         graph = self._graph()
         hosts = {node.name: node.host for node in graph.nodes}
         robots = RobotGraph(facts_of(graph), commands)
+        guarded = [topic for topic in robots.topics if topic.name in commands]
         return [
             GuardedDriver(topic.name, node, hosts[node])
-            for topic in robots.topics if topic.name in commands
+            for topic in guarded
             for node in sorted(robots.ends(topic)) if node in hosts
-        ]  # fmt: skip
+        ], [sentence for topic in guarded for sentence in inside(robots, topic)]  # fmt: skip
 
     def _sentences(self, drivers: Iterable[GuardedDriver]) -> Iterator[str]:
         for topic, host in dict.fromkeys((driver.topic, driver.host) for driver in drivers):
@@ -303,7 +306,7 @@ class GuardOrders:
         presets = [preset_row(one) for one in PRESETS.values()] if request.presets else []
         return GuardList(
             self._monitors.revision, self._monitors.tag, presets, rows,
-            [*self._former().values(), *self.placement.elsewhere],
+            [*self._former().values(), *self.placement.elsewhere, *self.placement.inside],
         )  # fmt: skip
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:

@@ -227,7 +227,8 @@ class RobotGraph:
     @cached_property
     def velocity_commands(self) -> list[TopicFacts]:
         """The topics by which drivers take velocities."""
-        return [topic for topic in self.velocities if self.drivers(topic)][:MAX_COMMANDS]
+        found = [topic for topic in self.velocities if self.drivers(topic) and self.crosses(topic)]
+        return found[:MAX_COMMANDS]
 
     @cached_property
     def bases(self) -> list[TopicFacts]:
@@ -239,7 +240,7 @@ class RobotGraph:
 
     @cached_property
     def arms(self) -> list[TopicFacts]:
-        found = [topic for topic in self.topics if topic.type in TRAJECTORIES and _used(topic)]
+        found = [topic for topic in self.topics if topic.type in TRAJECTORIES and self.crosses(topic)]
         return [topic for topic in found if topic not in self.legs][:MAX_COMMANDS]
 
     @cached_property
@@ -274,16 +275,21 @@ class RobotGraph:
 
     @cached_property
     def _commands_of(self) -> Mapping[str, set[str]]:
-        """The velocities that each node publishes for another one."""
+        """The velocities that each node publishes for others, and does not carry out in its own process."""
         found = dict[str, set[str]]()
         for topic in self.velocities:
-            for node in topic.publishers if _used(topic) else ():
+            used = _used(topic)
+            for node in {*topic.publishers} - used if used else ():
                 found.setdefault(node, set()).add(topic.name)
         return found
 
     def ends(self, command: TopicFacts) -> frozenset[str]:
         """Return the nodes that carry out a command of any type."""
         return (self.drivers(command) if command.type in VELOCITIES else frozenset()) or _used(command)
+
+    def crosses(self, command: TopicFacts) -> bool:
+        """Whether the relay carries a command to a node: what a process sends to itself never leaves it."""
+        return any(command.publishers != (node,) for node in self.ends(command))
 
     def robot_of(self, command: TopicFacts) -> GraphedRobot:
         return next(robot for robot in self.robots if command in robot.commands)

@@ -90,6 +90,9 @@ def advice(
             writer.add_goal(goal)
     for command in graph.velocities:
         writer.add_joystick(command)
+    others = (topic for topic in graph.topics if topic.type in {*types.TRAJECTORIES, *types.GOALS})
+    for command in (*graph.velocities, *others):
+        writer.left_out.extend(inside(graph, command))
     unguarded = graph.unguarded({*types.COMMANDS, *types.GOALS})
     if unguarded and graph.robots:
         named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:_MAX_NAMED])
@@ -112,6 +115,16 @@ def advice(
             f" robot: rosrv guard new deadman {topic.name} --shadow"
         )
     return Suggestions(writer.found, writer.in_use, writer.left_out, [*writer.not_protected()])
+
+
+def inside(graph: RobotGraph, command: TopicFacts) -> Iterator[str]:
+    """Yield a sentence for each node that carries out commands of its own process, which the relay never gets."""
+    for node in sorted(graph.ends(command).intersection(command.publishers)):
+        yield f"{node} also publishes {command.name} to itself, as " + (
+            "move_base does with the goals of rviz (/move_base_simple/goal): no guard gets these"
+            if command.type in types.GOALS
+            else "nodelets of one manager do: no guard gets these"
+        )
 
 
 class _Writer:
@@ -198,19 +211,14 @@ class _Writer:
     def add_goal(self, goal: TopicFacts) -> None:
         before = goal.name.removesuffix("/goal")
         wanted = f"{before}/result", goal.type.replace("ActionGoal", "ActionResult")
-        if goal.subscribers and before != goal.name and wanted in {
+        if self.graph.crosses(goal) and before != goal.name and wanted in {
             (topic.name, topic.type) for topic in self.graph.topics if topic.publishers
         }:  # fmt: skip
             self._add("answer", goal)
-        for node in sorted({*goal.publishers} & {*goal.subscribers}):
-            self._say(
-                f"{node} also publishes {goal.name} to itself, as move_base does with the goals of rviz"
-                " (/move_base_simple/goal): no guard gets these"
-            )
 
     def add_joystick(self, command: TopicFacts) -> None:
         """Propose to stop a command whose joystick is silent: some teleoperations repeat its last value."""
-        if not command.publishers or not command.subscribers:
+        if not command.publishers or not self.graph.crosses(command):
             return
         sticks = [
             topic for topic in self.graph.topics

@@ -7,7 +7,7 @@ import yaml
 
 from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS, GuardError, text_of
-from appliance.features.guards.robot_graph import MAX_COMMANDS, TopicFacts
+from appliance.features.guards.robot_graph import MAX_COMMANDS, RobotGraph, TopicFacts
 from appliance.features.guards.suggestions import NOT_SUGGESTED, advice
 from appliance.features.guards.upgrades import planned
 from rosmop.check.sources import compiled_from
@@ -124,6 +124,39 @@ def test_without_its_source_a_guard_is_left_out(robot: str) -> None:
         again = advice([*moved(graph_of(robot), "b"), *less]).suggestions
         assert all(topic.startswith("/a/") for each in again if each.topics["command"].startswith("/a/")
                    for topic in each.topics.values())  # fmt: skip
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_guard_hears_some_command_of_each_driver_or_a_sentence_says_that_it_does_not(robot: str) -> None:
+    """No message of a process to itself leaves it, as when both ends of a command are nodelets of one manager."""
+    graph = graph_of(robot)
+    for command in ["", *dict.fromkeys(one.topics["command"] for one in advice(graph).suggestions)]:
+        merged = graph
+        if command:
+            [topic] = [topic for topic in graph if topic.name == command]
+            merged = in_one_process({*topic.publishers, *RobotGraph(graph).ends(topic)}, graph)
+        found, read = advice(merged), RobotGraph(merged)
+        for topic in read.topics:
+            if topic.name in {one.topics["command"] for one in found.suggestions}:
+                own = read.ends(topic).intersection(topic.publishers)
+                assert {*topic.publishers} - own or not own, topic
+                for node in own:
+                    assert any(
+                        f"{node} also publishes {topic.name} to itself" in one for one in found.left_out
+                    )
+        sent = [one for one in read.velocities if "/manager" in one.publishers]
+        if not any({*one.subscribers} - {"/manager"} for one in sent):
+            heard = {
+                one.name for one in read.velocities if read.crosses(one) and "/manager" in one.subscribers
+            }
+            assert heard <= {one.topics["command"] for one in found.suggestions}
+
+
+def in_one_process(nodes: set[str], graph: list[TopicFacts]) -> list[TopicFacts]:
+    def ends(names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys("/manager" if node in nodes else node for node in names))
+
+    return [one._replace(publishers=ends(one.publishers), subscribers=ends(one.subscribers)) for one in graph]
 
 
 TWIST, STAMPED, ODOMETRY = "geometry_msgs/Twist", "geometry_msgs/TwistStamped", "nav_msgs/Odometry"
