@@ -261,6 +261,7 @@ class LoadedSuggestion(msgspec.Struct, frozen=True):
     name: Annotated[str, doc("the guard")]
     preset: Annotated[str, doc("its preset")]
     topics: Annotated[dict[str, str], doc("its topics, by the names that the preset has for them")]
+    state: Annotated[str, doc("its state, as in `rosrv guard list`")] = "free"
 
 
 class Suggestions(msgspec.Struct, frozen=True):
@@ -271,6 +272,9 @@ class Suggestions(msgspec.Struct, frozen=True):
     left_out: Annotated[list[str], doc("what is ambiguous or cannot be guarded, as sentences")] = []
     not_protected: Annotated[
         list[str], doc("what neither these guards nor those in use protect, as sentences; never empty")
+    ] = []
+    unguarded: Annotated[
+        list[str], doc("what no guard in force protects now, as sentences without advice; never empty")
     ] = []
 
 

@@ -311,7 +311,7 @@ class GuardOrders:
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
         loaded = [
-            LoadedSuggestion(name, preset.name, self._row(name, preset).topics)
+            LoadedSuggestion(name, preset.name, self._row(name, preset).topics, self._state(name))
             for name, preset in self._guards().items()
         ]
         return advice(facts_of(self._graph()), loaded, self._monitors.checked.monitors)

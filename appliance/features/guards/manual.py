@@ -68,12 +68,12 @@ class Manual:
         ])  # fmt: skip
 
 
-def safety_manual(name: str, guards: GuardList, not_protected: Sequence[str]) -> Manual:
+def safety_manual(name: str, guards: GuardList, unguarded: Sequence[str]) -> Manual:
     """Return the manual of the robot with this name, which may be empty."""
     acting = [row for row in guards.guards if row.state not in _IDLE]
     sections = (
         _guards(guards.guards), _times(acting), _distances(acting),
-        _listed("Not protected", [*not_protected, *guards.warnings]), _common(),
+        _listed("Not protected", [*unguarded, *guards.warnings]), _common(),
     )  # fmt: skip
     head = [f"# Safety manual of the robot{f' {name}' if name else ''}", "", NO_SAFETY_FUNCTION, "",
             f"Made by `rosrv guard manual` {__version__} from the guards of the running appliance.", ""]  # fmt: skip

@@ -41,7 +41,7 @@ def manual(
     status = appliance.ask_or_exit(StatusWanted())
     guards = appliance.ask_or_exit(GuardsWanted(presets=False))
     advice = appliance.ask_or_exit(GuardSuggestionsWanted())
-    made = safety_manual(status.name, guards, advice.not_protected)
+    made = safety_manual(status.name, guards, advice.unguarded)
     lines = _changes(diff, made) if diff is not None else []
     if appliance.as_json:
         say_json({"digest": made.digest, "manual": made.text(lines), "changes": lines})

@@ -114,7 +114,10 @@ def advice(
             f"{topic.name} ({topic.type}) goes from {ends}, and may be a command or a measurement; if it moves the"
             f" robot: rosrv guard new deadman {topic.name} --shadow"
         )
-    return Suggestions(writer.found, writer.in_use, writer.left_out, [*writer.not_protected()])
+    return Suggestions(
+        writer.found, writer.in_use, writer.left_out,
+        [*writer.not_protected()], [*writer.not_protected(now=True)],
+    )  # fmt: skip
 
 
 def inside(graph: RobotGraph, command: TopicFacts) -> Iterator[str]:
@@ -326,8 +329,16 @@ class _Writer:
                 f" {_silence_of_each(button)['silent']} s: let it send 5 times a second or more"
             )
 
-    def not_protected(self) -> Iterator[str]:
-        """Yield what stays without a guard, by command, and then what no guard protects."""
+    def not_protected(self, *, now: bool = False) -> Iterator[str]:
+        """Yield what stays without a guard, by command, and then what no guard protects.
+
+        Proposals count, and guards in use unless they are disabled or broken; with `now`, only guards in force.
+        """
+        guards = {
+            (one.preset, one.topics.get("command"))
+            for one in self._loaded
+            if (one.state in _IN_FORCE if now else one.state not in ("off", "broken"))
+        } | {(one.preset, one.topics["command"]) for one in self.found if not now}
         bases, arms = self.graph.bases, [*self.graph.arm_velocities, *self.graph.arms]
         for commands, presets, what, help_ in (
             ([*bases, *arms], ("estop",), "no button stops {}", self._no_button),
@@ -338,18 +349,13 @@ class _Writer:
             (bases, ("overspeed",), "no guard stops {} when the base is measured too fast", self._no_measurement),
             (arms, (), "no guard stops {} before the arm meets a person or a thing", None),
         ):  # fmt: skip
-            bare = [command for command in commands if not self._guards(command, presets)]
+            bare = [one for one in commands if guards.isdisjoint((preset, one.name) for preset in presets)]
             if bare:
-                advised = help_(bare[0]) if help_ else ""
+                advised = help_(bare[0]) if help_ and not now else ""
                 yield what.format(_named(bare)) + (f": {advised}" if advised else "")
         if not (bases or arms):
             yield "nothing that moves here: no topic commands a base or an arm now"
         yield _NEVER_PROTECTED
-
-    def _guards(self, command: TopicFacts, presets: Sequence[str]) -> bool:
-        guards = [(one.preset, one.topics) for one in self._loaded]
-        guards += [(one.preset, one.topics) for one in self.found]
-        return any(preset in presets and topics.get("command") == command.name for preset, topics in guards)
 
     def _no_button(self, command: TopicFacts) -> str:
         new = f"rosrv guard new estop {command.name} --topic stop="
@@ -551,6 +557,7 @@ class _Writer:
             self.left_out.append(sentence)
 
 
+_IN_FORCE = {"free", "stopping", "withholding"}
 _OWN_GUARD = {"sensor": ("by",), "separation": ("by",), "estop": ("stop",)}
 """The topics that have a guard of their own each."""
 

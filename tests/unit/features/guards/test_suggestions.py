@@ -1,10 +1,12 @@
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from appliance.features.guards import robot_graph as types
 from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS, GuardError, text_of
 from appliance.features.guards.robot_graph import MAX_COMMANDS, RobotGraph, TopicFacts
@@ -208,6 +210,37 @@ def test_the_list_of_what_is_not_protected_is_never_empty_and_knows_the_guards_i
         assert len(advice(BASE, [*loaded[:place], *loaded[place + 1 :]]).not_protected) == 1 + (
             guard.preset != "fence"
         )
+
+
+STATES = {"free": True, "stopping": True, "withholding": True, "off": False, "shadow": False, "broken": False,
+          "holding": False}  # fmt: skip
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_only_guards_in_force_close_a_gap_of_the_safety_manual(robot: str) -> None:
+    """The better a robot is equipped, the more is proposed for it; a proposal protects as little as an idle guard."""
+    graph = graph_of(robot)
+    found = advice(graph)
+    needed = {*types.COMMANDS, *types.GOALS, ODOMETRY, "sensor_msgs/JointState"}
+    without_sources = advice([topic for topic in graph if topic.type in needed])
+    assert gaps(found.unguarded) >= gaps(without_sources.not_protected) | gaps(found.not_protected)
+    for state, in_force in STATES.items():
+        loaded = [LoadedSuggestion(one.name, one.preset, one.topics, state) for one in found.suggestions]
+        named = advice(graph, loaded)
+        assert gaps(named.unguarded) == gaps(found.not_protected if in_force else found.unguarded), state
+        idle = state in ("off", "broken")
+        assert gaps(named.not_protected) == gaps(found.unguarded if idle else found.not_protected), state
+
+
+def gaps(lines: Sequence[str]) -> set[tuple[str, str]]:
+    """Return the gaps and commands of these lines, without the advice."""
+    assert lines[-1].startswith("never by a guard: ")
+    heads = [line.partition(": ")[0] for line in lines[:-1]]
+    return {
+        (re.sub(r"/[^\s,]+(?:, /[^\s,]+)*", "…", head), name)
+        for head in heads
+        for name in re.findall(r"/[^\s,]+", head)
+    }
 
 
 BUTTONS = [  # the rates of its publishers; the values of the estop; whether a sentence names the rate
