@@ -471,9 +471,13 @@ class _Writer:
                         others=others,
                     )
             if preset == "separation" and (several or any(_NOT_AHEAD.search(scan.name) for scan in chosen)):
+                together = (
+                    ", and each must permit a motion: if together they see all round, merge their scans, or also set"
+                    " unseen to the highest velocity"
+                )
                 self._say(
                     "each separation needs the direction and the view of its scanner: set mounted and sector"
-                    f" ({', '.join(scan.name for scan in chosen)})"
+                    f"{together if several else ''} ({', '.join(scan.name for scan in chosen)})"
                 )
 
     def _say_merged(self, scan: TopicFacts, watched: Sequence[TopicFacts], base: TopicFacts) -> None:
