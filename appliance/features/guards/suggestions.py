@@ -536,6 +536,14 @@ class _Writer:
                     self.in_use.append(guard)
                 return
         source = topics.get("by") or topics.get("stop") or ""
+        heard, most = topics.get("state", source), _MOST_PUBLISHERS.get(preset)
+        number = next((len(one.publishers) for one in self.graph.topics if one.name == heard), 0)
+        if most is not None and number > most:
+            self._say(
+                f"{preset} of {command.name} is left out: {counted(number, 'node publishes', 'nodes publish')} {heard},"
+                f" and it follows {most}: let each publish on a topic of its own"
+            )
+            return
         short = command.name.removesuffix("/follow_joint_trajectory/goal")
         parts = [preset, *([] if self._alone else [short]), *([source] if several else [])]
         name = next(name for name in _names(parts, command.name) if name not in self._names)
@@ -562,6 +570,8 @@ class _Writer:
 
 
 _IN_FORCE = {"free", "stopping", "withholding"}
+_MOST_PUBLISHERS = {"fence": 1, "ready": 1, "sensor": 1, "separation": 1, "joints": 2}
+"""The nodes on the topic of a guard beyond which it stops the robot for ever."""
 _OWN_GUARD = {"sensor": ("by",), "separation": ("by",), "estop": ("stop",)}
 """The topics that have a guard of their own each."""
 

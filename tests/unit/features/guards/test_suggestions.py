@@ -1,3 +1,4 @@
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -8,15 +9,16 @@ import yaml
 
 from appliance.features.guards import robot_graph as types
 from appliance.features.guards.guard_answers import LoadedSuggestion, Suggestion, Suggestions
-from appliance.features.guards.presets import PRESETS, GuardError, text_of
+from appliance.features.guards.presets import PRESETS, GuardError, text_of, topics_in, types_in, values_in
 from appliance.features.guards.robot_graph import MAX_COMMANDS, RobotGraph, TopicFacts
+from appliance.features.guards.stimuli import stimulus
 from appliance.features.guards.suggestions import NOT_SUGGESTED, advice
 from appliance.features.guards.upgrades import planned
 from rosmop.check.sources import compiled_from
 from tests.support.examples import sample
 from tests.support.features.guards.running_guard import DEFINITIONS
 from tests.support.rows import require_rows
-from tests.unit.features.guards.guarding import seeded
+from tests.unit.features.guards.guarding import NODES, Guarded, legs_of, seeded, twist
 
 ROBOTS: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("robots.yaml").read_text(encoding="utf-8"))
 
@@ -241,6 +243,85 @@ def gaps(lines: Sequence[str]) -> set[tuple[str, str]]:
         for head in heads
         for name in re.findall(r"/[^\s,]+", head)
     }
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_robot_moves_behind_each_proposal_while_all_its_registered_nodes_send(robot: str) -> None:
+    """With the values that a sentence names, forward passes, and backward, however many nodes share a source."""
+    commanded = {*types.COMMANDS, *types.GOALS, *types.RESULTS}
+    for more in ((), ("/second", "/third")):
+        graph = [
+            topic._replace(publishers=(*topic.publishers, *more) if topic.publishers else ())
+            if topic.type not in commanded
+            else topic
+            for topic in graph_of(robot)
+        ]
+        found = advice(graph)
+        for one in found.suggestions:
+            assert moves(one, graph, named_values(one, found.left_out)), one.command
+
+
+def named_values(one: Suggestion, sentences: Sequence[str]) -> dict[str, str]:
+    """Return the values of a scanner, of several that together see all round."""
+    for sentence in sentences:
+        scans = sentence.rpartition("(")[2].rstrip(")").split(", ")
+        if one.preset == "separation" and "set mounted and sector" in sentence and one.topics["by"] in scans:
+            mounted = math.remainder(2 * math.pi * scans.index(one.topics["by"]) / len(scans), 2 * math.pi)
+            return {"mounted": f"{mounted}", "sector": "2.3"} | (
+                {"unseen": "1"} if "unseen" in sentence else {}
+            )
+    return {}
+
+
+def moves(one: Suggestion, graph: list[TopicFacts], named: dict[str, str]) -> bool:
+    """Whether a motion passes when each publisher has sent what an honest robot sends, at its rate, for 3 s."""
+    preset = PRESETS[one.preset]
+    guard = planned(preset, one.name, one.topics, graph, {**one.measured, **one.values, **named}, {})
+    sent: dict[str, list[bytes]] = {}
+    text = text_of(guard)
+    kinds = dict.fromkeys(("stop", "reset", "fix", "check"), "std_msgs/Bool") | types_in(text)
+    test = stimulus(one.preset, topics_in(text), kinds, values_in(text))
+    for message in test.messages[: test.fault]:
+        sent.setdefault(message.topic, []).append(message.data)
+    facts = {topic.name: topic for topic in graph}
+    nodes: list[str] = []
+    due = []
+    for given, name in guard.topics.items():
+        if name not in sent or (given != "command" and name not in facts):
+            continue
+        publishers = facts[name].publishers or ("/operator",)
+        for place, node in enumerate(publishers):
+            nodes += [node] if node not in nodes else []
+            period = 1000 * len(publishers) / (facts[name].rate or _UNKNOWN_HZ)
+            due += [
+                (round(number * period + place), given, node, number)
+                for number in range(int(6000 / period) + 1)
+            ]
+    robot = Guarded(one.preset, dict(guard.types), **{
+        name: valued(preset.parameter(name).kind, value) for name, value in guard.values.items()
+    })  # fmt: skip
+    passed = set[bytes]()
+    motions = [sent[one.topics["command"]][-1]]
+    if guard.types["command"] == TWIST:
+        motions.append(twist(-legs_of(motions[0])[0], 0, 0, 0, 0, 0))
+    for at, given, node, number in sorted(due):
+        said = sent[guard.topics[given]]
+        data = said[number % len(said)]
+        if given == "command":
+            data = said[0] if at < 3000 else motions[0 if at < 4500 else -1]
+        outcome = robot.tell(given, data, at, NODES[1 + nodes.index(node)])
+        if given == "command" and at >= 3000 and outcome.result not in {"dropped", "changed"}:
+            passed.add(data)
+    return passed >= {*motions}
+
+
+_UNKNOWN_HZ = 10.0
+
+
+def valued(kind: str, value: str) -> Any:
+    if kind == "bool":
+        return value == "true"
+    return int(value) if kind == "int" else float(value) if kind == "double" else value
 
 
 BUTTONS = [  # the rates of its publishers; the values of the estop; whether a sentence names the rate
