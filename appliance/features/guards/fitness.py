@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from typing import NamedTuple
 
 import msgspec
 
@@ -21,6 +22,13 @@ _SAVED_SECONDS = 60.0
 _REPORTED_SECONDS = 2.0  # relays report once a second: a longer pause was not measured
 
 
+class _Kept(NamedTuple):
+    """The times, and the last report of each guard's relay, which may outlive control: timed, late and latest."""
+
+    times: dict[str, GuardTimes]
+    counted: dict[str, tuple[int, int, float]]
+
+
 class GuardFitness:
     """The times of guards since they were first measured with the present limit."""
 
@@ -31,21 +39,22 @@ class GuardFitness:
         self._limit, self._relays = relay.late / 1e3, relays
         self._wanted = bool(relay.heartbeat or relay.heartbeat_line)
         self._beats = False
-        self._counted: dict[str, tuple[int, int, float]] = {}  # timed, late, and when they last grew
         self._late: dict[
             str, list[tuple[float, int, float]]
         ] = {}  # of the last minute: when, how many, how late
-        kept = store.settings().get(_SETTING, "")
-        self.times: dict[str, GuardTimes] = {}
-        with suppress(ValueError):  # an unreadable row begins again
-            self.times = msgspec.json.decode(kept or "{}", type=dict[str, GuardTimes])
         self._saved = clock.now()
+        kept = _Kept({}, {})
+        with suppress(ValueError):  # an unreadable row begins again
+            kept = msgspec.json.decode(store.settings().get(_SETTING, "[{}, {}]"), type=_Kept)
+        self.times, self._counted = kept
+        self._grown = dict.fromkeys(self._counted, self._saved)  # when the report last grew
 
     def look(self, guards: Iterable[str]) -> None:
         names, now = [*guards], clock.now()
         found = {name: self._added(name, now) for name in names}
         self.times = {name: times for name, times in found.items() if times.timed}
         self._counted = {name: row for name, row in self._counted.items() if name in found}
+        self._grown = {name: at for name, at in self._grown.items() if name in found}
         self._late = {
             name: rows
             for name in names
@@ -61,7 +70,7 @@ class GuardFitness:
     def save(self) -> None:
         self._saved = clock.now()
         with suppress(StoreError):  # a full disk has its own alarm; the next minute tries again
-            self._store.save_setting(_SETTING, msgspec.json.encode(self.times).decode())
+            self._store.save_setting(_SETTING, msgspec.json.encode(_Kept(self.times, self._counted)).decode())
 
     @property
     def late(self) -> Mapping[str, str]:
@@ -86,13 +95,15 @@ class GuardFitness:
         row = self._monitors.rollout.rows.get(name)
         if row is None or row.shadow:
             return times
-        timed, late, grown = self._counted.get(name, (0, 0, now))
-        if row.timed == timed:
+        before, report = self._counted.get(name, (0, 0, 0.0)), (row.timed, row.late, row.latest)
+        if row.timed == before[0]:
             return times
-        again = row.timed < timed  # another relay process, or the guard began again
-        more, beyond = (row.timed, row.late) if again else (row.timed - timed, row.late - late)
-        self._counted[name] = row.timed, row.late, now
-        if beyond > 0:
+        if any(new < old for new, old in zip(report, before, strict=True)):
+            before = 0, 0, 0.0  # another relay process, or the guard began again
+        more, beyond = row.timed - before[0], row.late - before[1]
+        grown = self._grown.get(name, now)
+        self._counted[name], self._grown[name] = report, now
+        if beyond:
             rows = self._late.setdefault(name, [])
             rows.append((now, beyond, row.latest))
             if len(rows) == 1:
@@ -101,7 +112,7 @@ class GuardFitness:
             times.since,
             times.seconds + min(now - grown, _REPORTED_SECONDS),
             times.timed + more,
-            times.late + max(beyond, 0),
+            times.late + beyond,
             max(times.latest, row.latest),
             self._limit,
         )

@@ -269,28 +269,57 @@ async def test_delays_of_a_guard_add_up_over_restarts_of_the_relay_and_of_contro
     assert (times.timed, times.limit) == (10, 0.05)
 
 
+@pytest.mark.parametrize("late", [0, 3])
+@pytest.mark.parametrize("unsaved", [0, 40])
+@pytest.mark.parametrize("restarted", ["control", "relay", "control and relay"])
+async def test_each_tick_counts_once_whatever_restarts(
+    monitors: SpecificationManager, restarted: str, unsaved: int, late: int
+) -> None:
+    store = Settings()
+    orders = orders_of(monitors, store=store)
+    timed(monitors, 100, late, latest=0.03)
+    let_time_pass(60.0)
+    alarms_of(orders)
+    timed(monitors, 100 + unsaved, late, latest=0.03)
+    let_time_pass(59.0)
+    alarms_of(orders)
+    let_time_pass(3.0)
+    trail = FakeTrail()
+    if "control" in restarted:
+        orders = orders_of(monitors, trail, store=store)
+    count = (100 + unsaved, late) if restarted == "control" else (0, 0)
+    for more, alarms in ((0, 0), (20, 0), (30, 1)):
+        timed(monitors, count[0] + more, count[1] + alarms, latest=0.03)
+        assert len(alarms_of(orders)) == alarms
+    lost = unsaved if restarted == "control and relay" else 0
+    times = (await row(orders)).times
+    assert times is not None
+    assert (times.timed, times.late) == (100 + unsaved + 30 - lost, late + 1)
+    assert [record.event for record in trail.records].count("guard late") == ("control" in restarted)
+
+
+def alarms_of(orders: GuardOrders) -> list[str]:
+    orders.look()
+    state = orders.state()
+    assert state is not None
+    return [one.text for one in GUARDS_VIEW.states[0].alarms(state) if one.kind == "guard-late:fence"]
+
+
 async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: SpecificationManager) -> None:
     trail = FakeTrail()
     orders = orders_of(monitors, trail)
-
-    def alarms() -> list[str]:
-        orders.look()
-        state = orders.state()
-        assert state is not None
-        return [one.text for one in GUARDS_VIEW.states[0].alarms(state) if one.kind == "guard-late:fence"]
-
     timed(monitors, 100)
-    assert alarms() == []
+    assert alarms_of(orders) == []
     for second in range(1, 4):
         timed(monitors, 100 + second, late=second, latest=0.04 + second / 1000)
-        found = alarms()
+        found = alarms_of(orders)
     assert found == [
         "the guard fence acted late 3 times in the last minute (limit 20 ms, longest since its relay began 43 ms):"
         " rosrv guard list"
     ]
     assert [record.event for record in trail.records].count("guard late") == 1
     let_time_pass(60.0)
-    assert alarms() == []
+    assert alarms_of(orders) == []
 
 
 async def test_the_heartbeat_is_off_for_the_reason_of_a_relay(monitors: SpecificationManager) -> None:
