@@ -79,7 +79,7 @@ class GuardTimes(msgspec.Struct, frozen=True):
 
 
 class StopReached(msgspec.Struct, frozen=True):
-    """A subscriber of the command to which a proof test wrote the stop.
+    """A subscriber of the command to which a proof test wrote the stop, or a driver that has no connection.
 
     The times are seconds from the fault in real time, or null if it took longer than a second. Whether the node read
     the stop, or obeyed, is not seen.
@@ -112,7 +112,10 @@ class ProofTest(msgspec.Struct, frozen=True):
     cause: Annotated[str, doc("the cause that the copy printed, or empty")]
     after: Annotated[float, doc("seconds of the copy's own time from the fault to that, such as `silent`")]
     seconds: Annotated[float, doc("seconds of real time in which the copy judged the messages of the fault")]
-    reached: Annotated[list[StopReached], doc("the subscribers to which the stop was written")]
+    reached: Annotated[
+        list[StopReached],
+        doc("the subscribers to which the stop was written, and the drivers without a connection"),
+    ]
     not_sent: Annotated[str, doc("why no stop was sent to the driver, or empty")]
     who: Annotated[str, doc("who ordered it")]
 

@@ -164,12 +164,16 @@ class ProofTests:
         return self._graph.name_of(messages[0].key) or "a node"
 
     def _reached(self, found: GuardTested, command: str) -> Iterator[StopReached]:
-        facts = facts_of(self._graph.present())
+        graph = self._graph.present()
+        facts = facts_of(graph)
         drivers = {
             node for fact in facts if fact.name == command for node in RobotGraph(facts, [command]).ends(fact)
         }
         for one in found.reached:
             yield StopReached(one.node, one.host, one.node in drivers, one.accepted, one.acknowledged)
+        hosts = {node.name: node.host for node in graph.nodes}
+        for node in sorted(drivers - {one.node for one in found.reached}) if found.reached else ():
+            yield StopReached(node, hosts.get(node, ""), driver=True, accepted=None, acknowledged=None)
 
     def _keep(self, name: str, test: ProofTest, command: str) -> None:
         self._trail.happened(

@@ -1,17 +1,19 @@
 """`rosrv guard test`: each preset, by its own stimulus, on a copy that leaves the guard in force as it is."""
 
 import contextlib
+import itertools
 import math
 import re
 import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import AsyncMock
 
 import pytest
 
 from appliance.base.withdrawal import WITHDRAWN, WithdrawnError, awaited
-from appliance.channel.answers.graph_answers import Graph, Topic
+from appliance.channel.answers.graph_answers import Graph, Node, Topic
 from appliance.channel.messages import GuardTested, GuardTestWanted, MessageSeen, SubscriberReached
 from appliance.control.errors import SenselessError
 from appliance.features.guards.presets import PRESETS, Guard, text_of, topics_in, types_in, values_in
@@ -261,3 +263,25 @@ async def test_only_a_robot_that_is_known_to_stand_is_tested(
         assert found.proved and found.digest == orders.row("fence").digest
         assert kept_tests(cast(Any, store)) == {"fence": found}
         assert trail.rows[-1]["event"] == "guard tested"
+
+
+@pytest.mark.anyio
+async def test_a_guard_is_proved_only_if_each_registered_driver_acknowledges(tmp_path: Path) -> None:
+    drivers = ("/base", "/horn", "/lights")
+    topics = [example(Topic, name="/cmd_vel", type="geometry_msgs/Twist", subscribers=[*drivers, "/rviz"],
+                      publishers=[{"node": "/teleop", "messages_per_second": 1.0}])]  # fmt: skip
+    nodes = [example(Node, name=node, host="10.0.0.5") for node in drivers]
+    graph: Any = SimpleNamespace(present=lambda: Graph(nodes, topics, []), name_of=lambda _key: "/teleop")
+
+    async with monitors_of(tmp_path) as monitors:
+        for arrived in itertools.chain.from_iterable(itertools.combinations(drivers, n) for n in range(1, 4)):
+            reached = [SubscriberReached(node, "10.0.0.5", 0.001, 0.002) for node in (*arrived, "/rviz")]
+            found = GuardTested(1, "", True, "stopped", 0.1, "why", 0.004, reached)
+            look = AsyncMock(side_effect=[[MessageSeen(1, "k", 0, "", 48, ZERO)], []])
+            relay: Any = SimpleNamespace(look=look, test=AsyncMock(return_value=found))
+            proofs = ProofTests(monitors, orders_of(monitors), {}, graph=graph, relay=relay, trail=FakeTrail(),
+                                store=cast(Any, Settings()))  # fmt: skip
+            test = await proofs.test(GuardTest("fence"), "eve")
+            assert test.proved is (arrived == drivers)
+            rows = [(one.node, one.host) for one in test.reached if one.driver]
+            assert sorted(rows) == [(node, "10.0.0.5") for node in drivers]
