@@ -147,11 +147,13 @@ class SensorWorld(EvidenceWorld):
             self.seeing, self.shown = False, []
             return
         finite = sum(map(math.isfinite, numbers))
-        same = repr(numbers) == repr(self.shown)
+        beyond = {SCAN: (math.inf,), RANGE: (math.inf, -math.inf)}.get(self.by, ())
+        valid = finite + sum(map(numbers.count, beyond))
+        same = repr(numbers) == repr(self.shown) and finite >= 10
         self.repeated = self.repeated + 1 if same else 0
         hears = self.second is None or not self.second.in_doubt
         self.shown = numbers if hears else []
-        self.seeing, self.heard = finite > 0 and finite >= self.least * count, self.now
+        self.seeing, self.heard = valid > 0 and valid >= self.least * count, self.now
         self.say("by", values(self.by, self.now, numbers))
 
     def fit(self) -> str:

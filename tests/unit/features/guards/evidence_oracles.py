@@ -49,14 +49,15 @@ def sensor(seed: int, events: int = 60) -> None:
             node = 4 if chance.random() < 0.04 else 3
             values = list(before)
             if not before or chance.random() < 0.6:
-                values = [1.0 + i * 1e-3] * 10
-                for j in range(chance.choice((0, 0, 0, 4, 5, 9, 10))):
-                    values[j] = chance.choice((math.nan, math.inf, 0.05, 31.0))
+                values = [1.0 + i * 1e-3] * 20
+                for j in range(chance.choice((0, 0, 0, 8, 10, 18, 20))):
+                    values[j] = chance.choice((math.nan, math.inf, -math.inf, 0.05, 31.0))
             data = scan(trace.now, -1, 0.1, 0.1, 30, np.array(values))
             if source.hear(node, trace.now):
-                good = sum(1 for value in values if math.isfinite(value) and 0.1 <= value <= 30)
+                good = sum(1 for value in values if 0.1 <= value <= 30 or value == math.inf)
                 seen = good > 0 and good >= least * len(values)
-                repeated = repeated + 1 if repr(values) == repr(list(before)) else 0
+                known = sum(map(math.isfinite, values))
+                repeated = repeated + 1 if repr(values) == repr(list(before)) and known >= 10 else 0
                 before = tuple(values)
             trace.observe("by", data, node, [round(value, 4) for value in values[:10]])
             fine = seen and (frozen == 0 or repeated < frozen) and source.alone(trace.now, 1000)

@@ -99,6 +99,55 @@ def test_many_values_are_compared_by_their_sum() -> None:
         assert runs(guard, at) == moves
 
 
+HONEST: dict[str, list[dict[str, Any]]] = {
+    "sensor_msgs/LaserScan": [
+        {"range_min": 0.1, "range_max": 10.0, "ranges": [5.0] * seen + [math.inf] * 351} for seen in (0, 9)
+    ],
+    "sensor_msgs/Range": [
+        {"min_range": low, "max_range": 0.8, "range": value}
+        for low in (0.02, 0.8) for value in (0.8, math.inf, -math.inf)
+    ],
+    "sensor_msgs/NavSatFix": [{"latitude": 48.1, "longitude": 11.5, "altitude": math.nan}],
+    "sensor_msgs/Imu": [{"linear_acceleration__z": 9.81}],
+    "nav_msgs/Odometry": [{"pose__pose__position__x": 3.25, "pose__pose__orientation__w": 1.0}],
+    "sensor_msgs/JointState": [{"name": list("abcdef"), "position": [0.5] * 6}],
+}  # fmt: skip
+"""The same message for a minute, by type: of a base that stands, or in open space."""
+
+
+@pytest.mark.parametrize("kind", [kind for kind in PRESETS["sensor"].topics["by"] if kind != "*"])
+def test_an_honest_sensor_of_a_base_that_stands_or_in_open_space_stops_nothing(kind: str) -> None:
+    for given in HONEST[kind]:
+        guard, data = Guarded("sensor", {"by": kind}), message(kind, **given)
+        for at in range(0, 60_000, 100):
+            guard.tell("by", data, at)
+        assert runs(guard, 60_000), given
+
+
+def test_a_frozen_or_covered_scanner_stops() -> None:
+    for ranges in (
+        [5.0] * 10 + [math.inf] * 350,
+        [5.0] * 360,
+        [0.0] * 360,
+        [math.nan] * 360,
+        [-math.inf] * 360,
+    ):
+        guard = Guarded("sensor")
+        for at in range(0, 3000, 100):
+            guard.tell(
+                "by", message("sensor_msgs/LaserScan", range_min=0.1, range_max=10.0, ranges=ranges), at
+            )
+        assert not runs(guard, 3000), ranges[:11]
+
+
+@pytest.mark.parametrize("charge", [0.2, 1.0, 12.5 / 11.1])
+def test_a_battery_may_be_reported_by_its_voltage(charge: float) -> None:
+    for most in (1, 1.3):
+        guard = Guarded("ready", most=most)
+        guard.tell("by", message("sensor_msgs/BatteryState", percentage=charge), 1)
+        assert runs(guard, 2) == (charge <= most)
+
+
 @pytest.mark.parametrize("kind", ["sensor_msgs/Joy", "std_msgs/Header"])
 def test_only_the_silence_of_any_other_type_is_judged(kind: str) -> None:
     """A joystick at rest repeats its values; a broken link is silent."""
