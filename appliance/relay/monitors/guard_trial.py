@@ -28,6 +28,7 @@ from appliance.channel.messages import (
     SubscriberReached,
 )
 from appliance.relay.loop import EventLoop, WorkBeside
+from appliance.relay.monitors.observer import own_cause
 from rosmop.run.outcomes import NOBODY, MessageSender, Outcome
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def tried(
         act, cause = "", ""
         for outcome in copy.go_on(number):
             act = act or copy.act(outcome, message.topic)
-            cause = next((line.text.removeprefix("stopped: ") for line in outcome.log), cause)
+            cause = own_cause(outcome, wanted.monitor) or cause
         if number < wanted.fault:
             passed = not act if message.topic == wanted.command else passed
         elif act:

@@ -228,7 +228,7 @@ class Observer:
         assert self._monitors is not None  # noqa: S101  they have stopped it
         instance = self._monitors.monitor(monitor)
         faults = [fault.text for fault in outcome.faults if fault.monitor == monitor]
-        own = _own_cause(outcome, monitor)
+        own = own_cause(outcome, monitor)
         if faults:
             return f"a message of {topic} could not be judged: {faults[-1]}"
         if instance.held or instance.broken:
@@ -317,7 +317,7 @@ class Observer:
         if len(self._stopping) >= _MAX_STOPPING:
             self._stopping.clear()
         self._stopping[events, point] = safe
-        explained = safe and _own_cause(outcome, _monitor(events[-1]))
+        explained = safe and own_cause(outcome, _monitor(events[-1]))
         if point in self._second.shown and not explained:
             self._again[events, point, safe] = self._again.get((events, point, safe), 0) + 1
             return
@@ -533,7 +533,7 @@ def refusal(outcome: Outcome, part: str) -> str:
     return f"the {part} is dropped by the monitor {outcome.dropped_by}{said}"
 
 
-def _own_cause(outcome: Outcome, monitor: str) -> str:
+def own_cause(outcome: Outcome, monitor: str) -> str:
     """Return the last line of a monitor in an outcome, of those with a cause if there are any."""
     lines = [line.text for line in outcome.log if line.monitor == monitor]
     causes = [line.removeprefix(CAUSE) for line in lines if line.startswith(CAUSE)]

@@ -106,6 +106,8 @@ def test_a_copy_passes_the_honest_motion_and_acts_at_the_fault(
     test = stimulus_of(text, preset)
     found, _quiet = outcome_of(text, test, topics_in(text)["command"])
     assert (found.why, found.passed, found.act) == ("", True, act)
+    if act == "stopped" and found.cause:  # as in the records: the line of the stop, and no other one
+        assert f'"{found.cause}' not in text
 
 
 def test_the_guard_in_force_gets_no_message_of_a_test_and_nothing_is_published() -> None:
@@ -277,7 +279,7 @@ async def test_a_guard_is_proved_only_if_each_registered_driver_acknowledges(tmp
         for arrived in itertools.chain.from_iterable(itertools.combinations(drivers, n) for n in range(1, 4)):
             reached = [SubscriberReached(node, "10.0.0.5", 0.001, 0.002) for node in (*arrived, "/rviz")]
             found = GuardTested(1, "", True, "stopped", 0.1, "why", 0.004, reached)
-            look = AsyncMock(side_effect=[[MessageSeen(1, "k", 0, "", 48, ZERO)], []])
+            look = AsyncMock(side_effect=[[MessageSeen(1, "k", 0, "", 48, {**ZERO})], []])
             relay: Any = SimpleNamespace(look=look, test=AsyncMock(return_value=found))
             proofs = ProofTests(monitors, orders_of(monitors), {}, graph=graph, relay=relay, trail=FakeTrail(),
                                 store=cast(Any, Settings()))  # fmt: skip
