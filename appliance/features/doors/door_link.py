@@ -42,7 +42,7 @@ class TypesGiven(Message, frozen=True):
 
 
 class PolicyChanged(Message, frozen=True):
-    """A new policy is in force, which may allow requests that were denied."""
+    """Rights changed, so that requests that were denied may be allowed: by a policy, an hour, an approval or a host."""
 
 
 class BlocksGiven(Message, frozen=True):

@@ -81,13 +81,13 @@ class DoorProcesses:
         self._numbers = itertools.count(1)  # none is used twice, also after hosts were forgotten
         self._settings = core.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._revision = core.policy.revision
         self._slots = [
             _Slot(Link(partial(self._heard, number), partial(self._lost, number)))
             for number in range(MAX_DOORS)
         ]
         for number, slot in enumerate(self._slots):
             core.links.attach(ROLE, slot.link, door_link.DoorLink, index=number, longest=_LONGEST)
+        core.policy.on_change(self._policy_changed)
         host = core.settings.listen_address[0]
         self._appliance = self._settings.gateway if host in _EVERYWHERE else host
 
@@ -249,12 +249,14 @@ class DoorProcesses:
                 yield f"{counted(count, 'connection')} to the door {row.name}"
 
     def define(self) -> None:
-        changed, self._revision = self._revision != self._core.policy.revision, self._core.policy.revision
         for slot in self._slots:
             if slot.started:
                 self._define(slot)
-                if changed:
-                    self._send(slot, door_link.PolicyChanged())
+
+    def _policy_changed(self) -> None:
+        for slot in self._slots:
+            if slot.started:
+                self._send(slot, door_link.PolicyChanged())
 
     def _define(self, slot: _Slot) -> None:
         now = self._core.specifications.sources.definitions

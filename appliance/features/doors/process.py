@@ -285,9 +285,7 @@ class DoorProcess:
             case door_link.TypesGiven(definitions):
                 self._define(definitions)
             case door_link.PolicyChanged():
-                if self._door is not None:
-                    self._door.lookout.policy_changed()
-                    self._door.node.policy_changed()
+                self._policy_changed()
             case door_link.BlocksGiven(hosts):
                 self._block(hosts)
             case door_link.DoorEnded():
@@ -312,10 +310,14 @@ class DoorProcess:
 
     def _block(self, hosts: list[str]) -> None:
         self._blocked = frozenset(hosts)
-        if self._door is not None:
-            self._door.node.policy_changed()  # the door itself may be blocked
+        self._policy_changed()  # the door itself may be blocked
         for client in [one for one in self._clients if one.peer in self._blocked]:
             client.session.revoke(_BLOCKED)
+
+    def _policy_changed(self) -> None:
+        if self._door is not None:
+            self._door.lookout.policy_changed()
+            self._door.node.policy_changed()
 
     def _end_tickets(self, ended: Callable[[str], bool], *, replaced: bool = False) -> None:
         self._tickets = Counter({one: count for one, count in self._tickets.items() if not ended(one)})

@@ -105,9 +105,9 @@ class DoorSite:
         self.core.specifications.now = InForce(sources=Sources(definitions=definitions))
         self.processes.define()
 
-    def load_policy(self, revision: int) -> None:
-        self.policies.in_force = self.policies.in_force._replace(revision=revision)
-        self.processes.define()
+    def change_rights(self) -> None:
+        for listener in self.core.policy.listeners:
+            listener()
 
 
 async def settled() -> None:

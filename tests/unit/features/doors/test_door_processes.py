@@ -74,7 +74,7 @@ async def test_a_process_that_does_not_end_in_time_is_killed_once(site: DoorSite
         await site.loses()
     elif loses == "patience":
         site.fill()
-        site.load_policy(8)
+        site.change_rights()
     else:
         await site.hears(door_link.DoorStarted("bob", 1.0, True))
     assert asked(4.0) == []
@@ -122,11 +122,11 @@ async def test_a_process_gets_the_definitions_in_force_before_its_door_and_each_
     assert [getattr(one, "definitions", None) for one in site.sent] == [{"own/Add.srv": "---"}, None, {}]
 
 
-async def test_a_process_learns_of_another_policy_once(site: DoorSite) -> None:
+async def test_a_process_learns_of_each_change_of_rights(site: DoorSite) -> None:
+    """Most change without another revision: by hours, dates, approvals and hosts."""
     await site.hears(NEW)
     site.sent.clear()
-    for revision in (0, 8, 8):
-        site.load_policy(revision)
+    site.change_rights()
     await settled()
     assert site.sent == [door_link.PolicyChanged()]
 

@@ -8,6 +8,7 @@ import pytest
 from appliance.features.doors import door_link, process
 from appliance.features.doors.connections import DoorConnections
 from appliance.features.doors.door_node import DoorNode
+from appliance.features.doors.lookout import Lookout
 from tests.support.features.doors.door_world import DOOR, WebSocketClient
 from tests.support.memory_network import MemoryNetwork
 
@@ -129,4 +130,20 @@ async def test_a_visit_that_a_newer_one_replaces_leaves_its_wills(
     assert ("the ticket is over" in await client.closed()) is not replaced
     await asyncio.sleep(3)
     assert published == [replaced]
+    await control.end()
+
+
+@pytest.mark.parametrize("message", [door_link.PolicyChanged(), door_link.BlocksGiven([]), GIVEN])
+async def test_denials_are_asked_about_again_after_each_change_of_rights(
+    monkeypatch: pytest.MonkeyPatch, message: Any
+) -> None:
+    """A control that starts again sends the door, because rights may have changed while it was down."""
+    control, asked = Control(monkeypatch), list[bool]()
+    monkeypatch.setattr(Lookout, "policy_changed", lambda _lookout: asked.append(True))
+    control.say(GIVEN)
+    control.starts.set()
+    await asyncio.sleep(3)
+    before = len(asked)
+    control.say(message)
+    assert len(asked) == before + 1
     await control.end()
