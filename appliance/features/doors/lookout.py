@@ -17,16 +17,14 @@ from typing import Literal, NamedTuple, Protocol
 from appliance.features.doors.known_types import KnownType, KnownTypes
 from appliance.features.doors.rosapi import Sight
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic, VisibleGraph
-from roswire.errors import DefinitionError, LimitExceededError, RosError
+from roswire.errors import DefinitionError, RosError
 from roswire.node import MasterDenialError
 from roswire.node.network import PeerUnreachableError
 
 _FRESH_SECONDS = 1.0
 _MAX_PROBES = 50  # topics and services that one look asks about
 _PROBE_SECONDS = 1.0
-_AGAIN_SECONDS = (
-    10.0  # after which a node is asked again that did not answer, or for which the door had no slot
-)
+_AGAIN_SECONDS = 10.0  # after which a node that failed is asked again, and one for which the door had no slot
 _MAX_ROUNDS = 20  # of looks for one answer about all services
 
 _Thing = tuple[Literal["topic", "service"], str]
@@ -140,11 +138,10 @@ class Lookout:
         try:
             known = await (self._door.learn(name) if kind == "topic" else self._probe(name))
             self._asked[thing] = _Asked(nodes, now(), known)
-        except (PeerUnreachableError, LimitExceededError):
+        except MasterDenialError:
+            self._asked[thing] = _Asked(nodes, now(), denied=policy)
+        except RosError:  # a node that is started again has the same name
             self._asked[thing] = _Asked(nodes, now(), again=now() + _AGAIN_SECONDS)
-        except RosError as error:
-            denied = policy if isinstance(error, MasterDenialError) else None
-            self._asked[thing] = _Asked(nodes, now(), denied=denied)
 
     async def _probe(self, service: str) -> str:
         try:

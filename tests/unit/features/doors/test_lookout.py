@@ -13,8 +13,9 @@ from appliance.features.doors.rosapi import Rosapi
 from appliance.features.doors.surroundings import VisibleGraph
 from appliance.features.doors.values import ValueLimits
 from roswire.definitions import Definitions
+from roswire.errors import DefinitionError, LimitExceededError, ProtocolError, RosError
 from roswire.node import MasterDenialError
-from roswire.node.network import PeerUnreachableError
+from roswire.node.network import PeerUnreachableError, ServiceFailedError
 from roswire.standard import standard_definitions
 from roswire.xmlrpc import Value
 
@@ -35,6 +36,7 @@ class Robot:
         self.types = KnownTypes(standard_definitions(), ValueLimits())
         self.asked: list[str] = []
         self.denied = {"/robot/denied"}
+        self.failure: RosError | None = None
         guests = {f"/a_guest/{number:03}": [f"/guest_{number % hosts}"] for number in range(400)}
         own = {f"/robot/{number:02}": ["/base"] for number in range(60)} | {"/robot/denied": ["/base"]}
         names = guests | own
@@ -54,6 +56,8 @@ class Robot:
 
     async def _answer(self, name: str) -> None:
         self.asked.append(name)
+        if self.failure is not None:
+            raise self.failure
         if name in self.denied:
             raise MasterDenialError(f"{name} is denied (site.ini:4)")
         if name.startswith("/a_guest"):
@@ -118,6 +122,43 @@ async def test_a_new_name_of_the_robot_is_asked_about_in_the_next_look() -> None
     robot.graph_now.types["/robot/new"] = "own/Load"  # type: ignore[index]  # a mapping of the test
     await robot.lookout.look()
     assert "/robot/new" in robot.asked[before : before + 2]
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        PeerUnreachableError("refuses the connection"),
+        LimitExceededError("no slot"),
+        ProtocolError("closes the connection, or answers with an error"),
+        ServiceFailedError("starts"),
+        DefinitionError("cannot be read", "own/Load"),
+        MasterDenialError("denied (site.ini:4)"),
+    ],
+    ids=lambda failure: type(failure).__name__,
+)
+@pytest.mark.parametrize("kind", ["topic", "service"])
+async def test_a_failure_at_the_first_look_is_not_kept(kind: str, failure: RosError) -> None:
+    """A node that is started again has the same name."""
+    robot = Robot(kind, 1)
+    robot.denied = set()
+    names = {"/robot/late": ["/base"]}
+    robot.graph_now = VisibleGraph(
+        publishers=names if kind == "topic" else {},
+        subscribers={},
+        services=names if kind == "service" else {},
+        types={"/robot/late": "own/Load"} if kind == "topic" else {},
+    )
+    robot.failure = failure
+    before = await robot.lookout.look()
+    assert not [*before.topics, *before.services]
+    robot.failure = None
+    if isinstance(failure, MasterDenialError):
+        robot.lookout.policy_changed()
+    await asyncio.sleep(11)
+    seen = await robot.lookout.look()
+    assert len([*seen.topics, *seen.services]) == 1
+    if kind == "service":
+        assert await robot.lookout.service_types() == {"/robot/late": "std_srvs/Trigger"}
 
 
 async def test_services_are_found_by_their_type_although_some_are_denied_or_silent() -> None:
