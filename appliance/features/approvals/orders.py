@@ -153,11 +153,16 @@ class ApprovalOrders:
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
-        """Approve a held call, or give an approval a new time."""
+        """Approve a held call, or give an approval a new time. A refusal is replaced only by its own person."""
         entry = self._entry(request.number)
         seconds = request.seconds
-        if request.waits and entry.state is not ApprovalState.WAITS:
-            raise SenselessError(f"approval {entry.number} is already {entry.state} by {entry.who}")
+        refused = entry.state is ApprovalState.REFUSED
+        another = entry.who != who or who == OPERATOR  # which everyone on the machine is
+        if (request.waits and entry.state is not ApprovalState.WAITS) or (refused and another):
+            again = (
+                f": it may be asked for again in {self._table.seconds_left(entry):.0f} s" if refused else ""
+            )
+            raise SenselessError(f"approval {entry.number} is already {entry.state} by {entry.who}{again}")
         if seconds is None and entry.for_some_time and entry.call.category is Category.CALL:
             raise SenselessError(
                 f"approval {entry.number} is for some time: give its new time with --for, or run:"

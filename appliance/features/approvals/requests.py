@@ -76,7 +76,10 @@ class ApproveCall(WaitingRequest[Approval], frozen=True, tag="approve"):
         doc("for all calls of the same host and name in this time, with any arguments"),
     ] = None
     waits: Annotated[
-        bool, doc("approve only a call that still waits, so that no answer of another operator is replaced")
+        bool,
+        doc(
+            "approve only a call that still waits; otherwise also one that is approved, or that the same person refused"
+        ),
     ] = False
 
 

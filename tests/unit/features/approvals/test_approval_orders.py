@@ -187,7 +187,7 @@ class Promises:
         if (key := self.key(number)) is None:
             return "rosrv approve lists all"
         one, is_call = self.held[key], key[1] is Category.CALL
-        if waits and one.state != "waits":
+        if (waits and one.state != "waits") or (one.state == "refused" and not one.who == who != "operator"):
             return f"is already {'approved' if one.tokens else 'refused'} by {one.who}"
         if seconds is None and one.state == "lease" and is_call:
             return "is for some time"
