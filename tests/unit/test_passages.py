@@ -7,6 +7,12 @@ from tests.support.sources import ROOT
 
 PAGE = (ROOT / "docs/dev/passages.md").read_text(encoding="utf-8")
 SECTIONS = dict(re.findall(r"^## (.+)\n((?:(?!## ).*\n)*)", PAGE, re.MULTILINE))
+THINGS = (
+    "Firewall rules", "Translations of `isolation: netns`", "Open connections", "Lists of publishers at nodes",
+    "Registrations at RVMaster", "Registrations at the robot's own master", "Types at doors", "Grants in relays",
+    "Sources awaited by monitors", "Leases of groups", "The lease of a pair", "Approvals", "Counters", "Timers",
+    "Threads", "Sockets", "Certificates", "The program's own log",
+)  # fmt: skip
 MOMENTS = (
     "first use", "a second one", "late", "lost and back", "replaced", "twice at once", "too slow", "hostile first",
     "restarted", "taken over", "full and free",
@@ -16,6 +22,10 @@ MOMENTS = (
 @cache
 def names_in(file: str) -> frozenset[str]:
     return frozenset(re.findall(r"def (test_\w+)\(", (ROOT / "tests" / file).read_text(encoding="utf-8")))
+
+
+def test_the_page_has_each_thing_that_the_appliance_keeps_for_others() -> None:
+    assert tuple(SECTIONS) == THINGS
 
 
 @pytest.mark.parametrize("thing", SECTIONS)
