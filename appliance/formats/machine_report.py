@@ -302,11 +302,11 @@ class Reading(msgspec.Struct, kw_only=True):
     """The records of a machine, read for a period.
 
     `places` are the address and port of each door at the end of the log; `settings` are those of the last start that
-    listed them, by section and name.
+    listed them, by section and name; None without one.
     """
 
     places: dict[str, str] = {}
-    settings: Mapping[str, Mapping[str, str]] = {}
+    settings: Mapping[str, Mapping[str, str]] | None = None
     interventions: list[Intervention] = []
     switched_off: list[LastingState] = []
     blocks: list[LastingState] = []

@@ -79,18 +79,23 @@ def interfaces(
         f"{sum(token.role == role for token in usable)} {role}"
         for role in ("viewer", "investigator", "operator", "admin")
     )
-    yield MachineInterface(
-        name="REST and console", where="api of appliance.yaml", commands="orders of the token's or person's role",
-        protection=f"TLS; tokens: {by_role}; single sign-on: {_sign_on(records).get('issuer', 'off')}",
-    )  # fmt: skip
+    if any(process["role"] == "api" for process in status["processes"]):
+        issuer = _sign_on(records).get("issuer", "off")
+        sign_on = issuer if records.settings is not None else "unknown: the log has no start"
+        yield MachineInterface(
+            name="REST and console", where="api of appliance.yaml", commands="orders of the token's or person's role",
+            protection=f"TLS, unless api_tls is off; tokens: {by_role}; single sign-on: {sign_on}",
+        )  # fmt: skip
     yield MachineInterface(
         name="admin socket", where="the appliance's machine", commands="all orders",
-        protection="permissions of the file: root and the appliance's group",
+        protection="permissions of the file: root",
     )  # fmt: skip
     for door in (status.get("doors") or {}).get("doors", ()):
+        place = records.places.get(door["name"], "see `rosrv door list`")
+        entry = "a ticket" if ", port none, " in place else "a ticket; at its own port only the address"
         yield MachineInterface(
-            name=f"door {door['name']}", where=records.places.get(door["name"], "see `rosrv door list`"),
-            commands="what the policy grants its name", protection="a ticket; the policy; monitors of its topics",
+            name=f"door {door['name']}", where=place, commands="what the policy grants its name",
+            protection=f"{entry}; the policy; monitors of its topics",
         )  # fmt: skip
     tunnels = status["ipsec"]
     if tunnels["esp"] is not None:
@@ -116,7 +121,7 @@ def rights(
 
     keys = in_force.site_keys
     signed = f", signed by one of {counted(len(keys), 'site key')}" if keys else ""
-    yield MachineRight(what="every order", who="root and the appliance's group", by="the appliance's machine")
+    yield MachineRight(what="every order", who="root", by="the appliance's machine")
     yield MachineRight(
         what=f"change policies, monitors and guards{signed}", who=holders("admin"), by="token, role admin"
     )
@@ -148,14 +153,14 @@ def rights(
 
 
 def _ends(policy: Policy) -> Iterator[MachineRight]:
-    for rule in policy.rules(Category.COMMAND):
-        if rule.key is None or rule.key.text == "shutdown":
-            yield MachineRight(what=f"{_STOP}: end a node", who=rule.shown, by=rule.place)
+    rules = {"" if rule.key is None else rule.key.text: rule for rule in policy.rules(Category.COMMAND)}
+    if rule := rules.get("shutdown") or rules.get(""):
+        yield MachineRight(what=f"{_STOP}: end a node", who=rule.shown, by=rule.place)
 
 
 def _sign_on(records: Reading) -> Mapping[str, str]:
     """Return the settings of single sign-on; empty if it is off, or if an earlier version wrote the log."""
-    return records.settings.get("sso", {})
+    return (records.settings or {}).get("sso", {})
 
 
 _VERIFY, _VERIFY_BOTH = "rosrv audit verify", "rosrv audit verify --other DIR"

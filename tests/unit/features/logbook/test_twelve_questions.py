@@ -16,11 +16,13 @@ from appliance.features.logbook import report_verb
 from appliance.formats.machine_report import (
     MachineReport,
     Period,
+    Reading,
     ReportedLog,
     merged,
     read_records,
 )
 from appliance.formats.report_words import page
+from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy_compiler import compile_policy
 
 POLICY = """[Groups]
@@ -43,6 +45,7 @@ shutdown = robot
 default = robot joystick
 """
 STATUS: dict[str, Any] = {
+    "processes": [{"role": "control"}, {"role": "api"}], "standby": {},
     "master": "http://10.0.0.2:11311", "policy": {"audit_only": []}, "blocks": {"hosts": 1},
     "monitors": {"enabled": 2, "loaded": 3}, "relaying": "on", "isolation": "netns",
     "doors": {"doors": [{"name": "agent"}]}, "ipsec": {"esp": "kernel", "enrolled": 2, "key_exchange": ["x25519"]},
@@ -136,17 +139,19 @@ class Page(HTMLParser):
         return "\n".join(" | ".join(row) for row in self.rows(title))
 
 
+TOKENS = Tokens([
+    Token(name="ann", role="operator", id="1", created=0.0, expires=1.0, revoked=None),
+    Token(name="root", role="admin", id="2", created=0.0, expires=1.0, revoked=None),
+], uses_since=0.0)  # fmt: skip
+IN_FORCE = PolicyInForce(
+    revision=2, text=POLICY, file="robot.ini", policy_file="robot.ini", differs_from_file=False, warnings=[],
+    confirm_by=None, site_keys=[], robot=["10.0.0.2/32"], hosts={"tablet": "10.77.0.5"}, loaded=0.0, who="eve",
+    note="", in_force=True, signature="",
+)  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def found() -> Page:
-    tokens = Tokens([
-        Token(name="ann", role="operator", id="1", created=0.0, expires=1.0, revoked=None),
-        Token(name="root", role="admin", id="2", created=0.0, expires=1.0, revoked=None),
-    ], uses_since=0.0)  # fmt: skip
-    in_force = PolicyInForce(
-        revision=2, text=POLICY, file="robot.ini", policy_file="robot.ini", differs_from_file=False, warnings=[],
-        confirm_by=None, site_keys=[], robot=["10.0.0.2/32"], hosts={"tablet": "10.77.0.5"}, loaded=0.0, who="eve",
-        note="", in_force=True, signature="",
-    )  # fmt: skip
     policy = compile_policy(POLICY, file="robot.ini", robot=[ipaddress.ip_address("10.0.0.2")])
     period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
     read = read_records(merged({"": entries()}), period)
@@ -167,8 +172,8 @@ def found() -> Page:
         until_utc="2026-05-04T00:00:00.000000000Z",
         made_utc="2026-05-04T08:00:00.000000000Z", version="0.5.0", verify="rosrv audit verify",
         interventions=read.interventions, switched_off=read.switched_off, blocks=read.blocks, software=read.software,
-        drivers=read.drivers, interfaces=list(report_verb.interfaces(STATUS, in_force, tokens, read)),
-        rights=list(report_verb.rights(policy, in_force, tokens, read)), live_reason="", gaps=read.gaps,
+        drivers=read.drivers, interfaces=list(report_verb.interfaces(STATUS, IN_FORCE, TOKENS, read)),
+        rights=list(report_verb.rights(policy, IN_FORCE, TOKENS, read)), live_reason="", gaps=read.gaps,
     )  # fmt: skip
     return Page(page(made))
 
@@ -216,6 +221,53 @@ def test_the_page_says_which_interfaces_take_commands_and_what_protects_each(fou
     assert all(row[3] for row in rows)
     (door,) = (row for row in rows if row[0] == "door agent")
     assert door[1] == "address 10.78.0.1, port 9091, from 10.0.0.20"
+
+
+ABSENT: dict[str, dict[str, Any]] = {
+    "REST and console": {"processes": [{"role": "control"}]},
+    "door agent": {"doors": None},
+    "IPsec tunnels": {"ipsec": {"esp": None}},
+    "the other appliance and the witness": {"standby": None},
+}
+
+
+@pytest.mark.parametrize("name", ABSENT)
+def test_an_interface_that_is_off_is_not_named(name: str) -> None:
+    named = [
+        {one.name for one in report_verb.interfaces(status, IN_FORCE, TOKENS, Reading())}
+        for status in (STATUS, STATUS | ABSENT[name])
+    ]
+    assert named[0] - named[1] == {name}
+
+
+@pytest.mark.parametrize(("port", "free"), [(None, False), (9091, True)])
+def test_a_door_is_named_with_its_port_that_needs_no_ticket(port: int | None, free: bool) -> None:
+    detail = {"address": "10.78.0.1", "port": port, "source": None}
+    record = AuditRecord(id="1", time=1, event="door added", resource="agent", detail=detail)
+    read = read_records(merged({"": [LogEntry(1, record)]}), Period(0, 9))
+    (door,) = (
+        one for one in report_verb.interfaces(STATUS, IN_FORCE, TOKENS, read) if one.name == "door agent"
+    )
+    assert door.protection.startswith("a ticket") and ("at its own port" in door.protection) is free
+    (rest,) = (one for one in report_verb.interfaces(STATUS, IN_FORCE, TOKENS, read) if "REST" in one.name)
+    assert rest.protection.endswith("single sign-on: unknown: the log has no start")
+
+
+@pytest.mark.parametrize("own", ["shutdown = robot\n", "shutdown = joystick\n", ""])
+def test_the_right_to_end_a_node_names_the_hosts_that_the_policy_allows(own: str) -> None:
+    text = POLICY.replace("shutdown = robot\n", own)
+    policy = compile_policy(text, file="robot.ini", robot=[ipaddress.ip_address("10.0.0.2")])
+    rows = [
+        row
+        for row in report_verb.rights(policy, IN_FORCE, TOKENS, Reading())
+        if row.what.endswith("end a node")
+    ]
+    hosts = {"robot": "10.0.0.2", "joystick": "10.0.0.5"}
+    assert {name for name in hosts if any(name in row.who for row in rows)} == {
+        name
+        for name, host in hosts.items()
+        if policy.decide(Request(address_of(host), "", Category.COMMAND, "shutdown")).allowed
+    }
 
 
 def test_the_page_says_who_drove_at_14_03(found: Page) -> None:
