@@ -219,6 +219,12 @@ class Runs:
         return after < len(self.last) and self.first[after] <= last
 
 
+CHANGED = "the bundle was changed after the export"
+UNSIGNED = "it is not signed with this key: the key is of another appliance, or the bundle was made again"
+REWRITTEN = "a checkpoint differs from the one kept elsewhere: the log was rewritten, or the kept one was"
+FOREIGN = "the checkpoints kept elsewhere are of other logs, so they prove nothing about this one"
+
+
 class Verifier:
     """The verification of a bundle: its faults (`findings`), and the claims that it does not prove (`notes`)."""
 
@@ -234,7 +240,8 @@ class Verifier:
         self.sums: dict[str, str] = {}  # of the members
         self.loads: dict[str, str | None] = {}  # the hash in the log of each loaded file or folder
         self.revisions: set[int | None] = set()  # revisions of the policies that decided
-        self.checkpoints = self.agreeing = 0
+        self.causes: dict[str, str] = {}  # of findings about something else than a change of the bundle
+        self.checkpoints = self.signed = self.agreeing = 0
 
     def read_key(self, key: Path | None) -> str:
         with regular(key) if key else self.open("audit.pub") as file:
@@ -252,6 +259,18 @@ class Verifier:
                 look()
             except Exception as error:  # the file may contain anything
                 self.findings.append(f"{what}: cannot be read: {type(error).__name__} {error}")
+
+    def verdict(self) -> str:
+        if not self.findings:
+            return "valid: the bundle is unchanged since the appliance sealed it"
+        causes = {self.causes.get(finding, CHANGED) for finding in self.findings}
+        if CHANGED in causes or (UNSIGNED in causes and self.signed):
+            return f"invalid: {CHANGED}"
+        return f"invalid: {'; '.join(sorted(causes))}"
+
+    def blame(self, cause: str, finding: str) -> None:
+        self.findings.append(finding)
+        self.causes[finding] = cause
 
     def read(self, name: str) -> bytes:
         with self.open(name) as file:
@@ -320,7 +339,7 @@ class Verifier:
             records = "record of its runs is" if missing == 1 else "records of its runs are"
             self.findings.append(f"records.ndjson: {missing} {records} missing")
         if self.copies and self.manifest["log"] not in {log for log, _number in self.copies}:
-            self.findings.append("the checkpoints kept elsewhere: are of other logs, and none of this one")
+            self.blame(FOREIGN, "the checkpoints kept elsewhere: are of other logs, and none of this one")
         first, last = runs.first[0], runs.last[-1]
         if not beside[first - 1] and first > 1:
             self.notes.append(f"records before {first}: removed by retention")
@@ -397,14 +416,16 @@ class Verifier:
             self.findings.append(
                 f"checkpoint {number}: does not seal the records up to {walk.sequence} of this bundle"
             )
-        if not self.is_signed(given) or {*given} - {*Checkpoint._fields, "signature", "key"}:
-            self.findings.append(f"checkpoint {number}: is not signed with the key")
+        signed = self.is_signed(given)
+        if not signed or {*given} - {*Checkpoint._fields, "signature", "key"}:
+            self.blame(UNSIGNED, f"checkpoint {number}: is not signed with the key")
         copies = self.copies.get((self.manifest["log"], number), [])
         for copy in copies:
             if stated(copy) != stated(given):
                 but = "" if self.is_signed(copy) else ", which is not signed with the key"
-                self.findings.append(f"checkpoint {number}: differs from the one kept elsewhere{but}")
-        self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + bool(copies)
+                self.blame(REWRITTEN, f"checkpoint {number}: differs from the one kept elsewhere{but}")
+        self.checkpoints, self.signed = self.checkpoints + 1, self.signed + signed
+        self.agreeing += any(stated(copy) == stated(given) for copy in copies)
 
     def is_signed(self, given: dict[str, Any]) -> bool:
         made = stated(given)
@@ -488,8 +509,7 @@ def main(arguments: list[str]) -> int:
     print(
         f"key {verifier.raw_key}{'' if given.key else ', from the bundle: compare it with a copy kept elsewhere'}"
     )
-    valid = "valid: the bundle is unchanged since the appliance sealed it"
-    print("invalid: the bundle was changed after the export" if findings else valid)
+    print(verifier.verdict())
     return 1 if findings else 0
 
 

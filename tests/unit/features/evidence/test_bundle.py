@@ -522,6 +522,9 @@ def test_a_bundle_of_another_key_is_invalid(
     unknown = Reviewer(capsys, place)
     assert unknown.status(bundle) == 1
     assert "is not signed with the key" in unknown.said
+    assert unknown.said.splitlines()[-1] == f"invalid: {bundle_verifier.UNSIGNED}"
+    assert unknown.status(written(lines(members_of(bundle), _hide), tmp_path / "x.zip")) == 1
+    assert unknown.said.splitlines()[-1] == f"invalid: {bundle_verifier.CHANGED}"
 
 
 @pytest.mark.nightly
@@ -542,6 +545,7 @@ def test_copied_checkpoints_show_a_rewritten_history(
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
     assert reviewer.status(bundle, "--checkpoints", kept) == 1
     assert "differs from the one kept elsewhere, which is not signed with the key" in reviewer.said
+    assert re.search(r"^0 of \d+ checkpoints were also kept elsewhere$", reviewer.said, re.MULTILINE)
 
 
 Copies = list[dict[str, Any]]
@@ -584,6 +588,11 @@ def test_kept_checkpoints_have_one_verdict(
     found = verify(control.log.path, key.public_key().public_bytes_raw(), copies=read_copies(place)).findings
     assert bool(found) is (kept.startswith("forged") or kept == "other log alone")
     assert reviewer.status(bundle, "--checkpoints", place) == bool(found), reviewer.said
+    cause = bundle_verifier.REWRITTEN if kept.startswith("forged") else bundle_verifier.FOREIGN
+    unchanged = "valid: the bundle is unchanged since the appliance sealed it"
+    assert reviewer.said.splitlines()[-1] == (f"invalid: {cause}" if found else unchanged)
+    counted = re.search(r"(\d+) of (\d+) checkpoints? w", reviewer.said)
+    assert counted and (counted[1] == counted[2]) is (kept not in {"other log alone", "torn at the end"})
 
 
 @pytest.mark.nightly
