@@ -75,7 +75,7 @@ def message_through_the_relay(master: str) -> bytes:
             call(master, "registerPublisher", _PUBLISHER, TOPIC, _TYPE, publisher.uri)
             places = call(master, "registerSubscriber", _SUBSCRIBER, TOPIC, _TYPE, subscriber.uri)
             if not places:
-                raise ProbeError(f"RVMaster lists no publisher of {TOPIC} to the subscriber")
+                raise OSError(f"RVMaster lists no publisher of {TOPIC} to the subscriber")
             return _receive(places[0])
         finally:
             with contextlib.suppress(OSError, ProbeError):
@@ -85,8 +85,10 @@ def message_through_the_relay(master: str) -> bytes:
 
 
 def _receive(uri: str) -> bytes:
-    protocol = call(uri, "requestTopic", _SUBSCRIBER, TOPIC, [["TCPROS"]])
-    _name, host, port = protocol
+    try:
+        _name, host, port = call(uri, "requestTopic", _SUBSCRIBER, TOPIC, [["TCPROS"]])
+    except ProbeError as error:  # the policy decided at the registrations
+        raise OSError(str(error)) from error
     with socket.create_connection((host, port), _SECONDS) as sock:
         sock.sendall(encode_header(_fields(_SUBSCRIBER)))
         header, frames = HeaderParser(), FrameParser()
@@ -94,13 +96,13 @@ def _receive(uri: str) -> bytes:
         while True:
             data = sock.recv(65_536)
             if not data:
-                raise ProbeError("the connection was closed before a message came")
+                raise OSError("the connection was closed before a message came")
             if fields is None:
                 fields = header.feed(data)
                 if fields is None:
                     continue
                 if "error" in fields:
-                    raise ProbeError(fields["error"])
+                    raise OSError(fields["error"])
                 data = bytes(header.rest)
             found = frames.feed(data)
             if found:

@@ -1,7 +1,9 @@
 import secrets
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from itertools import chain, islice, repeat
+from types import SimpleNamespace
 from typing import NoReturn
 
 import httpx
@@ -14,6 +16,7 @@ from appliance.channel.answers.status import Status
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.features.selftest import live_checks
+from roswire.tcpros import encode_frame, encode_header
 from tests.support.answers import example
 from tests.support.memory_call import call_of
 from tests.support.memory_rest import page, problem, rest_client
@@ -106,3 +109,56 @@ def test_protection_that_is_off_is_a_warning_and_no_failure() -> None:
     commands = {"rosrv monitor enable gun", "rosrv monitor enable deadman"}
     assert told >= {("warn", command) for command in commands}
     assert not any(outcome == "fail" for outcome, _command in told)
+
+
+MESSAGE = encode_header({"type": "std_msgs/String"}) + encode_frame(b"selftest")
+WAYS: dict[str, tuple[str, bytes | None, str]] = {
+    "a message": ("", MESSAGE, "ok"),
+    "another message": ("", MESSAGE.replace(b"selftest", b"changed!"), "fail"),
+    "the publisher is denied": ("registerPublisher", MESSAGE, "skip"),
+    "the subscriber is denied": ("registerSubscriber", MESSAGE, "skip"),
+    "the relay's place is refused": ("requestTopic", MESSAGE, "fail"),
+    "no publisher": ("no publisher", MESSAGE, "fail"),
+    "an error in the header": ("", encode_header({"error": "too many connections"}), "fail"),
+    "closed": ("", b"", "fail"),
+    "silent": ("", None, "fail"),
+}
+"""By what happens: the call of the master that is refused, and the bytes that the relay sends."""
+
+
+class Relay:
+    """A connection to a relay that sends these bytes and closes it; None: it sends nothing."""
+
+    def __init__(self, sent: bytes | None) -> None:
+        self._sent = sent
+
+    def __enter__(self) -> "Relay":
+        return self
+
+    def __exit__(self, *_error: object) -> None: ...
+
+    def sendall(self, _header: bytes) -> None: ...
+
+    def recv(self, _size: int) -> bytes:
+        if self._sent is None:
+            raise TimeoutError("timed out")
+        sent, self._sent = self._sent, b""
+        return sent
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_only_a_denied_message_is_skipped(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    refused, sent, expected = WAYS[way]
+
+    def call(_uri: str, method: str, *_arguments: object) -> object:
+        if method == refused:
+            raise live_checks.ProbeError("refused")
+        places = [] if refused == "no publisher" else ["http://127.0.0.1:1/"]
+        return {"registerSubscriber": places, "requestTopic": ["TCPROS", "127.0.0.1", 2]}.get(method, 0)
+
+    monkeypatch.setattr(live_checks, "call", call)
+    monkeypatch.setattr(live_checks, "own_address", lambda _master: "127.0.0.1")
+    monkeypatch.setattr(live_checks, "_node", lambda _host: nullcontext(SimpleNamespace(uri="")))
+    monkeypatch.setattr(live_checks, "socket", SimpleNamespace(create_connection=lambda *_place: Relay(sent)))
+    [found] = live_checks._message("http://127.0.0.1:11311")
+    assert found.outcome == expected, found.text
