@@ -58,7 +58,7 @@ class RecordingSummary(Protocol):
     def topics(self) -> Sequence[TopicOfRecording]: ...
 
 
-_MAX_ROWS = 2000
+_MAX_ROWS = 2000  # of one severity and decision, so that no flood of denials hides an alarm
 _SEVERE = ("notice", "warning", "alarm")
 _TITLE = "Evidence of a ROSRV appliance"
 _PROOF = """\
@@ -85,7 +85,7 @@ class Page:
         self._names = names
         self._events: Counter[str] = Counter()
         self._rows: list[str] = []
-        self._left_out = 0
+        self._kinds: Counter[tuple[str, str | None]] = Counter()
 
     def add(self, lines: bytes) -> None:
         for line in lines.splitlines():
@@ -95,8 +95,9 @@ class Page:
         self._events[record["event"]] += 1
         if record["severity"] not in _SEVERE and record["decision"] in (None, "allow"):
             return
-        if len(self._rows) == _MAX_ROWS:
-            self._left_out += 1
+        of_kind = record["severity"], record["decision"]
+        self._kinds.update([of_kind])
+        if self._kinds[of_kind] > _MAX_ROWS:
             return
         kind = record["severity"] if record["decision"] in (None, "allow") else "deny"
         host = record["host"] and self._names.host_in_words(record["host"])
@@ -122,8 +123,12 @@ class Page:
             *self._rows,
             "</table>\n",
         ]
-        if self._left_out:
-            parts.append(f"<p>{self._left_out} more of this kind are in records.ndjson only.</p>\n")
+        for (severity, decision), count in self._kinds.items():
+            if count > _MAX_ROWS:
+                kind = text(" ".join(filter(None, (severity, decision))))
+                parts.append(
+                    f"<p>{count - _MAX_ROWS} more of the kind {kind} are in records.ndjson only.</p>\n"
+                )
         parts.append("<h2>All records by event</h2>\n<table>\n")
         parts += [f"<tr><td>{text(event)}<td>{count}\n" for event, count in sorted(self._events.items())]
         parts.append("</table>\n<h2>Contents of the bundle</h2>\n<table>\n")
