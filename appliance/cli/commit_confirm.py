@@ -1,6 +1,5 @@
 """The verbs for revisions and commit-confirm, for `rosrv policy` and `rosrv monitor`."""
 
-import datetime
 from collections.abc import Callable
 from typing import Annotated, TypeVar
 
@@ -8,6 +7,7 @@ import typer
 
 from appliance.base.actors import actor
 from appliance.base.option_group import GroupedVerb
+from appliance.base.timestamps import local_text
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.connection.target import Appliance, speaks
@@ -96,4 +96,4 @@ def _say_revision(
 
 
 def _time(seconds: float) -> str:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+    return local_text(int(seconds) * 1_000_000_000, digits=0).replace("T", " ")

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from appliance.audit.log.record_format import printable, rfc3339
 from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verification
 from appliance.base.counted import counted
+from appliance.base.timestamps import in_local_zone, local_text
 from appliance.signing.signed_logs import RememberedLog
 
 _BESIDE = (FindingKind.LOG_REPLACED, FindingKind.MEMORY_MISSING)
@@ -13,29 +14,29 @@ _BESIDE = (FindingKind.LOG_REPLACED, FindingKind.MEMORY_MISSING)
 
 def print_verification(result: Verification) -> None:
     for finding in result.findings:
-        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
-    write(
+        _say(f"{finding.kind.value.upper()}: {printable(finding.message)}")
+    _say(
         f"{counted(result.records, 'record')} ({result.first} to {result.last}), log {printable(result.log)}"
     )
     if result.removed:
-        write(f"records up to {result.removed} were removed by retention, as recorded{_vouched(result)}")
-    write(
+        _say(f"records up to {result.removed} were removed by retention, as recorded{_vouched(result)}")
+    _say(
         f"{result.signed_checkpoints} of {counted(result.checkpoints, 'checkpoint is', 'checkpoints are')}"
         f" signed; records up to {result.signed_through} are proven by a signature,"
         f" the {result.unsealed} after it by the chain only"
     )
     if result.elsewhere is not None:
         for text in _elsewhere(result.elsewhere):
-            write(text)
-    write(_memory(result.remembered))
+            _say(text)
+    _say(_memory(result.remembered))
     for other in result.other_logs:
         if other.set_aside is not None:
-            write(
+            _say(
                 f"log {other.log} was signed before, up to checkpoint {other.last}: it is not part of this one, and was"
                 f" set aside at {rfc3339(other.set_aside)}"
             )
-    write(f"key: {result.key or 'none (nothing was signed yet)'}")
-    write(verdict_of(result))
+    _say(f"key: {result.key or 'none (nothing was signed yet)'}")
+    _say(verdict_of(result))
 
 
 def _vouched(result: Verification) -> str:
@@ -90,9 +91,13 @@ def _elsewhere(found: Elsewhere) -> Iterator[str]:
 
 def signed_log_text(one: RememberedLog, present: str) -> str:
     state, known = one.state(present), one.acknowledgement
-    since = f" at {rfc3339(known.time)}" if state == "set aside" and known is not None else ""
+    since = f" at {local_text(known.time)}" if state == "set aside" and known is not None else ""
     lost = ", its beginning is not remembered" if one.lacks_memory else ""
     return f"{one.log}  {state}{since}, checkpoints {one.first} to {one.last}{lost}"
+
+
+def _say(text: str) -> None:
+    write(in_local_zone(text))
 
 
 def write(text: str) -> None:

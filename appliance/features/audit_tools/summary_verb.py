@@ -10,6 +10,7 @@ from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary
 from appliance.audit.search.filter_options import Since, Until, times_given
 from appliance.audit.search.query import Filter
 from appliance.base.counted import counted
+from appliance.base.timestamps import local_text, parse_date
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.verification_text import write
 from appliance.cli.connection.audit_source import audit_of
@@ -17,7 +18,6 @@ from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.policy.host_names import HostInWords
 
-_SECONDS = 19  # characters of a time
 _LONGEST_REASON = 160
 
 
@@ -65,7 +65,7 @@ def _lines(found: DenialSummary, host_in_words: HostInWords) -> Iterator[str]:
             f" {min(LARGEST_SUMMARY, len(found.hosts) + found.more_hosts)}"
         )
     if found.counted_since is not None:
-        earlier = found.counted_since[:_SECONDS] + "Z"
+        earlier = local_text(parse_date(found.counted_since), digits=0)
         yield f"earlier records were not counted, as there are too many: --until {earlier}"
 
 
@@ -75,7 +75,7 @@ def _span(row: HostDenials) -> str:
 
 
 def _second(time: str) -> str:
-    return time.replace("T", " ")[:_SECONDS] + "Z"
+    return local_text(parse_date(time), digits=0).replace("T", " ")
 
 
 def _callers(row: HostDenials) -> str:

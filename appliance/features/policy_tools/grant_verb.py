@@ -13,6 +13,7 @@ from appliance.audit.log.record_format import LogEntry
 from appliance.audit.search.search import recorded_in_full
 from appliance.base.counted import counted
 from appliance.base.input_files import read_given
+from appliance.base.timestamps import in_local_zone
 from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.cli.audit.audit_errors import Errors, fail
@@ -46,7 +47,7 @@ def why(appliance: Appliance, record: RecordArgument) -> None:
         say_json(found)
         return
     for line in found.lines:
-        say(printable(line), "green" if line.startswith("would be allowed by") else "")
+        say(printable(in_local_zone(line)), "green" if line.startswith("would be allowed by") else "")
     if found.refusal:
         say(printable(found.refusal), "yellow")
 

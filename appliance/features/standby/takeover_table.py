@@ -14,9 +14,10 @@ import msgspec
 
 from appliance.audit.log.log_database import reading
 from appliance.audit.log.log_queries import EventRow, outer_decisions, record_hash, records_of
-from appliance.audit.log.record_format import printable, rfc3339
+from appliance.audit.log.record_format import printable
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import KnownLog
+from appliance.base.timestamps import local_text
 from appliance.cli.audit.audit_errors import fail
 from appliance.cli.audit.verification_text import print_verification, write
 from appliance.features.standby.membership import MembershipError, load_membership, path_of
@@ -421,7 +422,7 @@ def print_pair(pair: PairVerification) -> None:
         write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
     for takeover in pair.takeovers:
         by = f"{takeover.appliance} took over from {takeover.other}"
-        write(f"epoch {takeover.epoch}, {rfc3339(takeover.time)}: {by} (record {takeover.sequence})")
+        write(f"epoch {takeover.epoch}, {local_text(takeover.time)}: {by} (record {takeover.sequence})")
         for text in _proven(takeover):
             write(f"    {text}")
     write(_verdict(pair))

@@ -1,6 +1,8 @@
 """Run the transcripts (`*.txt`) here and in the features' folders. `tests/support/transcript.py` defines their form."""
 
 import functools
+import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -78,3 +80,27 @@ _FILES = [*_HERE.rglob("*.txt"), *_HERE.parent.glob("features/*/*.txt")]
 @pytest.mark.parametrize("section", sections(*sorted(_FILES)))
 def test_transcript(transcript: Transcript, section: Section) -> None:
     assert section.played(transcript) == section.text
+
+
+_UTC = re.compile(r"[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]+)?)?Z")
+_OTHER = re.compile(r"\$ .*(--json|guard manual)")
+"""Commands with other output: JSON, and a document whose digest must be the same in each zone."""
+_MARKED = re.compile(r"\(UTC\)|^\S|^ +(2>|->|<-|\{)")
+
+
+@pytest.mark.parametrize(
+    "section", [one for one in sections(*sorted(_FILES)) if _UTC.search(one.values[0].text)]
+)
+def test_times_for_people_are_in_the_machines_zone(
+    transcript: Transcript, monkeypatch: pytest.MonkeyPatch, section: Section
+) -> None:
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
+    try:
+        played = section.played(transcript)
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    outputs = [part for part in re.split(r"^(?=\$ )", played, flags=re.MULTILINE) if not _OTHER.match(part)]
+    lines = [line for part in outputs for line in part.splitlines() if not _MARKED.search(line)]
+    assert [line for line in lines if _UTC.search(line)] == []
