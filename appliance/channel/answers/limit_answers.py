@@ -8,14 +8,17 @@ from appliance.channel.answers.field_docs import doc
 
 
 class LimitUse(msgspec.Struct, frozen=True):
-    """A finite resource: how much all hosts together use, and the host that uses most of its own quota."""
+    """A finite resource: how much all hosts together use, and who uses most of a quota."""
 
     resource: Annotated[str, doc("the resource with its unit")]
     used: Annotated[int, doc("by all hosts together")]
     allowed: Annotated[int | None, doc("for all hosts together, or null if only each host has a limit")]
     setting: Annotated[str, doc("the setting that changes the limit, or empty if there is none")]
     host: Annotated[
-        str, doc("the host that uses most, or empty if none does, or hosts have no quota of their own")
+        str,
+        doc(
+            "the host, or the hosts with one limit together, that are nearest to it; empty without such limits"
+        ),
     ] = ""
-    host_used: Annotated[int, doc("by that host")] = 0
-    host_allowed: Annotated[int, doc("the limit of one host")] = 0
+    host_used: Annotated[int, doc("by them")] = 0
+    host_allowed: Annotated[int, doc("their limit")] = 0

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
+
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.settings import Settings
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Registry
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
-from appliance.quotas.pool import Pool
+from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
 
 Holder = TypeVar("Holder")
@@ -46,9 +48,9 @@ class OwnUses:
         )
 
     def _pools(self) -> Iterator[LimitUse]:
-        yield _of_pool("ports of nodes", "[Ports] range", self.ports())
-        yield _of_pool("connections to RVMaster and nodes", "limits.connections", self.connected)
-        yield _of_pool("bytes of parameters", "limits.parameter_bytes", self.parameters)
+        yield of_pool("ports of nodes", "[Ports] range", self.ports())
+        yield of_pool("connections to RVMaster and nodes", "limits.connections", self.connected)
+        yield of_pool("bytes of parameters", "limits.parameter_bytes", self.parameters)
 
     def _relays(self) -> Iterator[LimitUse]:
         carried, limits = self.carried, self.settings.relay
@@ -95,5 +97,13 @@ def _by_host(
     return LimitUse(resource, used, whole, setting, name, held[host], allowed)
 
 
-def _of_pool(resource: str, setting: str, pool: Pool[Holder]) -> LimitUse:
-    return _by_host(resource, pool.bounds.whole, setting, dict(pool.holders()), pool.bounds.host)
+def of_pool(resource: str, setting: str, pool: Pool[Holder]) -> LimitUse:
+    """Return the use of a pool, with the host, or the hosts with one limit together, that are nearest to a limit."""
+    bounds, unknown = pool.bounds, pool.held_by(QuotaClass.UNKNOWN)
+    row = _by_host(resource, bounds.whole, setting, dict(pool.holders()), bounds.host)
+    unregistered = unknown + pool.held_by(QuotaClass.NAMED), bounds.whole - bounds.kept
+    together = ((pool.unknown, unknown, bounds.unknown), ("hosts without a registration", *unregistered))
+    for holders, used, allowed in together:
+        if used * row.host_allowed > row.host_used * allowed:
+            row = msgspec.structs.replace(row, host=holders, host_used=used, host_allowed=allowed)
+    return row

@@ -18,6 +18,7 @@ from appliance.channel.messages import HeldRequestDecided, RequestHeld
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.motion_stop import StopAfter
+from appliance.control.operators.limit_use import of_pool
 from appliance.features.approvals import requests
 from appliance.features.approvals.approval_table import (
     WAIT_SECONDS,
@@ -333,9 +334,7 @@ class ApprovalOrders:
         return ApprovalCounts(len(waiting), round(oldest, 1), for_some_time, len(self._unanswered))
 
     def limits(self) -> tuple[LimitUse, ...]:
-        pool = self._table.pool
-        host, used = max(pool.holders(), key=lambda held: held[1], default=("", 0))
-        return (LimitUse("approvals", pool.total, pool.bounds.whole, "", str(host), used, pool.bounds.host),)
+        return (of_pool("approvals", "", self._table.pool),)
 
     def _entry(self, number: int) -> ApprovalEntry:
         entry = self._table.entry(number)

@@ -12,7 +12,7 @@ _UNITS = (("GB", 1e9), ("MB", 1e6), ("kB", 1e3))
 
 @speaks
 def limits(appliance: Appliance) -> None:
-    """Show the use and the limit of each finite resource, and the host that uses the largest part of its own quota.
+    """Show the use and the limit of the resources that hosts use up first, and the hosts that are nearest to a limit.
 
     A row with `!` has at least 80 percent in use.
 
