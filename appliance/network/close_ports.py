@@ -153,6 +153,7 @@ def protection(
         f"tcp dport {ports} {_SYN} counter reject with tcp reset",
         f"udp dport {ports} ct state {{ new, invalid }} counter drop",
     ]
+    free = f"# Open to all: {', '.join(map(str, dict.fromkeys(services)))}.\n" if services else ""
     inside = "loopback" if strict is None else f"{strict} of this machine"
     head = "    chain local {\n        type filter hook output priority filter; policy accept;\n"
     chain = f"{head}{_indent(local)}    }}\n" if local else ""
@@ -160,6 +161,7 @@ def protection(
         "#!/usr/sbin/nft -f\n"
         f"# Closes the ROS ports of this machine ({ports}) to all but {inside} and the appliance\n"
         f"# ({', '.join(appliances)}), whose address no host behind this machine can use.\n"
+        f"{free}"
         "# Made by `rosrv protect`; `rosrv protect --remove` removes it.\n"
         f"table inet {TABLE}\n"
         f"delete table inet {TABLE}\n"

@@ -178,10 +178,18 @@ def _make(
                 " address can lock the appliance out. Run: sysctl -w net.ipv4.tcp_syncookies=1\n"
             )
         inside = "loopback" if local is None else f"{local} on this machine"
+        opened = [*map(str, services)]
         _say(
             as_json,
-            {"event": "applied", "ports": str(ports), "appliances": appliances, "strict": local is not None},
-            f"TCP and UDP {ports} are now closed to all but {inside} and {', '.join(appliances)}.\n"
+            {
+                "event": "applied",
+                "ports": str(ports),
+                "appliances": appliances,
+                "strict": local is not None,
+                "open": opened,
+            },
+            f"TCP and UDP {ports} are now closed to all but {inside} and {', '.join(appliances)}"
+            f"{'; open to all: ' if opened else ''}{', '.join(opened)}.\n"
             "Check it from another machine: rosrv protect --check ADDRESS-OF-THIS-MACHINE\n",
         )
     else:

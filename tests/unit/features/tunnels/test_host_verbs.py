@@ -18,6 +18,7 @@ from appliance.features.tunnels.tunnel_answers import KitParts
 from appliance.network.close_ports import LINK, protection
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import IsolationSettings
+from appliance.network.namespaces import Namespace
 from tests.support.answers import example
 
 
@@ -83,3 +84,31 @@ def test_the_rules_for_an_appliance_of_this_machine_have_no_address(
     dropped = " flags & (syn | ack) == syn iif != 0 fib saddr type local counter drop"
     assert (f'oifname "veth-rosrv" tcp{dropped}' in text) is near
     assert "10.9.9.9" in text
+
+
+@pytest.mark.parametrize(
+    "option", ["--appliance 10.9.9.9", "--open tcp/40022", "--open udp/40123-40130", "--strict --user root"]
+)
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_each_option_that_opens_something_is_in_what_protect_prints(
+    monkeypatch: pytest.MonkeyPatch, option: str, form: list[str]
+) -> None:
+    files: list[str] = []
+    monkeypatch.setattr("appliance.network.close_ports.apply", files.append)
+    monkeypatch.setattr(protect_verb, "addresses_by_interface", lambda _: {})
+    monkeypatch.setattr(Namespace, "lacks_syn_cookies", lambda _own: False)
+    words = [
+        "protect",
+        "--appliance",
+        "10.8.8.8",
+        "--ports",
+        "40000-40200",
+        "--apply",
+        *option.split(),
+        *form,
+    ]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    comment = "".join(line for line in files[0].splitlines() if line.startswith("# "))
+    for text in (comment, done.output):
+        assert option.rsplit(maxsplit=1)[-1] in text or ("strict" in option and '"strict": true' in text)
