@@ -1,7 +1,9 @@
+import json
 import re
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from playwright.sync_api import expect
 
 from appliance.base.actors import DISK, UNCONFIRMED, actor
@@ -157,3 +159,57 @@ def test_each_refusal_has_its_own_heading(opened: Callable[..., Reader]) -> None
     }"""
     kinds = ["not-for-this-role", "host-blocked", "foreign-origin"]
     assert opened().go("now").evaluate(headings, kinds) == ["Not for this role", *kinds[1:]]
+
+
+_PAIR = {
+    "role": "active", "name": "a", "address": "10.0.0.1", "since": "2026-01-02T03:04:05Z", "epoch": 2,
+    "fixed": "10.0.0.9", "obstacle": "", "troubles": [], "not_serving": "", "answers_alone": False,
+    "other": {
+        "name": "b", "address": "10.0.0.2", "connected": True, "in_sync": True, "trouble_seconds": None,
+        "reason": "", "behind_changes": 0, "behind_bytes": 0,
+    },
+    "witness": {"address": "10.0.0.3", "answered_seconds": 1.0, "holder": "a", "refusal": "", "trouble": ""},
+}  # fmt: skip
+_NO_KEYS = """
+const real = crypto.subtle.importKey.bind(crypto.subtle);
+crypto.subtle.importKey = (form, key, kind, ...more) =>
+  kind === "Ed25519" ? Promise.reject(new DOMException("no", "NotSupportedError")) : real(form, key, kind, ...more);
+"""
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [("challenge", 0), ("challenge", 503), ("challenge", 429), ("keys", 0)]
+    + [("standby/switch", status) for status in (0, 403, 409, 429, 503)],
+)
+def test_an_order_without_an_answer_is_not_reported_as_given(
+    appliance: Appliance, opened: Callable[..., Reader], path: str, status: int
+) -> None:
+    reader = opened()
+    page = reader.page
+    now = json.loads(
+        next(one["data"] for one in appliance.rest().events("/v1/live") if one.get("event") == "now")
+    )
+    now["status"]["standby"] = _PAIR
+    state = f"event: now\ndata: {json.dumps(now)}\n\n"
+    page.route(
+        "**/v1/live*", lambda route: route.fulfill(body=state, headers={"content-type": "text/event-stream"})
+    )
+    if path == "keys":
+        reader.context.add_init_script(_NO_KEYS)
+    reader.go("now")
+    page.route(
+        f"**/v1/{path}",
+        lambda route: (
+            route.fulfill(status=status, headers={"retry-after": "1"}, json={"detail": "refused"})
+            if status
+            else route.abort()
+        ),
+    )
+    page.get_by_role("button", name="Switch over…").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_role("button", name="Switch over", exact=True).click()
+    expect(dialog.get_by_role("alert")).to_be_visible()
+    unknown = dialog.get_by_text("The order may have taken effect")
+    expect(unknown).to_have_count(int((path, status) == ("standby/switch", 0)))
+    expect(page.locator(".toasts .notice")).to_have_count(0)

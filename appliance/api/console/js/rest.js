@@ -40,7 +40,8 @@ export async function send(method, path, { query, json, text, match, token, anon
     });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new Problem(0, { detail: "No answer. Check that the appliance runs and that this machine can reach it." });
+    const unknown = match === undefined ? "" : " The order may have taken effect: look before you repeat it.";
+    throw new Problem(0, { detail: `No answer. Check that the appliance runs and that this machine can reach it.${unknown}` });
   }
   if (response.ok) return response;
   const problem = await problemOf(response);
