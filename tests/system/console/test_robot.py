@@ -182,3 +182,52 @@ def _smallest_name(page: Page) -> float:
             " one.getAttribute('font-size') * one.getScreenCTM().a))"
         )
     )
+
+
+# Draws the pad beside the page, and returns its words after each button was pressed, and its orders.
+PAD = """async ([group, guard]) => {
+    const { h, html, render } = await import("/console/static/vendor/preact.js");
+    const { Pad } = await import("/console/static/features/doors/teleop/pad.js");
+    const orders = [];
+    const shown = ({ value, title, children }) => html`<span>${value} ${title} ${children}</span>`;
+    const Button = ({ onClick, children }) => html`<button onClick=${onClick}>${children}</button>`;
+    const answers = { "/v1/drive": { groups: [group] }, "/v1/guards": { guards: [guard] } };
+    const parts = {
+        Field: () => null, Given: shown, Notice: shown, Failure: shown, Button,
+        optional: async (path) => answers[path],
+        ask: async (_method, path, { json }) => orders.push([path, json]),
+    };
+    const place = document.createElement("div");
+    const topics = [{ name: "/cmd_vel", type: "geometry_msgs/Twist" }];
+    const given = { parts, door: {}, topics, freshness: { age: () => 0 }, name: "first", address: "10.0.0.1" };
+    render(html`<${Pad} ...${given} />`, place);
+    await new Promise((done) => setTimeout(done, 500));
+    for (const button of place.querySelectorAll("button")) button.click();
+    const text = place.textContent;
+    render(null, place);
+    return [text, orders];
+}"""
+GUARD = {"preset": "deadman", "topics": {"command": "/cmd_vel"}, "state": "free"}
+
+
+GROUP = {"group": "base", "names": ["/cmd_vel"], "ranks": [], "holder": "10.0.0.1"}
+
+
+def test_the_pad_hands_over_only_what_it_shows(opened: Callable[..., Reader]) -> None:
+    """Another operator may have handed the group on since: the order names the holder that the person saw."""
+    page = opened().go("robot")
+    for holder in ("", "10.0.0.1", "10.0.0.2"):
+        [[_path, order]] = page.evaluate(PAD, [GROUP | {"holder": holder}, GUARD])[1]
+        assert order["holder"] == holder
+
+
+def test_the_pad_lists_the_guards_that_act(opened: Callable[..., Reader]) -> None:
+    page = opened().go("robot")
+    listed = {
+        state: "Guards: deadman" in text
+        for state in ("free", "stopping", "withholding", "holding", "shadow", "off", "broken")
+        if ("No deadman guards" in (text := page.evaluate(PAD, [GROUP, GUARD | {"state": state}])[0]))
+        != ("Guards: deadman" in text)
+    }
+    acting = dict.fromkeys(("free", "stopping", "withholding", "holding"), True)
+    assert listed == acting | dict.fromkeys(("shadow", "off", "broken"), False)

@@ -53,7 +53,7 @@ function Authority(/** @type {{parts: any, group: any, held: boolean, name: stri
   if (group.ranks.length) return html`<div class="small"><${parts.Given} value=${group.group} most=${64} />: <${parts.Given} value=${group.standing} /><div class="muted"><${parts.Given} value=${group.why} most=${200} /></div></div>`;
   const holder = group.holder ? html`<${parts.Given} value=${group.holder} mono /> holds` : "No host holds";
   return html`<div class="row small"><span>${held ? "You hold" : holder} <strong><${parts.Given} value=${group.group} most=${64} /></strong>.</span>
-    ${held ? html`<${parts.Button} small role="operator" onClick=${() => order("free", { to: "" })}>Free it</${parts.Button}>` : html`<${parts.Button} small role="operator" tone="primary" onClick=${() => order("assign", { host: `door:${name}` })}>Take it</${parts.Button}>`}</div>`;
+    ${held ? html`<${parts.Button} small role="operator" onClick=${() => order("free", { to: "", holder: group.holder })}>Free it</${parts.Button}>` : html`<${parts.Button} small role="operator" tone="primary" onClick=${() => order("assign", { host: `door:${name}`, holder: group.holder })}>Take it</${parts.Button}>`}</div>`;
 }
 
 /** Who may drive on a topic, and the guards in force on it, every two seconds. */
@@ -64,7 +64,7 @@ function useMotion(/** @type {any} */ parts, /** @type {string} */ topic) {
       const [drive, guarded] = await Promise.all([parts.optional("/v1/drive"), parts.optional("/v1/guards")]);
       const all = drive?.groups ?? [];
       const group = all.find((/** @type {any} */ one) => one.names.includes(topic)) ?? null;
-      const acting = (guarded?.guards ?? []).filter((/** @type {any} */ one) => one.topics.command === topic && !["shadow", "off"].includes(one.state));
+      const acting = (guarded?.guards ?? []).filter((/** @type {any} */ one) => one.topics.command === topic && !["shadow", "off", "broken"].includes(one.state));
       setState({ group, groups: all.flatMap((/** @type {any} */ one) => one.names), guards: acting.map((/** @type {any} */ one) => one.preset), error: null });
     } catch (error) {
       setState((known) => ({ ...known, error }));
