@@ -404,7 +404,9 @@ def remove(appliance: Appliance, name: GuardName, confirm_within: ConfirmWithin 
 
 
 def _undo(guard: GuardRow) -> str:
-    """Return the command that makes a removed guard again. It begins in its initial state."""
+    """Return the command that makes a removed guard again, in its initial state, or in shadow mode if it did not act
+    for good.
+    """
     if guard.origin != "current":
         return "rosrv monitor rollback"
     defaults = {
@@ -420,7 +422,7 @@ def _undo(guard: GuardRow) -> str:
     words += [word for name, topic in topics.items() for word in ("--topic", f"{name}={topic}")]
     words += [word for name, kind in guard.types.items() for word in ("--type", f"{name}={kind}")]
     words += ["--name", guard.name] if guard.name != guard.preset else []
-    words += ["--shadow"] if guard.state == "shadow" else []
+    words += ["--shadow"] if guard.state in ("shadow", "off") or guard.confirm_by is not None else []
     return shlex.join(words)
 
 

@@ -113,3 +113,43 @@ def test_the_check_of_a_driver_asks_measures_and_ends_with_its_window(
         assert {record["detail"]["outcome"] for record in records} == {"stopped", "interrupted"}
     viewed = opened(token("viewer", "watcher")).go("robot").get_by_role("button", name="Check the driver")
     expect(viewed).to_have_attribute("aria-disabled", "true")
+
+
+@pytest.mark.parametrize(
+    ("options", "then", "after"),
+    [
+        ((), (), "free"),
+        (("--shadow",), (), "shadow"),
+        ((), ("monitor", "disable", "deadman"), "shadow"),
+        ((), ("monitor", "disable", "deadman", "--for", "10m"), "shadow"),
+        (("--shadow",), ("guard", "enforce", "deadman", "--confirm-within", "600s"), "shadow"),
+    ],
+    ids=["in force", "shadow mode", "off", "off for a time", "until confirmed"],
+)
+def test_an_undo_brings_no_guard_into_force_that_was_not(
+    appliance: Appliance,
+    opened: Callable[..., Reader],
+    options: tuple[str, ...],
+    then: tuple[str, ...],
+    after: str,
+) -> None:
+    """Neither that of the page nor the command that `rosrv guard remove` prints."""
+    page = opened().go("robot")
+    for in_page in (True, False):
+        types = ("--type", "command=geometry_msgs/Twist")
+        made = appliance.rosrv("guard", "new", "deadman", "/cmd_vel", *types, *options)
+        assert made.returncode == 0, made.stderr
+        if then:
+            assert appliance.rosrv(*then).returncode == 0
+        if in_page:
+            page.locator("tr[data-guard=deadman]").get_by_role("button", name="Remove").click()
+            page.get_by_role("dialog").get_by_role("button", name="Remove").click()
+            page.get_by_role("button", name="Undo").click()
+            expect(page.locator(".toasts").get_by_text("deadman is back")).to_be_visible()
+        else:
+            removed = appliance.rosrv("guard", "remove", "deadman").stdout
+            undo = shlex.split(removed.partition("undo: ")[2].splitlines()[0])
+            assert appliance.rosrv(*undo[1:]).returncode == 0
+        [row] = appliance.rest().get("/v1/guards").json["guards"]
+        assert (row["state"], row["confirm_by"]) == (after, None)
+        appliance.rosrv("guard", "remove", "deadman")

@@ -88,13 +88,17 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
         <p>It stops the robot no longer. The file <code><${Given} value=${guard.file} /></code> on disk is kept: remove it there also, or the next reload loads it again.</p></${Confirm}>`}</td></tr>`;
 }
 
-/** A function that makes a removed guard again, in its initial state, unless the specifications have changed since. @param {any} guard */
-function bringBack({ name, preset, topics, types, given, loads, state }) {
+/**
+ * A function that makes a removed guard again, in its initial state, unless the specifications have changed since. One that
+ * was off, or in force until it is confirmed, comes back in shadow mode. @param {any} guard
+ */
+function bringBack({ name, preset, topics, types, given, loads, state, confirm_by }) {
   const constants = given.filter((/** @type {any} */ one) => one.kind !== "topic").map((/** @type {any} */ one) => [one.name, String(one.value)]);
-  const json = { name, preset, topics, types, values: { ...Object.fromEntries(constants), ...loads }, shadow: state === "shadow" };
+  const shadow = state === "shadow" || state === "off" || confirm_by !== null;
+  const json = { name, preset, topics, types, values: { ...Object.fromEntries(constants), ...loads }, shadow };
   return async (/** @type {string} */ tag) => {
     await ask("POST", "/v1/guards", { json, match: `"${tag}"` });
-    done(`${name} is back`, "It begins in its initial state.");
+    done(`${name} is back`, shadow ? "It is in shadow mode: it only records." : "It begins in its initial state.");
   };
 }
 
