@@ -6,7 +6,8 @@ import pytest
 from playwright.sync_api import Route, expect
 
 from tests.support.appliance import Appliance
-from tests.system.console.reader import Reader
+from tests.system.console.reader import LIMIT, Reader
+from tests.system.console.test_age import HOUR, shifted
 
 SPECIFICATION = """\
 counting() {
@@ -139,3 +140,48 @@ def test_a_specification_is_loaded_replaced_and_removed(
     expect(page.get_by_role("heading", level=1, name="Monitors")).to_be_visible()
     expect(page.get_by_role("link", name="counting", exact=True)).to_have_count(0)
     assert state(appliance, "counting") is None
+
+
+@pytest.mark.parametrize("view", ["policy", "monitors/counting", "monitors"])
+def test_a_text_that_is_not_loaded_stays(
+    appliance: Appliance, opened: Callable[..., Reader], view: str
+) -> None:
+    """Over loads of others, another view, and a lock."""
+    rest = appliance.rest()
+
+    def load(**files: str) -> None:
+        given = {f"{name}.rv": text for name, text in files.items()}
+        assert rest.post("/v1/monitors", {"files": given}, match="*").status == 200
+
+    load(counting=SPECIFICATION)
+    reader = opened()
+    shifted(reader, 0)
+    page = reader.go(view, heading="counting" if "/" in view else None)
+    new = page.get_by_role("button", name="Load a specification")
+    if view == "monitors":
+        new.click()
+    reader.write("// half an hour of work\n")
+    load(other=SPECIFICATION.replace("counting", "other"))
+    load(counting=SPECIFICATION.replace("/chatter", "/gossip"))
+    policy = rest.get("/v1/policy").json["text"]
+    assert rest.post("/v1/policy", f"{policy}\n# {view}\n", match="*").status == 200
+    if view == "monitors":
+        page.wait_for_timeout(3000)
+        expect(reader.editor()).to_contain_text("half an hour of work")
+        page.get_by_role("button", name="Not yet").click()
+    else:
+        expect(page.get_by_text("came into force while you wrote")).to_be_visible()
+        expect(reader.editor()).to_contain_text("half an hour of work")
+    page.get_by_role("link", name="Now", exact=True).click()
+    page.go_back()
+    if view == "monitors":
+        new.click()
+    expect(reader.editor()).to_contain_text("half an hour of work")
+    page.evaluate(f"window.shifted = {HOUR}")
+    expect(page.get_by_role("dialog", name="Locked")).to_be_visible(timeout=2 * LIMIT)
+    page.get_by_label("Access token").fill(str(appliance.ready["token"]))
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("dialog", name="Locked")).to_have_count(0)
+    expect(reader.editor()).to_contain_text("half an hour of work")
+    for name in ("counting", "other"):
+        appliance.rosrv("monitor", "remove", name)

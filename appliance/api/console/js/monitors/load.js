@@ -39,6 +39,7 @@ export function LoadSpecification({ etag, files, signed, close, loaded }) {
   const load = async () => {
     const body = await send(false);
     if (!body) return;
+    draft.write(EXAMPLE);
     done(`Revision ${body.revision} of the specifications is in force`, [...body.added, ...body.changed].join(", "));
     await loaded();
     close();

@@ -39,7 +39,7 @@ export function MonitorPage({ name, row, monitors }) {
   if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. Its actions are still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
   const held = row.error ? html`<${Notice} tone="deny" role="alert" title=${`It does nothing${row.held ? ", and holds its topics" : ""}: its file has an error`}><${Given} value=${row.error} most=${400} />. Load a corrected <${Given} value=${row.file} mono most=${80} /></${Notice}>` : row.held && html`<${Notice} tone="deny" role="alert" title="It holds its topics, and drops every message there">${row.why_held || "its relay process was restarted"}. When it is safe, resume it: <code>rosrv monitor resume ${name}</code></${Notice}>`;
   return html`${head}${held}
-    <div class="policy-grid"><div class="stack"><${Verdicts} name=${name} row=${row} />${error ? html`<${Failure} error=${error} retry=${again} />` : !value ? html`<section class="panel"><${Loading} /></section>` : html`<${Specification} key=${value.revision} monitor=${value} monitors=${monitors} />`}</div>
+    <div class="policy-grid"><div class="stack"><${Verdicts} name=${name} row=${row} />${error ? html`<${Failure} error=${error} retry=${again} />` : !value ? html`<section class="panel"><${Loading} /></section>` : html`<${Specification} key=${`${value.file} ${value.text}`} monitor=${value} monitors=${monitors} />`}</div>
       <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${History} path=${path} row=${row} /></div></div>
     ${removing && html`<${Remove} name=${name} row=${row} path=${path} monitors=${monitors} close=${() => setRemoving(false)} />`}`;
 }
@@ -54,7 +54,7 @@ function Verdicts(/** @type {{name: string, row: any}} */ { name, row }) {
 }
 
 function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, monitors }) {
-  const draft = useSpecification(monitor.text);
+  const draft = useSpecification(monitor.text, monitor.file);
   const [note, setNote] = useState("");
   const [signature, setSignature] = useState("");
   const [asking, setAsking] = useState(false);
@@ -75,6 +75,7 @@ function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, m
   const findings = draft.report || draft.findings.length || draft.error ? draft.findings : monitor.warnings;
   return html`<section class="panel" aria-labelledby="specification"><div class="panel-head"><h2 id="specification">Specification</h2>${changed && html`<${Badge} word="changed here, not loaded" tone="warn" />`}
       <span class="end">${changed && html`<button class="button small plain" onClick=${() => draft.write(monitor.text)}>Discard</button>`}<${Button} small role="operator" onClick=${dry} title="Compile and check (Ctrl S)">Dry run</${Button}><${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is unchanged" onClick=${() => setAsking(true)}>Replace</${Button}></span></div>
+    ${draft.stale && html`<div class="panel-body"><${Notice} tone="warn" title="Another text of this file came into force while you wrote">Replace puts yours in its place; Discard shows it.</${Notice}></div>`}
     ${(draft.report || draft.error || findings.length > 0) && html`<div class="panel-body"><${Outcome} report=${draft.report} error=${draft.error} findings=${findings} pick=${(/** @type {any} */ one) => setLine({ number: one.line, column: one.column, count: (line?.count ?? 0) + 1 })} /></div>`}
     <${Editor} label=${`Specification ${monitor.file}`} language="rv" value=${draft.text} change=${draft.write} findings=${findings} line=${line} dry=${() => may("operator") && dry()} height="46vh" />
     ${asking && html`<${Dialog} title=${`Replace ${monitor.file}?`} close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Not yet</button><${Button} role="admin" tone="primary" onClick=${load}>Replace</${Button}>`}>
