@@ -213,3 +213,33 @@ def test_an_order_without_an_answer_is_not_reported_as_given(
     unknown = dialog.get_by_text("The order may have taken effect")
     expect(unknown).to_have_count(int((path, status) == ("standby/switch", 0)))
     expect(page.locator(".toasts .notice")).to_have_count(0)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["stream?", "?.*decision=", "?.*category=", "?.*severity=alarm"],
+    ids=lambda one: one.strip("?.*="),
+)
+def test_records_that_do_not_come_are_not_taken_for_none(
+    appliance: Appliance, opened: Callable[..., Reader], path: str
+) -> None:
+    """The stream and each list may be refused alone, by its own limit."""
+    appliance.rosrv("host", "block", "10.0.0.77", "--for", "1h")
+    reader = opened()
+    refused = re.compile(r"/v1/audit" + ("/" if path == "stream?" else "") + path.replace("?", r"\?", 1))
+    reader.page.route(
+        refused,
+        lambda route: route.fulfill(status=503, headers={"retry-after": "5"}, json={"detail": "full"}),
+    )
+    page = reader.go("now")
+    expect(page.locator(".banner")).to_contain_text("New denials, alarms and actions do not come. full")
+    expect(page.locator("[data-standing=live]")).to_be_visible()
+    expect(page.get_by_role("region", name="Open alarms")).to_contain_text("1 host is blocked")
+    denied = page.get_by_role("link", name=re.compile("^Denied"))
+    expect(denied).to_have_text(re.compile(r"^Denied, \d+ s ago|^Denied\s*not known"))
+    for words in ("No open alarms", "at once", "No monitor acted"):
+        expect(page.get_by_text(words)).to_have_count(0)
+    expect(page.locator(".skeleton")).to_have_count(0)
+    reader.page.unroute(refused)
+    expect(page.locator(".banner")).to_have_count(0)
+    appliance.rosrv("host", "unblock", "10.0.0.77")

@@ -4,6 +4,7 @@
  */
 
 import { compared, isDenial } from "./audit/rows.js";
+import { mark } from "./elapsed.js";
 import { follow } from "./events.js";
 import { get } from "./rest.js";
 import { createStore } from "./store.js";
@@ -19,6 +20,8 @@ export const notable = createStore({
   doings: /** @type {AuditRecord[] | null} */ (null), // actions of monitors
   incidents: /** @type {AuditRecord[] | null} */ (null), // records of severity alarm
   latest: /** @type {AuditRecord | null} */ (null), // the newest record since the page follows
+  missing: /** @type {string | null} */ (null), // why records do not come at present
+  heard: /** @type {import("./elapsed.js").Mark | null} */ (null), // until when they came, while they do not
 });
 
 let running = /** @type {ReturnType<typeof follow> | null} */ (null);
@@ -32,7 +35,10 @@ export async function startNotable() {
     get("/v1/audit", { since: NEAR, limit: 100, equality: 1, ...query }).then(compared);
   const all = () => Promise.all([
     past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
-  ]).catch(() => null);
+  ]).catch((error) => {
+    if (mine === generation) notable.update({ missing: String(error.message) });
+    return null;
+  });
   let lists = await all();
   while (!lists && mine === generation) {
     await new Promise((done) => setTimeout(done, AGAIN)); // until they come they are not known, and never empty
@@ -40,16 +46,21 @@ export async function startNotable() {
   }
   if (!lists || mine !== generation) return;
   const [denials, doings, incidents] = lists;
-  notable.update({ denials, doings, incidents });
+  notable.update({ denials, doings, incidents, missing: null });
   const last = Math.max(0, ...[...denials, ...doings, ...incidents].map((one) => one.sequence));
-  running = follow(() => `/v1/audit/stream?severity=notice&equality=1&since=${NEAR}`, heard, () => {}, String(last));
+  running = follow(() => `/v1/audit/stream?severity=notice&equality=1&since=${NEAR}`, heard, stands, String(last));
 }
 
 export function stopNotable() {
   generation += 1;
   running?.stop();
   running = null;
-  notable.set({ denials: null, doings: null, incidents: null, latest: null });
+  notable.set({ denials: null, doings: null, incidents: null, latest: null, missing: null, heard: null });
+}
+
+function stands(/** @type {import("./events.js").Standing} */ { state, reason }) {
+  if (state === "live") notable.update({ missing: null, heard: null });
+  else if (reason) notable.update({ missing: reason, heard: notable.get().heard ?? mark() });
 }
 
 function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {

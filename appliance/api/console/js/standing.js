@@ -3,6 +3,7 @@
 import { html } from "./html.js";
 import { ageOf, live, retry } from "./live.js";
 import { lasting, useSeconds } from "./moments.js";
+import { notable } from "./notable.js";
 import { Given } from "./parts/given.js";
 import { Icon } from "./parts/icon.js";
 import { useStore } from "./store.js";
@@ -29,12 +30,15 @@ export function Pulse() {
 
 export function NotLive() {
   const { standing, away, heard } = useStore(live);
+  const missing = useStore(notable, (one) => one.missing);
   const { age, old } = useAge();
   const since = heard ? `, as of ${lasting(age)} ago` : "";
   if (standing.state === "live" && away)
     return html`<div class="banner" role="status"><${Icon} name="warn" /><span><strong>RVMaster does not answer${since}.</strong> <${Given} value=${away} most=${300} /></span></div>`;
   if (standing.state === "live" && old)
     return html`<div class="banner" role="status"><${Icon} name="warn" /><span><strong>No news from the appliance for ${lasting(age)}.</strong> What is shown may be over.</span></div>`;
+  if (standing.state === "live" && missing)
+    return html`<div class="banner" role="status"><${Icon} name="warn" /><span><strong>New denials, alarms and actions do not come.</strong> <${Given} value=${missing} most=${300} /> Retrying automatically.</span></div>`;
   if (standing.state === "live" || !standing.reason) return null;
   const wait = standing.again ? Math.max(0, Math.ceil((standing.again - performance.now()) / 1000)) : 0;
   return html`<div class="banner" role="status"><${Icon} name="warn" />

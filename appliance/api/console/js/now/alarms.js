@@ -2,6 +2,7 @@
 
 import { html, useState } from "../html.js";
 import { inOwnZone, isNow, Moment } from "../moments.js";
+import { notable } from "../notable.js";
 import { useApplianceTime } from "../parts/ago.js";
 import { Badge } from "../parts/badge.js";
 import { CopyCommand } from "../parts/copy.js";
@@ -10,6 +11,7 @@ import { Sentence } from "../parts/host.js";
 import { Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
 import { store, stored } from "../storage.js";
+import { useStore } from "../store.js";
 
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
 const SEEN = "rosrv.reviewed";
@@ -23,7 +25,8 @@ export function placeOf(alarm) {
   return places[alarm.kind] ?? places[alarm.about];
 }
 
-export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ { alarms, incidents }) {
+export function Alarms(/** @type {{alarms: any[]}} */ { alarms }) {
+  const { incidents, missing } = useStore(notable);
   const [seen, setSeen] = useState(reviewed);
   const now = useApplianceTime();
   const open = (incidents ?? []).filter((one) => !seen.has(one.id));
@@ -32,10 +35,10 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
     store(SEEN, JSON.stringify(ids));
     setSeen(new Set(ids));
   };
-  return html`<section class="panel spaced" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>${incidents !== null && !alarms.length && !open.length && html`<span class="muted small">No open alarms</span>`}
+  return html`<section class="panel spaced" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>${!alarms.length && !open.length && (missing || incidents) && html`<span class="muted small">${missing ? "Not known at present" : "No open alarms"}</span>`}
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
-    ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? null
-      : html`<ul class="alarm-list">${alarms.toSorted((one, other) => ORDER.indexOf(one.severity) - ORDER.indexOf(other.severity)).map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
+    ${incidents === null && !missing ? html`<${Loading} rows=${2} />` : null}
+    ${!alarms.length && !open.length ? null : html`<ul class="alarm-list">${alarms.toSorted((one, other) => ORDER.indexOf(one.severity) - ORDER.indexOf(other.severity)).map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${placeOf(one)} class="alarm-text"><${Told} text=${inOwnZone(one.text)} /></${Link}><${CopyCommand} text=${one.text} /></li>`)}
         ${open.slice(0, MAX).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} tone=${isNow(one.time, now) ? "deny" : ""} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}

@@ -17,18 +17,18 @@ import { useStore } from "../store.js";
 const SHOWN = 8;
 
 export function Refusals() {
-  const denials = useStore(notable, (one) => one.denials);
+  const { denials, missing } = useStore(notable);
   return html`<section class="panel" aria-labelledby="refusals"><div class="panel-head"><h2 id="refusals">Recently denied</h2>
       <span class="end"><${Link} to="/console/audit?decision=deny&since=1d" class="small">All in the audit log</${Link}></span></div>
-    ${denials === null ? html`<${Loading} />` : !denials.length ? html`<${Empty} icon="check" title="Nothing was denied in the last day">Requests that the policy denies appear here at once.</${Empty}>`
+    ${missing && !denials?.length ? html`<${Empty} icon="warn" title="Not known at present" />` : denials === null ? html`<${Loading} />` : !denials.length ? html`<${Empty} icon="check" title="Nothing was denied in the last day">Requests that the policy denies appear here at once.</${Empty}>`
       : html`<${DeniedHosts} since="1h" title=" in the last hour" mark=${denials[0].sequence} /><${List} records=${denials} what=${denied} />`}</section>`;
 }
 
 export function Doings() {
-  const doings = useStore(notable, (one) => one.doings);
+  const { doings, missing } = useStore(notable);
   return html`<section class="panel" aria-labelledby="doings"><div class="panel-head"><h2 id="doings">Recent actions of monitors</h2>
       <span class="end"><${Link} to="/console/audit?category=monitor&since=1d" class="small">All in the audit log</${Link}></span></div>
-    ${doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor acted in the last day">Stops, verdicts, dropped and changed messages appear here.</${Empty}>`
+    ${missing && !doings?.length ? html`<${Empty} icon="warn" title="Not known at present" />` : doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor acted in the last day">Stops, verdicts, dropped and changed messages appear here.</${Empty}>`
       : html`<${List} records=${doings} what=${done} />`}</section>`;
 }
 

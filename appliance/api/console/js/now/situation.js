@@ -18,11 +18,11 @@ export function Situation() {
 }
 
 function Denied() {
-  const denials = useStore(notable, (one) => one.denials);
+  const { denials, missing, heard } = useStore(notable);
   const now = useApplianceTime();
   const [row] = byHostAndKind(grouped((denials ?? []).filter((one) => !isSelftest(one) && !isHeld(one))));
-  if (!row) return html`<${Fact} name="Denied" to="/console/audit?decision=deny&since=1d">${denials === null ? "…" : "nothing in the last day"}</${Fact}>`;
+  if (!row) return html`<${Fact} name="Denied" failed=${heard} to="/console/audit?decision=deny&since=1d">${denials ? "nothing in the last day" : missing ? "not known" : "…"}</${Fact}>`;
   const one = shownOf(row);
   const others = othersOf(row);
-  return html`<${Fact} name="Denied" to=${`/console/audit/${one.id}`} tone=${isNow(row.last.time, now) ? "deny" : ""}><${Host} value=${one.host} none="no address" /> <span class="muted">${requested(one)}</span> <${Given} value=${one.resource || one.event} most=${60} mono />${others > 0 && html` <span class="muted">and ${others} more</span>`}, <${Ago} at=${row.last.time} /></${Fact}>`;
+  return html`<${Fact} name="Denied" failed=${heard} to=${`/console/audit/${one.id}`} tone=${isNow(row.last.time, now) ? "deny" : ""}><${Host} value=${one.host} none="no address" /> <span class="muted">${requested(one)}</span> <${Given} value=${one.resource || one.event} most=${60} mono />${others > 0 && html` <span class="muted">and ${others} more</span>`}, <${Ago} at=${row.last.time} /></${Fact}>`;
 }

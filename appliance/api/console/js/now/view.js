@@ -3,7 +3,6 @@
 import { html } from "../html.js";
 import { live } from "../live.js";
 import { inOwnZone, lasting, Moment } from "../moments.js";
-import { notable } from "../notable.js";
 import { count, counted, growth, lately } from "../numbers.js";
 import { useApplianceTime } from "../parts/ago.js";
 import { Badge } from "../parts/badge.js";
@@ -25,7 +24,6 @@ const DROPS = 1; // index in the counts of a monitor: verdicts, drops, changes, 
 export function Now() {
   const status = useStore(live, (one) => one.status);
   const alarms = useStore(live, (one) => one.alarms);
-  const incidents = useStore(notable, (one) => one.incidents);
   const now = useApplianceTime();
   useKeys((key) => {
     const step = { j: 1, k: -1 }[key];
@@ -37,7 +35,7 @@ export function Now() {
   });
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
   return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${now === null ? "…" : lasting(now - status.since)}</span></div>
-    <${Situation} /><${Alarms} alarms=${alarms} incidents=${incidents} />
+    <${Situation} /><${Alarms} alarms=${alarms} />
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">
       <div class="stack"><${Curves} /><${Refusals} /></div>
