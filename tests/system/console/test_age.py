@@ -184,6 +184,65 @@ def test_a_request_that_fails_later_is_seen(
     expect(page.get_by_text(re.compile(r"What is shown is of \d+ s ago"))).to_be_visible()
 
 
+_CALL = {
+    "state": "waits", "host": "10.0.0.7", "caller_id": "/agent", "category": "publish", "resource": "/goal",
+    "type": "", "sha256": "", "arguments": "", "size": 0, "left_seconds": 90.0, "who": "", "number": 17,
+}  # fmt: skip
+_FENCE = {
+    "preset": "fence", "name": "fence", "topics": {"command": "/cmd_vel", "by": "/odom"}, "shadow": True,
+    "types": {"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"}, "values": {},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+@pytest.mark.parametrize(
+    ("view", "path"),
+    [
+        ("now", "guards"),
+        ("robot", "guards"),
+        ("robot", "approvals"),
+        ("monitors", "monitors"),
+        ("robot", "monitors/fence/values"),
+    ],
+)
+def test_a_value_that_follows_the_state_has_its_age_until_it_is_heard_again(
+    appliance: Appliance, opened: Callable[..., Reader], view: str, path: str, hangs: bool
+) -> None:
+    """One request fails, or has no answer, just when something has changed, and nothing changes later."""
+    rest = appliance.rest()
+    rest.post("/v1/guards", _FENCE, match="*")
+    reader = opened()
+    page = reader.page
+    asked: list[Route] = []
+    failing = False
+
+    def answer(route: Route) -> None:
+        asked.append(route)
+        if failing and not hangs:
+            route.abort()
+        elif path == "approvals" and not failing:
+            route.fulfill(json={"approvals": [_CALL]})
+        elif not failing:
+            route.continue_()
+
+    page.route(f"**/v1/{path}*", answer)
+    reader.go(view)
+    _held(page, asked, 1)
+    reader.settle()
+    failing, before = True, len(asked)
+    if path in ("guards", "monitors"):
+        row = next(row for row in rest.get("/v1/monitors").json["monitors"] if row["name"] == "safeTrigger")
+        appliance.rosrv("monitor", "disable" if row["enabled"] else "enable", "safeTrigger")
+    age = page.get_by_text(
+        re.compile(r"(What is shown is of|^Stops,|The appliance last answered) \d+ s ago")
+    ).locator("visible=true")
+    expect(age.first).to_be_visible()
+    _held(page, asked, before + 2)
+    failing = False
+    expect(age).to_have_count(0)
+    page.unroute_all(behavior="ignoreErrors")
+
+
 def test_waiting_calls_that_no_answer_confirms_are_an_error(opened: Callable[..., Reader]) -> None:
     """They are asked for again with the next state."""
     reader = opened()
@@ -213,13 +272,9 @@ def test_a_bell_rings_for_each_call_that_begins_to_wait(opened: Callable[..., Re
     page = reader.page
     reader.context.add_init_script(_BELL)
     waiting: list[int] = []
-    call = {
-        "state": "waits", "host": "10.0.0.7", "caller_id": "/agent", "category": "publish", "resource": "/goal",
-        "type": "", "sha256": "", "arguments": "", "size": 0, "left_seconds": 90.0, "who": "",
-    }  # fmt: skip
     page.route(
         "**/v1/approvals",
-        lambda route: route.fulfill(json={"approvals": [call | {"number": one} for one in waiting]}),
+        lambda route: route.fulfill(json={"approvals": [_CALL | {"number": one} for one in waiting]}),
     )
     for now, rings in (([17, 18], 1), ([17], 1), ([17, 18], 2), ([16, 17], 3), ([16], 3)):
         waiting[:] = now

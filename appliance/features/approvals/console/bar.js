@@ -26,12 +26,12 @@ const NARROW = "(max-width: 720px)";
 
 export function WaitingCalls() {
   useHeldCalls();
-  const { rows, at } = useStore(held);
+  const { rows, heard } = useStore(held);
   const [slots, setSlots] = useState(/** @type {import("./slots.js").Slot[]} */ ([]));
   const [now, setNow] = useState(performance.now());
   const bar = useRef(/** @type {HTMLElement | null} */ (null));
   const signedIn = useStore(session, ({ current }) => current !== null);
-  useEffect(() => setSlots((slots) => placed(slots, rows, at, performance.now())), [rows]);
+  useEffect(() => setSlots((slots) => placed(slots, rows, heard?.steady ?? 0, performance.now())), [rows]);
   useEffect(() => {
     if (!slots.length) return undefined;
     const timer = setInterval(() => {

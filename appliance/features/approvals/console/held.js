@@ -1,59 +1,39 @@
 /** The calls that wait for an operator, and the approvals: fetched once for all places that show them. */
 
 import { callFor } from "#console/attention.js";
+import { mark } from "#console/elapsed.js";
 import { useEffect, useRef } from "#console/html.js";
 import { live } from "#console/live.js";
 import { notable } from "#console/notable.js";
 import { counted } from "#console/numbers.js";
 import { attempt } from "#console/parts/attempt.js";
-import { inTime } from "#console/parts/resource.js";
-import { done, failed } from "#console/parts/toast.js";
+import { inTime, inTurn } from "#console/parts/resource.js";
+import { done } from "#console/parts/toast.js";
 import { ask, get } from "#console/rest.js";
 import { session } from "#console/session.js";
 import { createStore, useStore } from "#console/store.js";
 import { waitingOf } from "./slots.js";
 import { ring } from "./sound.js";
 
-/** `at`: when they came, by the browser's monotonic clock, in milliseconds. `rows` is null before they are known. */
-export const held = createStore({ rows: /** @type {any[] | null} */ (null), error: /** @type {unknown} */ (null), at: 0 });
+/** `heard`: when they came. `rows` is null before they are known. */
+export const held = createStore({ rows: /** @type {any[] | null} */ (null), error: /** @type {unknown} */ (null), heard: /** @type {import("#console/elapsed.js").Mark | null} */ (null) });
 
-const GAP = 200; // milliseconds between two requests: a storm of calls makes many records, and needs no request for each
-
-let fetching = /** @type {Promise<void> | null} */ (null);
-let stale = false;
-
-/** Fetch them; what changes meanwhile is fetched once more before the promise ends. */
-export function again() {
-  stale = true;
-  fetching ??= fetchAll().finally(() => {
-    fetching = null;
-  });
-  return fetching;
-}
-
-async function fetchAll() {
-  for (let first = true; stale; first = false) {
-    if (!first) await new Promise((done) => setTimeout(done, GAP));
-    stale = false;
-    await fetchOnce();
-  }
-}
-
-async function fetchOnce() {
+/** Fetch them. */
+export const again = inTurn(async () => {
   try {
     const { approvals } = await inTime((signal) => get("/v1/approvals", undefined, signal));
-    held.set({ rows: approvals, error: null, at: performance.now() });
+    held.set({ rows: approvals, error: null, heard: mark() });
   } catch (error) {
     held.update({ error });
   }
-}
+});
 
 /**
  * Fetch them when a record or the state says that they changed, and with each state while there are any or the last request failed. The bar, which
  * is on every page, calls this.
  */
 export function useHeldCalls() {
-  const mark = useStore(live, (one) => {
+  const changed = useStore(live, (one) => {
     const counts = one.status?.approvals;
     if (!counts) return "";
     const some = counts.waiting + counts.leases > 0 || held.get().rows?.length || held.get().error;
@@ -63,9 +43,9 @@ export function useHeldCalls() {
   const signedIn = useStore(session, ({ current }) => current !== null);
   const waiting = waitingOf(useStore(held, (one) => one.rows));
   useEffect(() => {
-    if (mark || record) again();
-  }, [mark, record]);
-  useEffect(() => () => held.set({ rows: null, error: null, at: 0 }), []);
+    if (changed || record) again();
+  }, [changed, record]);
+  useEffect(() => () => held.set({ rows: null, error: null, heard: null }), []);
   useEffect(() => callFor(signedIn && waiting.length ? counted(waiting.length, "call waits", "calls wait") : ""), [signedIn, waiting.length]);
   useEffect(() => () => callFor(""), []);
   const numbers = waiting.map((one) => one.number);

@@ -16,11 +16,11 @@ import { Sound } from "./sound.js";
 const CHECKED = 100; // milliseconds between two looks at the places of the rows
 
 export function Approvals() {
-  const { rows, error } = useStore(held);
+  const { rows, error, heard } = useStore(held);
   const table = useRef(/** @type {HTMLElement | null} */ (null));
   const steady = useAwake(table);
   return html`<section class="panel" aria-labelledby="approvals"><div class="panel-head"><h2 id="approvals">Approvals</h2>${!error && rows?.length === 0 && html`<span class="muted small">no call waits</span>`}<span class="end"><${Sound} /></span></div>
-    ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}
+    ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} heard=${heard} /></div>` : null}
     ${rows?.length ? html`<div class="table-wrap" ref=${table}><table class="table stacked"><thead><tr><th>Host</th><th>Wants to</th><th>State</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((one) => html`<${Row} key=${one.number} one=${one} steady=${steady} />`)}</tbody></table></div>` : null}</section>`;
 }

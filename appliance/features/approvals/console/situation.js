@@ -8,8 +8,8 @@ import { held } from "./held.js";
 import { waitingOf } from "./slots.js";
 
 export function Waits() {
-  const { rows, error } = useStore(held);
+  const { rows, error, heard } = useStore(held);
   const waiting = waitingOf(rows).length;
   const lasts = (rows ?? []).filter((one) => one.state === "lease").length;
-  return html`<${Fact} name="Waits" to="/console/robot" tone=${waiting ? "warn" : ""}>${waiting ? counted(waiting, "call waits for you", "calls wait for you") : error ? "not known" : rows ? "no call waits" : "…"}${lasts > 0 && html` <span class="muted">${counted(lasts, "approval lasts", "approvals last")}</span>`}</${Fact}>`;
+  return html`<${Fact} name="Waits" failed=${error && heard} to="/console/robot" tone=${waiting ? "warn" : ""}>${waiting ? counted(waiting, "call waits for you", "calls wait for you") : rows ? "no call waits" : error ? "not known" : "…"}${lasts > 0 && html` <span class="muted">${counted(lasts, "approval lasts", "approvals last")}</span>`}</${Fact}>`;
 }

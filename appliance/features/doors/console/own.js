@@ -8,7 +8,7 @@ import { Button } from "#console/parts/button.js";
 import { Field } from "#console/parts/field.js";
 import { Given } from "#console/parts/given.js";
 import { Failure, Loading, Notice } from "#console/parts/notice.js";
-import { useResource } from "#console/parts/resource.js";
+import { inTime, useResource } from "#console/parts/resource.js";
 import { done, failed } from "#console/parts/toast.js";
 import { ask, get } from "#console/rest.js";
 import { Link } from "#console/router.js";
@@ -69,7 +69,7 @@ async function loaded() {
 /** The answer to a request, or null if the appliance has no such path. */
 async function optional(/** @type {string} */ path) {
   try {
-    return await get(path);
+    return await inTime((signal) => get(path, undefined, signal));
   } catch (failure) {
     if (/** @type {any} */ (failure).status === 404) return null;
     throw failure;

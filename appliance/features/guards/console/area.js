@@ -22,11 +22,11 @@ export function Area({ guard, seen, tried = guard, draft = null, move }) {
 }
 
 function Fence(/** @type {{guard: any, map: any, trail: any[]}} */ { guard, map, trail }) {
-  const { belief, error, may } = useBelief(guard.name);
+  const { belief, error, heard, may } = useBelief(guard.name);
   const robot = positionOf(belief);
   const age = ageOf(belief);
   const late = age !== null && age > (constant(guard, "silent") ?? PRESENT);
-  const why = outdated(belief, error);
+  const why = outdated(belief, error, heard);
   return html`<${FenceMap} ...${map} robot=${robot} old=${late || why !== ""} trail=${trail} where=${place(robot, age, map.polygon, { may, belief, why })} />`;
 }
 

@@ -31,7 +31,7 @@ const WATCHED = 6; // topics that are watched at once: control answers eight que
 
 export function Guards() {
   const guards = useGuards();
-  const { body, error, again } = guards;
+  const { body, error, heard, again } = guards;
   const rows = body?.guards ?? [];
   const topics = /** @type {string[]} */ ([...new Set(rows.flatMap((/** @type {any} */ one) => [one.topics.by, one.topics.command].filter(Boolean)))].slice(0, WATCHED));
   const { looking, turn, seen, error: unseen } = useLook(topics);
@@ -43,7 +43,8 @@ export function Guards() {
         <${Button} small tone=${rows.length ? "" : "primary"} onClick=${() => setOpen("suggest")}><${Icon} name="plus" size=${14} />Suggest guards</${Button}></span></div>
     ${unseen ? html`<div class="panel-body"><${Failure} error=${unseen} /></div>` : null}
     ${body?.warnings.map((/** @type {string} */ one) => html`<div key=${one} class="panel-body"><${Notice} tone="warn"><${Given} value=${one} most=${400} /></${Notice}></div>`)}
-    ${error && !body ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !body ? html`<${Loading} rows=${3} />`
+    ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} heard=${heard} /></div>` : null}
+    ${!body ? (error ? null : html`<${Loading} rows=${3} />`)
       : !rows.length ? html`<${Empty} icon="robot" title="No guard">A guard stops the robot when its commands end, when it leaves a fence or drives too fast. Suggest guards reads the graph and proposes them.</${Empty}>`
       : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Guard</th><th>State</th><th>Guards</th><th>How close it came</th><th class="number">Stopped</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((/** @type {any} */ one) => html`<${Guard} key=${one.name} guard=${one} guards=${guards} seen=${seen} />`)}</tbody></table></div>`}

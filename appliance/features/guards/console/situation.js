@@ -15,17 +15,17 @@ const BEGINS = 10; // seconds in which a stop is red: then the robot is held
 const MAX = 2; // guards by name
 
 export function Stops() {
-  const { body, error } = useGuards({ presets: false });
+  const { body, error, heard } = useGuards({ presets: false });
   const now = useApplianceTime();
   const rows = body?.guards ?? [];
   const acting = rows.filter((/** @type {any} */ one) => one.state in ACTS);
   const lately = rows.filter((/** @type {any} */ one) => one.last_stop?.until && now !== null && now - secondsOf(one.last_stop.until) < LATELY)
     .sort((/** @type {any} */ one, /** @type {any} */ other) => secondsOf(other.last_stop.until) - secondsOf(one.last_stop.until));
   const idle = rows.filter((/** @type {any} */ one) => one.state === "off" || one.state === "shadow");
-  if (acting.length) return html`<${Fact} name="Stops" to="/console/robot" tone=${acting.some((/** @type {any} */ one) => one.state === "holding" || one.state === "broken" || begins(one, now)) ? "deny" : ""}>${acting.slice(0, MAX).map((/** @type {any} */ one) => html`<${Acting} key=${one.name} guard=${one} now=${now} />`)}${acting.length > MAX && html`<div class="muted">and ${acting.length - MAX} more</div>`}</${Fact}>`;
-  if (lately.length) return html`<${Fact} name="Stops" to="/console/robot" tone=${isNow(lately[0].last_stop.until, now) ? "warn" : ""}><${Stopped} guard=${lately[0]} /></${Fact}>`;
+  if (acting.length) return html`<${Fact} name="Stops" failed=${error && heard} to="/console/robot" tone=${acting.some((/** @type {any} */ one) => one.state === "holding" || one.state === "broken" || begins(one, now)) ? "deny" : ""}>${acting.slice(0, MAX).map((/** @type {any} */ one) => html`<${Acting} key=${one.name} guard=${one} now=${now} />`)}${acting.length > MAX && html`<div class="muted">and ${acting.length - MAX} more</div>`}</${Fact}>`;
+  if (lately.length) return html`<${Fact} name="Stops" failed=${error && heard} to="/console/robot" tone=${isNow(lately[0].last_stop.until, now) ? "warn" : ""}><${Stopped} guard=${lately[0]} /></${Fact}>`;
   const said = error && !body ? "not known" : !body ? "…" : !rows.length ? "no guard is loaded" : `nothing: ${counted(rows.length - idle.length, "guard")} on watch`;
-  return html`<${Fact} name="Stops" to="/console/robot" tone=${idle.length ? "warn" : ""}>${said}${idle.length > 0 && html`, <${Given} value=${idle[0].name} most=${40} /> ${idle[0].state === "off" ? "is off" : "only records"}${idle.length > 1 && ` and ${idle.length - 1} more`}`}</${Fact}>`;
+  return html`<${Fact} name="Stops" failed=${error && heard} to="/console/robot" tone=${idle.length ? "warn" : ""}>${said}${idle.length > 0 && html`, <${Given} value=${idle[0].name} most=${40} /> ${idle[0].state === "off" ? "is off" : "only records"}${idle.length > 1 && ` and ${idle.length - 1} more`}`}</${Fact}>`;
 }
 
 /** Whether the stop of a guard that acts has just begun. @param {any} guard @param {number | null} now */

@@ -118,6 +118,10 @@ def test_a_repeated_request_waits_for_its_answer_and_shows_its_age() -> None:
     repeated = [text for text in texts.values() if re.search(r"useResource\(.*\], [^)]", text)]
     assert len(repeated) == 5
     assert all("heard=${heard}" in text or "error && heard" in text for text in repeated)
+    own = [one.name for one, text in texts.items() if re.search(r"=> \(\{ \.\.\.\w+, error \}\)", text)]
+    assert sorted(own) == ["belief.js", "pad.js", "records.js", "resource.js"], (
+        "others use useResource or useFollowed"
+    )
 
 
 def test_a_view_is_loaded_when_it_is_opened(client: Client) -> None:

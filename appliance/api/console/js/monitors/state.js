@@ -1,34 +1,30 @@
 /** The monitors from `/v1/monitors`, fetched again after each change. */
 
-import { useEffect, useRef, useState } from "../html.js";
-import { live } from "../live.js";
+import { useRef } from "../html.js";
 import { growth } from "../numbers.js";
+import { useFollowed } from "../parts/resource.js";
 import { ask } from "../rest.js";
-import { useStore } from "../store.js";
 
 /**
  * `change` sends a change of one monitor. Changes are queued, because each change makes a new ETag: a second click
  * before the first answer applies to the result of the first click.
- * @returns {{body: any, etag: string, error: unknown, again: () => Promise<void>, change: (name: string, to: any) => Promise<void>}}
+ * @returns {{body: any, etag: string, error: unknown, heard: import("../elapsed.js").Mark | null, again: () => Promise<void>, change: (name: string, to: any) => Promise<void>}}
  */
 export function useMonitors() {
-  const [state, setState] = useState({ body: /** @type {any} */ (null), etag: "", error: /** @type {unknown} */ (null) });
-  const mark = useStore(live, (one) => JSON.stringify(one.status?.monitors ?? null));
-  // Samples lack the counts of shadow mode, which are fetched with each sample.
-  const trying = state.body?.monitors.some((/** @type {any} */ row) => row.shadow);
-  const counted = useStore(live, (one) => JSON.stringify([one.samples.at(-1)?.monitors ?? null, trying && one.samples.at(-1)?.time]));
   const shown = useRef({ etag: "", changes: 0, last: /** @type {Promise<unknown>} */ (Promise.resolve()) });
-  const again = async () => {
-    const { changes } = shown.current;
-    try {
-      const { body, etag } = await ask("GET", "/v1/monitors");
-      if (changes !== shown.current.changes) return; // a later change makes this answer outdated, and fetches again
+  const { value, error, heard, again } = useFollowed(async (signal) => {
+    for (;;) {
+      const { changes } = shown.current;
+      const { body, etag } = await ask("GET", "/v1/monitors", { signal });
+      if (changes !== shown.current.changes) continue; // a later change made this answer outdated
       shown.current.etag = etag ?? "";
-      setState({ body, etag: etag ?? "", error: null });
-    } catch (error) {
-      setState((state) => ({ ...state, error }));
+      return { body, etag: etag ?? "" };
     }
-  };
+  }, ({ status, samples }, known) => {
+    // Samples lack the counts of shadow mode, which are fetched with each sample.
+    const trying = known?.body.monitors.some((/** @type {any} */ row) => row.shadow);
+    return [status?.monitors, samples.at(-1)?.monitors, trying && samples.at(-1)?.time];
+  });
   const change = (/** @type {string} */ name, /** @type {any} */ to) => {
     const made = shown.current.last.then(async () => {
       try {
@@ -41,10 +37,7 @@ export function useMonitors() {
     shown.current.last = made.catch(() => {});
     return made;
   };
-  useEffect(() => {
-    again();
-  }, [mark, counted]);
-  return { ...state, again, change };
+  return { body: value?.body ?? null, etag: value?.etag ?? "", error, heard, again, change };
 }
 
 /** A monitor's state in one word. @param {any} row */

@@ -24,10 +24,11 @@ export function Monitors() {
   const { rest: chosen } = useStore(place);
   const monitors = useMonitors();
   const [loading, setLoading] = useState(false);
-  const { body, error, again } = monitors;
+  const { body, error, heard, again } = monitors;
   if (!body) return html`<div class="head"><h1>Monitors</h1></div>${error ? html`<${Failure} error=${error} retry=${again} />` : html`<section class="panel"><${Loading} rows=${8} /></section>`}`;
   const row = body.monitors.find((/** @type {any} */ one) => one.name === chosen);
-  if (chosen) return html`<${MonitorPage} key=${chosen} name=${chosen} row=${row} monitors=${monitors} />`;
+  const late = error ? html`<${Failure} error=${error} retry=${again} heard=${heard} />` : null;
+  if (chosen) return html`${late}<${MonitorPage} key=${chosen} name=${chosen} row=${row} monitors=${monitors} />`;
   const reload = () => attempt(async () => {
     const { body: now } = await ask("POST", "/v1/monitors/reload", { match: monitors.etag });
     done(`Revision ${now.revision} of the specifications is in force`, "They are the folder's.");
@@ -35,7 +36,7 @@ export function Monitors() {
   });
   return html`<div class="head"><h1>Monitors</h1><span class="head-sub">revision ${body.revision}, loaded <${Moment} at=${body.loaded} /> <${By} who=${body.who} />${body.note && html`: <${Given} value=${body.note} most=${80} />`}</span>
       <div class="head-actions"><${Button} role="admin" tone="primary" onClick=${() => setLoading(true)}><${Icon} name="up" size=${16} />Load a specification</${Button}></div></div>
-    <div class="standing">
+    <div class="standing">${late}
       ${body.refused.length > 0 && html`<${Notice} tone="deny" title="The relay rejected the specifications: all topics are blocked">${body.refused.map((/** @type {string} */ one) => html`<div key=${one}><${Given} value=${one} most=${400} /></div>`)}</${Notice}>`}
       ${body.differs_from_folder && html`<${Notice} title="The specifications in force differ from the folder"><div class="row"><span><${Given} value=${body.folder} mono most=${120} /></span><${Button} small role="operator" onClick=${reload}><${Icon} name="again" size=${14} />Load the folder's</${Button}></div></${Notice}>`}
       ${body.warnings.length > 0 && html`<details class="notice warn"><summary>${counted(body.warnings.length, "warning")} about the specifications</summary><ul class="plain-list">${body.warnings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${400} /></li>`)}</ul></details>`}</div>

@@ -1,11 +1,14 @@
 /** A fetched resource: its value, whether it is loading, its error, and a function to fetch it again. */
 
 import { mark } from "../elapsed.js";
-import { useCallback, useEffect, useRef, useState } from "../html.js";
+import { useCallback, useEffect, useMemo, useRef, useState } from "../html.js";
+import { live } from "../live.js";
 import { Problem } from "../problem.js";
 import { unlocked } from "../session.js";
+import { useStore } from "../store.js";
 
 const PATIENCE = 8000; // milliseconds without an answer, after which a repeated request has failed
+const GAP = 200; // milliseconds between two requests: a storm of changes needs no request for each
 
 /**
  * The answer to a request that is repeated. Without one in 8 s the request fails, and is cut off; a locked page asks nothing.
@@ -64,4 +67,51 @@ export function useResource(fetching, inputs, every = 0) {
     return () => clearTimeout(timer);
   }, [state, pause]);
   return { ...state, again, set };
+}
+
+/**
+ * A function that fetches, one request at a time: no older answer follows a newer one. What changes during a request is fetched
+ * once more before the promise ends. @param {() => Promise<void>} fetching never fails @returns {() => Promise<void>}
+ */
+export function inTurn(fetching) {
+  let running = /** @type {Promise<void> | null} */ (null);
+  let stale = false;
+  const fetchAll = async () => {
+    for (let first = true; stale; first = false) {
+      if (!first) await new Promise((done) => setTimeout(done, GAP));
+      stale = false;
+      await fetching();
+    }
+    running = null;
+  };
+  return () => {
+    stale = true;
+    return (running ??= fetchAll());
+  };
+}
+
+/**
+ * A resource that follows the appliance's state: fetched again when a part of the state is another, and with each state while the
+ * last request has failed. `value`, `error` and `heard` as in `useResource`.
+ * @template T
+ * @param {(signal: AbortSignal) => Promise<T>} fetching
+ * @param {(state: any, value: T | null) => any[]} part of the state in `live`
+ * @returns {{value: T | null, error: unknown, heard: import("../elapsed.js").Mark | null, again: () => Promise<void>}}
+ */
+export function useFollowed(fetching, part) {
+  const [state, setState] = useState({ value: /** @type {T | null} */ (null), error: /** @type {unknown} */ (null), heard: /** @type {import("../elapsed.js").Mark | null} */ (null) });
+  const newest = useRef(fetching);
+  newest.current = fetching;
+  const again = useMemo(() => inTurn(async () => {
+    try {
+      setState({ value: await inTime((signal) => newest.current(signal)), error: null, heard: mark() });
+    } catch (error) {
+      setState((state) => ({ ...state, error }));
+    }
+  }), []);
+  const changed = useStore(live, (one) => JSON.stringify([part(one, state.value), state.error ? one.heard?.steady : null]));
+  useEffect(() => {
+    again();
+  }, [changed]);
+  return { ...state, again };
 }

@@ -5,6 +5,7 @@ import { firstField, numericFields, valueOf } from "./fields.js";
 
 const SPAN = 60_000; // milliseconds
 const INTERVAL = 50; // least milliseconds between two values
+const PRESENT = 2000; // milliseconds: the age of a value that needs no word
 const LEFT = 52;
 const BOTTOM = 18;
 const TOP = 6;
@@ -16,7 +17,7 @@ export function FieldPlot(/** @type {import("./picture.js").Given} */ { parts, d
   const [field, setField] = useState("");
   const [fields, setFields] = useState(/** @type {string[]} */ ([]));
   const [wrong, setWrong] = useState("");
-  const [latest, setLatest] = useState(/** @type {number | null | undefined} */ (undefined));
+  const [said, setSaid] = useState("");
   const points = useRef(/** @type {Point[]} */ ([]));
   const shown = useRef("");
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
@@ -30,7 +31,7 @@ export function FieldPlot(/** @type {import("./picture.js").Given} */ { parts, d
     show("");
     setFields([]);
     setWrong("");
-    setLatest(undefined);
+    setSaid("");
     if (!topic) return undefined;
     const heard = (/** @type {any} */ message) => {
       setFields((known) => (known.length ? known : numericFields(message)));
@@ -42,14 +43,13 @@ export function FieldPlot(/** @type {import("./picture.js").Given} */ { parts, d
     const leave = door.subscribe(topic, { interval: INTERVAL }, heard, setWrong);
     const timer = setInterval(() => {
       draw(canvas.current, points.current);
-      setLatest(points.current.at(-1)?.value);
+      setSaid(newest(points.current.at(-1)));
     }, 100);
     return () => {
       clearInterval(timer);
       leave();
     };
   }, [door, topic]);
-  const said = latest === undefined ? "no value yet" : latest === null ? "NaN" : say(latest);
   return html`<section class="stack-tight" aria-label="Plot"><h3>Plot</h3>
     <div class="form-grid"><${parts.Field} label="Topic" value=${topic} set=${setTopic} options=${[["", "choose a topic"], ...topics.map(({ name }) => [name, name])]} />
       <${parts.Field} label="Field" mono value=${field} set=${show} list=${list} disabled=${!topic} /></div>
@@ -117,6 +117,13 @@ function line(/** @type {CanvasRenderingContext2D} */ pen, /** @type {number[][]
   pen.beginPath();
   for (const [x, y] of points) pen.lineTo(x, y);
   pen.stroke();
+}
+
+/** The newest value in words, with its age once it is not the present one. */
+function newest(/** @type {Point | undefined} */ point) {
+  if (!point) return "no value yet";
+  const age = performance.now() - point.time;
+  return `${point.value === null ? "NaN" : say(point.value)}${age < PRESENT ? "" : `, ${Math.round(age / 1000)} s ago`}`;
 }
 
 function say(/** @type {number} */ value) {
