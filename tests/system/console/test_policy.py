@@ -340,3 +340,56 @@ def test_an_older_revision_comes_back(appliance: Appliance, opened: Callable[...
     dialog.get_by_role("button", name="Roll back to revision 1").click()
     expect(reader.toast(f"Revision {before + 1} is in force")).to_be_visible()
     assert rest.get("/v1/policy").json["text"] == POLICY
+
+
+# For each pair of texts: whether the page calls them the same, and the removed and the added lines that it shows.
+_SHOWN = """async (pairs) => {
+  const { html, render } = await import("/console/static/vendor/preact.js");
+  const { Difference } = await import("/console/static/js/parts/difference.js");
+  return pairs.map(([old, now]) => {
+    const place = document.createElement("div");
+    render(html`<${Difference} old=${old} now=${now} same="the same" />`, place);
+    const of = (kind) => [...place.querySelectorAll(`.diff-line.${kind} > span:last-child`)]
+      .map((one) => one.textContent.replace(/^(removed|added): /, ""));
+    const shown = [place.textContent === "the same", of("removed"), of("added")];
+    render(null, place);
+    return shown;
+  });
+}"""
+
+
+def test_each_difference_of_two_texts_is_shown(opened: Callable[..., Reader]) -> None:
+    """At any line and any character: a colleague's rule may stand far down, or at the end of a long line."""
+    page = opened().go("policy")
+    for lines, line in ((1, 1), (4001, 4001), (20_000, 4001), (20_000, 20_000)):
+        for width, place in ((10, 1), (500, 401), (50_000, 1), (50_000, 50_000)):
+            before = ["same"] * lines
+            before[line - 1] = "x" * width
+            after = list(before)
+            after[line - 1] = "x" * (place - 1) + "ANOTHER" + "x" * (width - place)
+            texts = ["\n".join(one) for one in (before, after)]
+            same, removed, added = page.evaluate(_SHOWN, [texts])[0]
+            assert not same
+            assert removed != added
+            assert ["ANOTHER" in one for one in added] == [True]
+    assert page.evaluate(_SHOWN, [["a\nb", "a\nb"]]) == [[True, [], []]]
+    far = ["\n".join([first, *["same"] * 5000, last]) for first, last in (("a", "b"), ("c", "d"))]
+    same, removed, added = page.evaluate(_SHOWN, [far])[0]
+    assert not same
+    assert (removed[0], removed[-1], added[0], added[-1]) == ("a", "b", "c", "d")
+
+
+def test_no_earlier_revision_is_called_the_one_in_force(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    reader = opened()
+    page = reader.go("policy")
+    reader.write(POLICY + "# a change\n")
+    page.get_by_role("button", name="Load", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    loaded = page.get_by_role("tabpanel").get_by_text(f"Revision {revision(appliance)} is in force")
+    expect(loaded).to_be_visible()
+    assert appliance.rest().post("/v1/policy", POLICY, match="*").status == 200
+    expect(page.locator(".head-sub")).to_contain_text(f"revision {revision(appliance)} in force")
+    expect(page.get_by_role("tabpanel").get_by_text(re.compile(r"Revision \d+ is in force"))).to_have_count(0)

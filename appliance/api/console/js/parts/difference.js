@@ -4,13 +4,15 @@ import { html } from "../html.js";
 import { plain } from "../words.js";
 
 const AROUND = 3;
-const MAX = 4000; // lines of a text to compare
+const MAX = 4000; // lines between the first and the last difference in which equal lines are looked for
+const WIDE = 400; // characters of a line; of a longer one that differs, what differs is shown
+const BESIDE = 40; // characters around what differs
 
 /** @typedef {{kind: "same" | "added" | "removed", text: string, old: number | null, now: number | null}} DiffLine */
 
 /** @param {{old: string, now: string, same: string}} given `same`: the text for equal texts */
 export function Difference({ old, now, same }) {
-  const lines = difference(old, now);
+  const lines = cut(difference(old, now));
   if (lines.every((one) => one.kind === "same")) return html`<p class="muted">${same}</p>`;
   const near = lines.map((_, index) => lines.slice(Math.max(0, index - AROUND), index + AROUND + 1).some((one) => one.kind !== "same"));
   const shown = [];
@@ -35,13 +37,13 @@ export function UnifiedDiff({ lines }) {
 function Line(/** @type {{line: DiffLine}} */ { line }) {
   const sign = { same: " ", added: "+", removed: "−" }[line.kind];
   const word = { same: "", added: "added: ", removed: "removed: " }[line.kind];
-  return html`<div class=${`diff-line ${line.kind}`}><span class="n">${line.old ?? ""}</span><span class="n">${line.now ?? ""}</span><span class="sign" aria-hidden="true">${sign}</span><span>${word && html`<span class="sr-only">${word}</span>`}${plain(line.text, 400)}</span></div>`;
+  return html`<div class=${`diff-line ${line.kind}`}><span class="n">${line.old ?? ""}</span><span class="n">${line.now ?? ""}</span><span class="sign" aria-hidden="true">${sign}</span><span>${word && html`<span class="sr-only">${word}</span>`}${plain(line.text, line.kind === "same" ? WIDE : Infinity)}</span></div>`;
 }
 
 /** @param {string} old @param {string} now @returns {DiffLine[]} */
 export function difference(old, now) {
-  const a = old.split("\n").slice(0, MAX);
-  const b = now.split("\n").slice(0, MAX);
+  const a = old.split("\n");
+  const b = now.split("\n");
   let head = 0;
   while (head < a.length && head < b.length && a[head] === b[head]) head += 1;
   let tail = 0;
@@ -54,8 +56,45 @@ export function difference(old, now) {
   ];
 }
 
-/** The difference by longest common subsequence. */
+/** Cut long lines to what differs from the line that they replace. @param {DiffLine[]} lines @returns {DiffLine[]} */
+function cut(lines) {
+  /** @type {DiffLine[]} */
+  const found = [];
+  for (let at = 0; at < lines.length; ) {
+    const first = at;
+    while (at < lines.length && lines[at].kind !== "same") at += 1;
+    const texts = { removed: /** @type {string[]} */ ([]), added: /** @type {string[]} */ ([]) };
+    for (const { kind, text } of lines.slice(first, at)) texts[/** @type {"removed" | "added"} */ (kind)].push(text);
+    const next = { removed: 0, added: 0 };
+    for (const line of lines.slice(first, at)) {
+      const kind = /** @type {"removed" | "added"} */ (line.kind);
+      const other = texts[kind === "added" ? "removed" : "added"][next[kind]++];
+      found.push({ ...line, text: line.text.length > WIDE && other !== undefined ? differing(line.text, other) : line.text });
+    }
+    if (at < lines.length) found.push(lines[at++]);
+  }
+  return found;
+}
+
+function differing(/** @type {string} */ text, /** @type {string} */ other) {
+  const least = Math.min(text.length, other.length);
+  let head = 0;
+  while (head < least && text[head] === other[head]) head += 1;
+  let tail = 0;
+  while (tail < least - head && text[text.length - 1 - tail] === other[other.length - 1 - tail]) tail += 1;
+  const from = Math.max(0, head - BESIDE);
+  const to = Math.min(text.length, text.length - tail + BESIDE);
+  return `${from ? "… " : ""}${text.slice(from, to)}${to < text.length ? " …" : ""}`;
+}
+
+/** The difference by longest common subsequence; if the texts are too long for it, all of both. */
 function walked(/** @type {string[]} */ a, /** @type {string[]} */ b, /** @type {number} */ head) {
+  if (a.length > MAX || b.length > MAX) {
+    return [
+      ...a.map((text, i) => /** @type {DiffLine} */ ({ kind: "removed", text, old: head + i + 1, now: null })),
+      ...b.map((text, j) => /** @type {DiffLine} */ ({ kind: "added", text, old: null, now: head + j + 1 })),
+    ];
+  }
   const width = b.length + 1;
   const best = new Uint16Array((a.length + 1) * width);
   for (let i = a.length - 1; i >= 0; i -= 1)

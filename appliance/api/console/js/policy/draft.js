@@ -27,7 +27,8 @@ session.subscribe(() => {
 export async function look() {
   try {
     const { body, etag } = await ask("GET", "/v1/policy");
-    const { text, base, live } = draft.get();
+    const { text, base, live, report } = draft.get();
+    if (report?.loaded && report.revision !== body.revision) draft.update({ report: null });
     if (live === null || text === base) draft.update({ live: body, etag, base: body.text, text: body.text, error: null });
     else draft.update({ live: body, error: null });
   } catch (error) {
