@@ -51,10 +51,12 @@ class Reader:
         theme: str = "light",
         width: int = 1440,
         height: int = 900,
+        zone: str | None = None,
     ) -> None:
         self.url = url.rstrip("/")
         self.context = browser.new_context(
             viewport={"width": width, "height": height},
+            timezone_id=zone,
             color_scheme=theme,  # type: ignore[arg-type]  # one of its literals
             ignore_https_errors=True,  # test_rest_network checks the certificate
             accept_downloads=True,

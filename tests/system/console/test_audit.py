@@ -1,9 +1,12 @@
 import json
 import random
 import re
+import urllib.parse
 import zipfile
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import pytest
 from playwright.sync_api import Route, expect
@@ -418,3 +421,26 @@ def test_rows_are_in_the_order_of_the_times_that_they_show(opened: Callable[...,
     }"""
     folded, newer, older = (f"2026-11-28T14:03:0{second}.000000000Z" for second in (4, 9, 1))
     assert page.evaluate(ordered, [folded, newer, older]) == [newer, folded, older]
+
+
+@pytest.mark.parametrize("zone", ["America/New_York", "UTC", "Asia/Kolkata"])
+def test_each_time_of_a_search_is_in_the_zone_of_the_browser(
+    opened: Callable[..., Reader], zone: str
+) -> None:
+    reader = opened(zone=zone)
+    page = reader.go("audit")
+    page.get_by_role("button", name="Filters").click()
+    sent = {}
+    for label, name, written in (
+        ("From", "since", "2026-11-30T08:00"),
+        ("Until", "until", "2026-11-30T09:30"),
+    ):
+        page.get_by_label(label, exact=True).fill(written)
+        at = datetime.fromisoformat(written).replace(tzinfo=ZoneInfo(zone)).astimezone(UTC)
+        sent[name] = f"{at:%Y-%m-%dT%H:%M}:00.000Z"
+    expect(page).to_have_url(re.compile(re.escape(urllib.parse.urlencode(sent)) + "$"))
+    without_zone = {name: time.removesuffix(":00.000Z") for name, time in sent.items()}
+    for query in (sent, without_zone):
+        page.goto(f"{reader.url}/console/audit?{urllib.parse.urlencode(query)}")
+        expect(page.get_by_label("From", exact=True)).to_have_value("2026-11-30T08:00")
+        expect(page.get_by_label("Until", exact=True)).to_have_value("2026-11-30T09:30")

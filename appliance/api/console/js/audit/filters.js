@@ -25,9 +25,10 @@ export function auditPath(filter, record = "") {
   return `/console/audit${record ? `/${record}` : ""}${words ? `?${words}` : ""}`;
 }
 
-/** A time as an input of the browser has it, in its own zone; empty for a span or no time. @param {string | undefined} since */
-function local(since) {
-  const at = /^\d{4}-/.test(since ?? "") ? new Date(/** @type {string} */ (since)).getTime() : NaN;
+/** A time as an input of the browser has it, in its own zone; empty for a span or no time. Without a zone it is UTC, as in the log. */
+function local(/** @type {string} */ time = "") {
+  const zone = /[T ]\d\d:\d\d[\d:.]*$/.test(time) ? "Z" : "";
+  const at = /^\d{4}-/.test(time) ? new Date(time.replace(" ", "T") + zone).getTime() : NaN;
   return Number.isNaN(at) ? "" : new Date(at - new Date(at).getTimezoneOffset() * 60_000).toISOString().slice(0, 16);
 }
 
@@ -41,7 +42,7 @@ export function Filters({ filter, record }) {
   };
   const field = (/** @type {string} */ name, /** @type {any} */ extra) => html`<${Field} label=${LABELS[/** @type {keyof typeof LABELS} */ (name)]} value=${filter[name] ?? ""} set=${set(name)} ...${extra} />`;
   const custom = filter.since && !SINCE.some(([word]) => word === filter.since) ? /** @type {[string, string][]} */ ([[filter.since, local(filter.since).replace("T", " ") || filter.since]]) : [];
-  const from = (/** @type {string} */ value) => set("since")(value && new Date(value).toISOString());
+  const time = (/** @type {string} */ label, /** @type {string} */ name) => html`<${Field} label=${label} type="datetime-local" value=${local(filter[name])} set=${(/** @type {string} */ value) => set(name)(value && new Date(value).toISOString())} />`;
   return html`<div class=${`filters${more ? " all" : ""}`} role="search" aria-label="Audit log">
     <div class="filters-few">
       <div class="filters-text"><${Icon} name="search" size=${16} /><input class="input" type="search" data-search placeholder="Search in names, reasons and details" aria-label="Text" value=${filter.text ?? ""} onInput=${(/** @type {any} */ event) => set("text")(event.target.value)} /></div>
@@ -50,12 +51,12 @@ export function Filters({ filter, record }) {
       <button class="button" aria-expanded=${String(more)} onClick=${() => setMore(!more)}><${Icon} name="filter" size=${16} />Filters</button>
     </div>
     ${more && html`<div class="form-grid">
-      <${Field} label="From" type="datetime-local" value=${local(filter.since)} set=${from} />      ${field("host", { placeholder: "10.0.0.*, or a name", mono: true })}${field("caller_id", { placeholder: "/node", mono: true })}${field("resource", { placeholder: "/cmd_*", mono: true })}
+      ${time("From", "since")}${field("host", { placeholder: "10.0.0.*, or a name", mono: true })}${field("caller_id", { placeholder: "/node", mono: true })}${field("resource", { placeholder: "/cmd_*", mono: true })}
       ${field("rule", { placeholder: "Publishers, or a key", mono: true })}${field("category", { placeholder: "publish, command, monitor" })}${field("event", { placeholder: "decision, message dropped" })}${field("who", { placeholder: "name of a token, or operator" })}
-      ${field("looks", { options: LOOKS })}${field("severity", { options: SEVERITIES })}${field("until", { placeholder: "10m, or 2026-11-20T08:00", mono: true })}
+      ${field("looks", { options: LOOKS })}${field("severity", { options: SEVERITIES })}${time("Until", "until")}
     </div>`}
     ${Object.keys(filter).some((name) => !FEW.includes(name)) && html`<div class="row">${Object.entries(filter).filter(([name]) => !FEW.includes(name)).map(([name, value]) => html`<button key=${name} class="chip" onClick=${() => set(name)("")} aria-label=${`Remove the filter ${name}`}>
-      <span class="muted">${LABELS[/** @type {keyof typeof LABELS} */ (name)]}</span> <${Given} value=${value} most=${40} /><${Icon} name="close" size=${12} /></button>`)}
+      <span class="muted">${LABELS[/** @type {keyof typeof LABELS} */ (name)]}</span> <${Given} value=${(name === "until" && local(value).replace("T", " ")) || value} most=${40} /><${Icon} name="close" size=${12} /></button>`)}
       <button class="link small" onClick=${() => go(auditPath({}, record), { replace: true })}>Clear all</button></div>`}
   </div>`;
 }
