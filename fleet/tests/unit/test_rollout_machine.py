@@ -48,8 +48,8 @@ def begun(terms: Terms | None = None, gates: HealthGates = GATES) -> BundleRollo
     return BundleRollout(NEW, OLD, terms or Terms(0, RINGS), gates, 0.0)
 
 
-def all_at(now: float, in_force: str = NEW) -> dict[str, RobotSeen]:
-    return {robot: RobotSeen(now, in_force) for robot in ROBOTS}
+def all_at(now: float, in_force: str = NEW, most: int = 20) -> dict[str, RobotSeen]:
+    return {robot: RobotSeen(now, in_force) for robot in ROBOTS[:most]}
 
 
 @given(looks)
@@ -68,6 +68,8 @@ def test_the_invariants_hold_for_all_reports(
         assert rollout.ring - before.ring in (0, 1)
         if rollout.ring > before.ring:
             assert now >= rollout.terms.rings[rollout.ring].after
+            opens = [seen.seen for robot, seen in robots.items() if ring_of(rollout, robot) == rollout.ring]
+            assert not any(opens) or now - max(opens) <= GATES.silent_seconds
             if before.ring >= 0:
                 assert before.healthy is not None
                 assert now - before.healthy >= GATES.healthy_seconds
@@ -148,6 +150,45 @@ def test_robots_that_were_off_do_not_count() -> None:
     assert rollout.ring >= 1
 
 
+@given(st.lists(st.sampled_from([0, 200, 900, 10_000_000]), min_size=len(ROBOTS), max_size=len(ROBOTS)))
+def test_no_ring_passes_that_no_robot_was_judged_of(comes: list[int]) -> None:
+    began = dict(zip(ROBOTS, comes, strict=True))
+    rollout, robots = begun(), dict[str, RobotSeen]()
+    for now in range(1, 3000, 20):
+        robots = {
+            robot: RobotSeen(now, selected(rollout, robot, None)) if now >= begins else RobotSeen(-5000, OLD)
+            for robot, begins in began.items()
+        }
+        rollout = advanced(rollout, robots, now)
+        if rollout.state != "running":
+            break
+    taken = sum(seen.in_force == NEW for seen in robots.values())
+    judged = {ring_of(rollout, robot) for robot in rollout.baselines}
+    first = [begins for robot, begins in began.items() if ring_of(rollout, robot) == 0]
+    assert judged == set(range(rollout.ring + 1))
+    if rollout.state == "done":
+        assert rollout.why.startswith(f"in force on {taken} of 20 robots")
+    elif rollout.state == "running":
+        assert rollout.why == f"ring {RINGS[rollout.ring + 1].name} has no robot that reports"
+    else:
+        assert min(first) > GATES.ring_seconds
+
+
+@pytest.mark.parametrize(("refusing", "state"), [(["r3", "r4"], "running"), (["r3", "r4", "r5"], "stopped")])
+def test_refusals_of_robots_that_were_off_when_their_ring_opened_count(
+    refusing: list[str], state: RolloutState
+) -> None:
+    gates = msgspec.structs.replace(GATES, tolerance=0.1)
+    one = Terms(0, [Ring("all", [], 100)])
+    rollout = advanced(
+        begun(one, gates), {robot: RobotSeen(-5000, OLD) for robot in ROBOTS} | all_at(0, OLD, 1), 0
+    )
+    assert list(rollout.baselines) == ["r0"]
+    robots = all_at(60) | {robot: RobotSeen(60, OLD, "", NEW) for robot in refusing}
+    assert advanced(rollout, robots, 60).state == state
+    assert advanced(rollout, robots | {"r0": RobotSeen(60, NEW, failing=1)}, 60).state == "stopped"
+
+
 def test_a_ring_that_is_not_taken_stops_after_its_time() -> None:
     rollout = advanced(begun(), all_at(0, OLD), 0)
     assert advanced(rollout, all_at(900, OLD), 900).state == "running"
@@ -160,7 +201,7 @@ def test_a_canary_ring_without_robots_stops_after_its_time() -> None:
     robots = {"r9": RobotSeen(0, OLD)}
     rollout = advanced(begun(), robots, 0)
     assert rollout.ring == -1
-    assert "no robot of the first ring" in rollout.why
+    assert "ring canary has no robot that reports" in rollout.why
     assert stopped(rollout, "by hand").state == "stopped"
     assert advanced(rollout, robots, 1000).state == "running"
     assert advanced(rollout, robots, 1001).state == "stopped"

@@ -2,7 +2,8 @@
 
 1. A robot gets the bundle only if its ring is open, and no ring opens before its signed time.
 2. The next ring opens only after enough robots of all open rings have had the bundle in force, and been healthy, for
-   a time without interruption.
+   a time without interruption, and once one of its own robots reports: otherwise no robot could be judged. A ring
+   whose robots have never reported opens as well.
 3. If too many robots of an open ring are unhealthy, the rollout stops, and never continues.
 4. Every selection is the bundle of the rollout, the one before it, or one that the robot has from an earlier rollout,
    which was stopped.
@@ -66,8 +67,8 @@ class BundleRollout(msgspec.Struct, frozen=True):
 
     The rings up to `ring` are open; it is -1 before the first one opens at `opened`. `healthy` is the time since
     which all open rings have had the bundle and been healthy. `baselines` has the robots that were not silent when
-    their ring opened; no other robots are counted. `kept` has the bundles of earlier rollouts that were stopped: a
-    robot that has one keeps it until its ring opens. It is unset in rollouts that an earlier release stored.
+    their ring opened; of robots that were, only a refusal counts. `kept` has the bundles of earlier rollouts that were
+    stopped: a robot that has one keeps it until its ring opens. It is unset in rollouts that an earlier release stored.
     """
 
     path: str
@@ -156,7 +157,10 @@ def _healthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float
     if now - healthy < rollout.gates.healthy_seconds:
         return since
     if rollout.ring + 1 == len(rollout.terms.rings):
-        return msgspec.structs.replace(since, state="done", why="in force in all rings")
+        taken = sum(seen.in_force == rollout.path for seen in robots.values())
+        missing = "" if taken == len(robots) else "; the others get it when they report"
+        why = f"in force on {taken} of {counted(len(robots), 'robot')}{missing}"
+        return msgspec.structs.replace(since, state="done", why=why)
     return _open(since, robots, now)
 
 
@@ -210,14 +214,15 @@ def _open(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -
     if now < earliest:
         why = f"ring {rollout.terms.rings[index].name} is signed to begin in {earliest - now:.0f} s"
         return msgspec.structs.replace(rollout, why=why)
+    members = {robot: seen for robot, seen in robots.items() if ring_of(rollout, robot) == index}
     fresh = {
         robot: Baseline(seen.denials, seen.failing)
-        for robot, seen in robots.items()
-        if ring_of(rollout, robot) == index and now - seen.seen <= rollout.gates.silent_seconds
+        for robot, seen in members.items()
+        if now - seen.seen <= rollout.gates.silent_seconds
     }
-    if not fresh and index == 0:
-        why = f"no robot of the first ring, {rollout.terms.rings[0].name}, reports"
-        if now - max(rollout.started, rollout.opened, earliest) > rollout.gates.ring_seconds:
+    if not fresh and (index == 0 or any(seen.seen for seen in members.values())):
+        why = f"ring {rollout.terms.rings[index].name} has no robot that reports"
+        if index == 0 and now - max(rollout.started, rollout.opened, earliest) > rollout.gates.ring_seconds:
             return _stopped(rollout, f"{why}, after {rollout.gates.ring_seconds:g} s")
         return msgspec.structs.replace(rollout, why=why)
     return msgspec.structs.replace(
@@ -232,8 +237,8 @@ def _open(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -
 
 def unhealthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> dict[str, str]:
     found = {}
-    for robot, baseline in rollout.baselines.items():
-        why = _why(rollout, robots[robot], baseline, now) if robot in robots else ""
+    for robot, seen in robots.items():
+        why = _why(rollout, seen, rollout.baselines.get(robot), now) if _judged(rollout, robot, seen) else ""
         if why:
             found[robot] = why
     return found
@@ -243,13 +248,19 @@ def _members(rollout: BundleRollout, robots: Mapping[str, RobotSeen], index: int
     return [robot for robot in rollout.baselines if robot in robots and ring_of(rollout, robot) == index]
 
 
-def _why(rollout: BundleRollout, seen: RobotSeen, baseline: Baseline, now: float) -> str:
+def _judged(rollout: BundleRollout, robot: str, seen: RobotSeen) -> bool:
+    """Return whether a robot of an open ring was heard when its ring opened, or is heard since the last one opened."""
+    late = seen.seen > rollout.opened and ring_of(rollout, robot) <= rollout.ring
+    return late or robot in rollout.baselines
+
+
+def _why(rollout: BundleRollout, seen: RobotSeen, baseline: Baseline | None, now: float) -> str:
     gates = rollout.gates
-    if now - seen.seen > gates.silent_seconds:
+    if baseline is not None and now - seen.seen > gates.silent_seconds:
         return f"silent for {now - seen.seen:.0f} s"
     if seen.refused == rollout.path:
         return f"refused: {seen.reason[:200]}"
-    if rollout.path not in (seen.in_force, seen.trying):
+    if baseline is None or rollout.path not in (seen.in_force, seen.trying):
         return ""
     if seen.failing > baseline.failing:
         return f"{counted(seen.failing, 'monitor fails', 'monitors fail')}, {baseline.failing} before"
@@ -264,9 +275,15 @@ def _unhealthy_ring(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now
         members = _members(rollout, robots, index)
         if not members and any(ring_of(rollout, robot) == index for robot in rollout.baselines):
             return f"no robot of ring {rollout.terms.rings[index].name} is enrolled in the group any more"
-        ill = [robot for robot in members if robot in sick]
-        if len(ill) > rollout.gates.tolerance * len(members):
-            return _why_sick(rollout, index, ill, len(members), sick[ill[0]])
+        judged = [
+            robot
+            for robot, seen in robots.items()
+            if ring_of(rollout, robot) == index and _judged(rollout, robot, seen)
+        ]
+        for all_of in (members, judged):  # robots that came later make the tolerance for the others no larger
+            ill = [robot for robot in all_of if robot in sick]
+            if len(ill) > rollout.gates.tolerance * len(all_of):
+                return _why_sick(rollout, index, ill, len(all_of), sick[ill[0]])
     return ""
 
 
