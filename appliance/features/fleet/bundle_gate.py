@@ -4,7 +4,8 @@
    the appliance ends during a trial, the next start rolls back.
 2. The bundle in force changes in one write, at the end of a trial in which the robot stayed healthy.
 3. A rollback never undoes a change that an operator made during the trial.
-4. A refused bundle changes nothing; the last good one stays in force.
+4. A refused bundle changes nothing; the last good one stays in force. No bundle is refused because the robot is worse
+   than in a minute that control does not know.
 5. A bundle whose monitors would hold topics with traffic is not loaded yet: the robot would get no command, not even
    a stop.
 6. With `bundles.wait_for_order`, each try of a bundle needs an order of an operator on the robot.
@@ -101,6 +102,7 @@ _log = structlog.get_logger()
 _SETTING = "fleet bundle"
 _TICK_SECONDS = 1.0
 _AGAIN_SECONDS = 5.0
+_KNOWN_SECONDS = 60.0  # the time of `LastMinute`
 _INTERRUPTIONS = 3  # trials of one bundle that may end with the process before the bundle is refused
 _REFUSALS = (
     DeclaredHostsError,
@@ -118,6 +120,10 @@ _UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle wai
 
 class _OperatorChangeError(Exception):
     """An operator changed a part of the bundle during its commit-confirm."""
+
+
+class _UnknownBeforeError(Exception):
+    """The robot became worse than in a minute of which control does not know the whole."""
 
 
 class Trial(msgspec.Struct, frozen=True):
@@ -191,6 +197,7 @@ class BundleGate:
         self._offered: BundleOffered | None = None
         self._there = asyncio.Event()
         self._waits = ""
+        self._known = self._rests = 0.0  # when control knows a whole minute; when bundles are tried again
         self._for_order: BundleOffered | None = None
         self._ordered: BundleOffered | None = None
         self._fingerprinted: tuple[object, str] = (None, "")
@@ -231,6 +238,7 @@ class BundleGate:
             await self._undo_interrupted(self._record, self._record.trial)
         if self._record.policy_back:
             self._earlier = await self._policies.compiled(self._record.policy_back)
+        self._known = clock.now() + _KNOWN_SECONDS
         while self._fleet.bundles.root is not None:
             self._state()
             try:
@@ -325,7 +333,7 @@ class BundleGate:
         record, contents = self._record, offered.contents
         refused = record.refused
         # The process may have offered the bundle again before it heard of the trial.
-        if (offered.path, offered.sha256) in (
+        if clock.now() < self._rests or (offered.path, offered.sha256) in (
             (record.in_force, record.sha256),
             refused and (refused.path, refused.sha256),
         ):
@@ -366,20 +374,29 @@ class BundleGate:
         try:
             await self._keep(msgspec.structs.replace(record, trial=trial))
             await self._try(trial, contents, tag)
-        except (*_OUTDATED, _OperatorChangeError, StoreError) as error:
+        except (*_OUTDATED, _OperatorChangeError, _UnknownBeforeError, StoreError) as error:
             # It says nothing about the bundle, which is offered again.
-            self._waits = str(error) if isinstance(error, StoreError) else _CHANGED_DURING_TRIAL
+            has_text = isinstance(error, StoreError | _UnknownBeforeError)
+            self._waits = str(error) if has_text else _CHANGED_DURING_TRIAL
             # Before the rollback: after a crash in between, the next start rolls back.
             self._save(msgspec.structs.replace(record, trial=trial))
             await self._end(trial)
             self._save(record)
+            if isinstance(error, _UnknownBeforeError):
+                self._rests = clock.now() + _KNOWN_SECONDS  # until the last minute has nothing of the trial
 
     async def _try(self, trial: Trial, contents: BundleContents, tag: str) -> None:
         before, self._earlier = self._health(), self._policies.current
+        is_known = clock.now() >= self._known
         try:
             there = await self._put_in_force(trial, contents, tag)
             self._held = frozenset(self._monitors.rollout.held - before.failing)
             reason = await self._watch(before, there)
+            if reason and not is_known:
+                raise _UnknownBeforeError(
+                    f"{trial.path} is rolled back, and tried again at a poll after a minute, because it was tried right"
+                    f" after a start of the appliance: {reason}"
+                )
         except _REFUSALS as error:
             reason = str(error)
         if reason:

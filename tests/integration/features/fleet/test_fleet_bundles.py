@@ -145,7 +145,8 @@ def test_an_unhealthy_bundle_goes_back_in_all_parts(site: tuple[BundleSite, str]
         with master_at(appliance.master_uri) as master:
             for number in range(30):
                 master.setParam("/worker", f"/value{number}", number)
-        assert "denials" in refused(appliance, path)
+        eventually(lambda: "denials" in bundles_of(appliance)["trouble"], appliance.story)
+        assert not bundles_of(appliance)["refused"], "it was tried right after the start"
         assert appliance.status()["monitors"]["loaded"] == 0
         assert "Publishers" in appliance.rosrv("policy", "show").stdout
         assert "ocu-9" not in appliance.rosrv("host", "list").stdout
