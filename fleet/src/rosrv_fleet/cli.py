@@ -22,7 +22,7 @@ from appliance.formats.fleet_membership import Invitation
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import LEAST_SILENT_SECONDS, FleetConfigError, load_config
-from rosrv_fleet.database import migrate
+from rosrv_fleet.database import migrate, note_complete
 from rosrv_fleet.enrolment import EnrolmentError, Robot, RobotGroup, check_name
 from rosrv_fleet.evidence.commands import evidence
 from rosrv_fleet.index_commands import report_app, search, who_drove
@@ -390,10 +390,13 @@ def reindex(config: Config = DEFAULT_CONFIG) -> None:
     collector = make_collector(load_config(config))
     with psycopg.connect(collector.config.database) as connection:
         migrate(connection)
-        connection.execute("TRUNCATE segment, record")
+        connection.execute("TRUNCATE segment, record, complete")
     collector.database.open()
     try:
         indexed, damaged = _index_all(collector)
+        if not damaged:
+            with collector.database.writing() as connection:
+                note_complete(connection)
     finally:
         collector.database.close()
     note(f"{counted(indexed, 'segment is', 'segments are')} indexed")

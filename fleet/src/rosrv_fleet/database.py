@@ -17,6 +17,7 @@ from psycopg_pool import ConnectionPool
 MIGRATIONS = Path(__file__).with_name("migrations")
 _MIGRATION_LOCK = 0x726F7372  # one collector migrates at a time
 _CONNECT_SECONDS = 5.0
+INCOMPLETE = "the index does not have all stored segments: run rosrv-fleet reindex, or wait for its end"
 _log = structlog.get_logger()
 
 Row = tuple[Any, ...]
@@ -59,6 +60,15 @@ class IndexDatabase:
             connection.execute("SET TRANSACTION READ ONLY")
             connection.execute("SELECT set_config('statement_timeout', %s, true)", (str(self._statement_ms),))
             yield connection
+
+
+def is_complete(connection: Connection) -> bool:
+    """Return whether each stored segment is in the index, or waits for it."""
+    return connection.execute("SELECT FROM complete").fetchone() is not None
+
+
+def note_complete(connection: Connection) -> None:
+    connection.execute("INSERT INTO complete VALUES (true) ON CONFLICT DO NOTHING")
 
 
 def migrate(connection: Connection, folder: Path = MIGRATIONS) -> list[str]:

@@ -33,7 +33,7 @@ from appliance.formats.machine_report import (
 from appliance.formats.report_words import host_words, page, report_lines
 from rosrv_fleet.collector import make_collector
 from rosrv_fleet.config import load_config
-from rosrv_fleet.database import Connection, IndexDatabase, Row
+from rosrv_fleet.database import INCOMPLETE, Connection, IndexDatabase, Row, is_complete
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import note
 from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
@@ -68,7 +68,10 @@ def fleet_report(
     try:
         with database.reading() as connection:
             logs = [CollectedLog(*row) for row in connection.execute(*logs_statement(robot))]
-            return report_of(logs, _rows(connection, robot), since, until, waiting=waiting, version=version)
+            found = report_of(logs, _rows(connection, robot), since, until, waiting=waiting, version=version)
+            if not is_complete(connection):
+                found.gaps.append(Gap(time_utc=rfc3339(until), event="not indexed", reason=INCOMPLETE))
+            return found
     except psycopg.errors.QueryCanceled as error:
         raise SearchTooLongError("the report took too long: give --robot, for fewer robots") from error
     except (psycopg.OperationalError, PoolTimeout, psycopg.errors.UndefinedTable) as error:
@@ -174,6 +177,8 @@ def search(
         typer.echo(json.dumps(record, separators=(",", ":")) if as_json else _line(record))
     if page.waiting:
         note(f"{page.waiting} stored segments are not indexed yet: this search misses them")
+    if not page.complete:
+        note(INCOMPLETE)
     if page.cursor is not None:
         note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 

@@ -14,7 +14,7 @@ from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.record_format import as_object, stored_entry
 from appliance.audit.search.query import FilterError
 from appliance.base.counted import counted
-from rosrv_fleet.database import IndexDatabase
+from rosrv_fleet.database import IndexDatabase, is_complete
 from rosrv_fleet.search_sql import FleetFilter, SearchCursor, days_statement, parse_cursor, search_statement
 
 LARGEST_FLEET_PAGE = 1000
@@ -63,12 +63,14 @@ class Searches:
 class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
     """A page of records, newest first, each with its `robot` and `log`, and the cursor of the next page.
 
-    `waiting` segments, counted up to 1,000, are not indexed yet, so the search misses them.
+    `waiting` segments, counted up to 1,000, are not indexed yet, so the search misses them. If the index is not
+    `complete`, it misses others until `rosrv-fleet reindex` has ended.
     """
 
     records: list[dict[str, Any]]
     cursor: str | None
     waiting: int
+    complete: bool
 
 
 def search_fleet(
@@ -77,7 +79,7 @@ def search_fleet(
     """Return a page of matching records. Raise `FilterError`, `SearchTooLongError` or `IndexDownError`."""
     after = None if cursor is None else parse_cursor(cursor)
     try:
-        rows = _rows(database, wanted, after, limit + 1)
+        rows, complete = _rows(database, wanted, after, limit + 1)
     except psycopg.errors.QueryCanceled as error:
         raise SearchTooLongError(
             "the search took too long: give a shorter time with since and until, or an exact name"
@@ -91,17 +93,18 @@ def search_fleet(
     records = [_record(row) for row in rows[:limit]]
     last = rows[limit - 1] if len(rows) > limit else None
     more = None if last is None else SearchCursor(last[4], last[0], last[3]).text()
-    return FleetPage(records=records, cursor=more, waiting=waiting)
+    return FleetPage(records=records, cursor=more, waiting=waiting, complete=complete)
 
 
 def _rows(
     database: IndexDatabase, wanted: FleetFilter, after: SearchCursor | None, limit: int
-) -> list[tuple[Any, ...]]:
+) -> tuple[list[tuple[Any, ...]], bool]:
     with database.reading() as connection:
         of_days, days = days_statement(wanted.record), None
         if of_days is not None:
             days = [day for (day,) in connection.execute(*of_days)]
-        return connection.execute(*search_statement(wanted, after, limit, days)).fetchall()
+        rows = connection.execute(*search_statement(wanted, after, limit, days)).fetchall()
+        return rows, is_complete(connection)
 
 
 def _record(row: tuple[Any, ...]) -> dict[str, Any]:

@@ -391,6 +391,18 @@ class SegmentStore:
                     return most
         return len(found)
 
+    def all_wait(self) -> bool:
+        """Return whether each segment waits for the index, as after the start of a new collector."""
+        return all(
+            any(
+                (self._folder / kind / robot.name / one.mark).exists()
+                for kind in ("pending", "large", "damaged")
+            )
+            for robot in _folders(self._folder / "segments")
+            for log in self.logs(robot.name)
+            for one in self.segments(robot.name, log)
+        )
+
     def indexed(self, place: SegmentPlace) -> None:
         for kind in ("pending", "large", "damaged"):
             self._unmark(kind, place)

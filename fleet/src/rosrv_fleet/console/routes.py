@@ -40,6 +40,7 @@ from rosrv_fleet.console.frame import (
     text,
 )
 from rosrv_fleet.console.rollout_pages import Act, confirm_page, group_page, groups_page
+from rosrv_fleet.database import INCOMPLETE
 from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.evidence.store import StoredEvidence
 from rosrv_fleet.health import FleetHealth, RobotState, health_of
@@ -110,6 +111,8 @@ def _shown(found: FleetPage, asked: Mapping[str, str], bundles: Sequence[StoredE
     missing = ""
     if found.waiting:
         missing = alert(f"{found.waiting:,} stored segments are not indexed yet: this search misses them.")
+    if not found.complete:
+        missing += alert(INCOMPLETE)
     rows = (_record(record, bundles) for record in found.records)
     return missing + table("Records", _SEARCH_COLUMNS, rows, "No record matches.") + more
 
