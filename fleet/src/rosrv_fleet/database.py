@@ -71,6 +71,25 @@ def note_complete(connection: Connection) -> None:
     connection.execute("INSERT INTO complete VALUES (true) ON CONFLICT DO NOTHING")
 
 
+_LOCKS_OF_A_DAY = 12  # of its partition and the partition's indexes
+_LOCKS = """
+    SELECT (SELECT count(*) FROM pg_inherits WHERE inhparent = 'record'::regclass),
+        current_setting('max_locks_per_transaction')::int, current_setting('max_connections')::int
+"""
+
+
+def too_few_locks(connection: Connection, searches: int) -> str:
+    """Return why this number of simultaneous searches of all days would fail, or ""."""
+    for days, locks, connections in connection.execute(_LOCKS):
+        needed = -(-searches * _LOCKS_OF_A_DAY * days // connections)
+        if locks < needed:
+            return (
+                f"searches of all {days} days of the index may fail: set max_locks_per_transaction of PostgreSQL to"
+                f" {2 * needed}, or keep fewer days (retention.index_days)"
+            )
+    return ""
+
+
 def migrate(connection: Connection, folder: Path = MIGRATIONS) -> list[str]:
     applied: list[str] = []
     with connection.transaction():

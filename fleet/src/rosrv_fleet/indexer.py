@@ -22,7 +22,7 @@ from appliance.audit.log.columns import StoredColumns
 from appliance.base import clock
 from appliance.formats.segments import SegmentError, SegmentReader
 from rosrv_fleet.config import FleetConfig
-from rosrv_fleet.database import INCOMPLETE, IndexDatabase, is_complete, migrate, note_complete
+from rosrv_fleet.database import INCOMPLETE, IndexDatabase, is_complete, migrate, note_complete, too_few_locks
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.robots import Robots
@@ -61,7 +61,7 @@ class Indexer:
         self._wake = {lane: threading.Event() for lane in LANES}
         self._failures: dict[str, str | None] = dict.fromkeys(LANES, "the index was not reached yet")
         self._checked = dict.fromkeys(LANES, 0.0)
-        self._damage = self._incomplete = ""
+        self._damage = self._incomplete = self._locks = ""
         self._killed = Counter[SegmentPlace]()
 
     @property
@@ -69,7 +69,8 @@ class Indexer:
         failures = [reason for reason in self._failures.values() if reason is not None]
         if failures or self._incomplete:
             return failures[0] if failures else self._incomplete
-        return self._damage if self._damage and any(map(self._is_damaged, self._robots.known())) else None
+        is_damaged = self._damage and any(map(self._is_damaged, self._robots.known()))
+        return (self._damage if is_damaged else self._locks) or None
 
     def _is_damaged(self, robot: str) -> bool:
         return bool(self._store.marked("damaged", robot, 1))
@@ -103,6 +104,7 @@ class Indexer:
                     if not is_complete(connection) and self._store.all_wait():
                         note_complete(connection)  # before this lane, or the other one, indexes the first
                     self._incomplete = "" if is_complete(connection) else INCOMPLETE
+                    self._locks = too_few_locks(connection, self._config.limits.searches)
                 self._checked[lane] = now
             return 0.0 if self.step(lane) else _IDLE_SECONDS
         except Exception as error:  # noqa: BLE001  after any failure, segments are indexed later

@@ -103,7 +103,8 @@ def _rows(
         of_days, days = days_statement(wanted.record), None
         if of_days is not None:
             days = [day for (day,) in connection.execute(*of_days)]
-        rows = connection.execute(*search_statement(wanted, after, limit, days)).fetchall()
+        statement = search_statement(wanted, after, limit, days)
+        rows = [] if days == [] else connection.execute(*statement).fetchall()  # no day would lock all
         return rows, is_complete(connection)
 
 

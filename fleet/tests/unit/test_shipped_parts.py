@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rosrv_fleet.config import Limits
 
 from tests.support.sources import ROOT
 
@@ -32,6 +33,15 @@ def test_the_collector_imports_only_what_is_shipped_with_it() -> None:
 def test_the_image_has_the_folders_of_the_wheel() -> None:
     copied = set(re.findall(r"^COPY appliance/(\w+) ", (ROOT / "fleet/Dockerfile").read_text(), re.MULTILINE))
     assert copied == SHIPPED
+
+
+def test_the_database_of_the_containers_has_locks_for_searches_of_five_years() -> None:
+    text = (ROOT / "fleet" / "postgres" / "postgresql.conf").read_text()
+    locks, connections = (
+        int(re.findall(rf"^{name} = (\d+)", text, re.MULTILINE)[0])
+        for name in ("max_locks_per_transaction", "max_connections")
+    )
+    assert locks * connections >= Limits().searches * 12 * 5 * 366
 
 
 def test_the_tests_import_only_what_is_shipped() -> None:

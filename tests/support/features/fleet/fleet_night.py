@@ -270,7 +270,7 @@ class FleetNight:
         for module, name, double in (
             (collector_module, "Workers", InlineWorkers), (push_routes, "processor_time", nullcontext),
             (psycopg, "connect", self._connect), (indexer, "migrate", lambda _connection: []),
-            (indexer, "is_complete", lambda _connection: True),
+            (indexer, "is_complete", lambda _connection: True), (indexer, "too_few_locks", lambda *_arguments: ""),
             (indexer, "_index_one", self._index), (collector, "drop_partitions", self._drop),
         ):  # fmt: skip
             monkeypatch.setattr(module, name, double)
