@@ -2,7 +2,9 @@
 
 import itertools
 import json
-from collections.abc import Iterable, Iterator
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -31,13 +33,14 @@ from appliance.formats.machine_report import (
     read_records,
 )
 from appliance.formats.report_words import host_words, page, report_lines
-from rosrv_fleet.collector import make_collector
+from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import load_config
 from rosrv_fleet.database import INCOMPLETE, Connection, IndexDatabase, Row, is_complete
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import note
 from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
-from rosrv_fleet.search_sql import FleetFilter, logs_statement, records_statement
+from rosrv_fleet.search_sql import FleetFilter, logs_statement, records_statement, regex_of
 
 # Report the interventions in the safety settings of many robots, from the index, as `rosrv report interventions`.
 #
@@ -47,21 +50,34 @@ from rosrv_fleet.search_sql import FleetFilter, logs_statement, records_statemen
 
 _LIVE = "not known to the collector: make the report of one robot on its machine"
 _PAGE = 2000
+_SECOND = 1_000_000_000
 
 
 class CollectedLog(NamedTuple):
-    """A log in the index: its last record, and the time of its earliest one (nanoseconds since the epoch)."""
+    """A log in the index: its last and first record, and the times of both (nanoseconds since the epoch)."""
 
     robot: str
     log: str
     last: int
     begins: int | None
+    first: int = 1
+    ends: int | None = None
 
 
 def fleet_report(
-    database: IndexDatabase, robot: str | None, since: int | None, until: int, *, waiting: int, version: str
+    database: IndexDatabase,
+    robot: str | None,
+    since: int | None,
+    until: int,
+    *,
+    waiting: int,
+    version: str,
+    heard: Mapping[str, float] | None = None,
 ) -> MachineReport:
     """Return the report of the robots whose names match. `waiting` is the number of segments that are not indexed yet.
+
+    `heard` has the time (seconds since the epoch) up to which each robot has pushed its records; 0: up to the last one
+    in the index.
 
     Raise `FilterError`, `SearchTooLongError` or `IndexDownError`.
     """
@@ -69,6 +85,7 @@ def fleet_report(
         with database.reading() as connection:
             logs = [CollectedLog(*row) for row in connection.execute(*logs_statement(robot))]
             found = report_of(logs, _rows(connection, robot), since, until, waiting=waiting, version=version)
+            found.gaps.extend(_missing(logs, heard or {}, until))
             if not is_complete(connection):
                 found.gaps.append(Gap(time_utc=rfc3339(until), event="not indexed", reason=INCOMPLETE))
             return found
@@ -76,6 +93,31 @@ def fleet_report(
         raise SearchTooLongError("the report took too long: give --robot, for fewer robots") from error
     except (psycopg.OperationalError, PoolTimeout, psycopg.errors.UndefinedTable) as error:
         raise IndexDownError("the index cannot be read now: try again; segments are still stored") from error
+
+
+def _missing(logs: Iterable[CollectedLog], heard: Mapping[str, float], until: int) -> Iterator[Gap]:
+    """Yield what the index lacks: records before the first ones of a log, and those after the last that arrived."""
+    ends: dict[str, int] = {}
+    for log in logs:
+        ends[log.robot] = max(ends.get(log.robot, 0), log.ends or 0)
+        if log.first > 1:
+            yield Gap(
+                time_utc=rfc3339(log.begins or until), event="not in the index", appliance=log.robot,
+                reason=f"the records before {log.first} of log {log.log}: a state that began there is not shown",
+            )  # fmt: skip
+    for robot, at in heard.items():
+        last = at or ends.get(robot, 0) / _SECOND
+        if robot not in ends:
+            yield Gap(
+                time_utc=rfc3339(until),
+                event="not in the index",
+                appliance=robot,
+                reason="all records of this robot",
+            )
+        elif last < until / _SECOND:
+            reason = "later records did not arrive: a state may have begun or ended since"
+            time = rfc3339(round(last * _SECOND))
+            yield Gap(time_utc=time, event="not collected since", appliance=robot, reason=reason)
 
 
 def _rows(connection: Connection, robot: str | None) -> Iterator[Row]:
@@ -236,17 +278,33 @@ def who_drove(
     Example: rosrv-fleet who-drove --at 14:03 --robot arm7
     """
     moment = parse_timestamp(at, clock.wall_ns())
-    rows = _report(config, robot, moment, moment + 1).drivers
-    for row in rows:
+    report = _report(config, robot, moment, moment + 1)
+    for gap in report.gaps:
+        note(printable(f"{gap.appliance}  {gap.event} {gap.time_utc}: {gap.reason}".strip()))
+    for row in report.drivers:
         if as_json:
             typer.echo(msgspec.json.encode(row).decode())
             continue
-        until = f"until {row.until_utc} ({row.ended_by})" if row.until_utc else "and holds it now"
+        until = (
+            f"until {row.until_utc} ({row.ended_by})"
+            if row.until_utc
+            else "and still in the last collected record"
+        )
         host = host_words(row.state, row.names)
         typer.echo(
             printable(f"{row.appliance}  {row.what}: {host} since {row.since_utc}, {until}: {row.reason}")
         )
-    raise typer.Exit(0 if rows else 1)
+    if not report.drivers:
+        note("the index has no record that a host held a group then")
+    raise typer.Exit(0 if report.drivers else 1)
+
+
+def _heard(collector: Collector, robot: Robot, until: int) -> float:
+    """Return up to when all appliances of a robot have pushed; infinity if that is `until`, but for a usual silence."""
+    signs = [collector.presence.last(robot.name, name) for name in robot.connecting]
+    running = [0.0 if sign is None else sign.at for sign in signs if sign is None or not sign.off]
+    last = min(running, default=0.0 if robot.removed is not None else math.inf)
+    return math.inf if last + collector.config.silent_seconds >= until / _SECOND else last
 
 
 def _report(config: Path, robot: str | None, since: int | None, until: int) -> MachineReport:
@@ -255,6 +313,12 @@ def _report(config: Path, robot: str | None, since: int | None, until: int) -> M
     database.open()
     try:
         waiting = collector.store.waiting()
-        return fleet_report(database, robot, since, until, waiting=waiting, version=__version__)
+        matching = re.compile(regex_of(robot or "*"))
+        heard = {
+            one.name: _heard(collector, one, until)
+            for one in collector.robots.known().values()
+            if matching.search(one.name)
+        }
+        return fleet_report(database, robot, since, until, waiting=waiting, version=__version__, heard=heard)
     finally:
         database.close()

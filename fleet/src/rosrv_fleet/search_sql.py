@@ -146,10 +146,12 @@ def records_statement(events: Collection[str], robot: str | None) -> SearchState
 
 
 def logs_statement(robot: str | None) -> SearchStatement:
-    """Return the query for all logs: robot, log, last record, and the earliest time. Raise `FilterError`."""
+    """Return the query for all logs: robot, log, last record, times, and first record. Raise `FilterError`."""
     found = _Conditions()
     found.matching("robot", "robot = %s", "robot ~ %s", robot)
-    head: LiteralString = "SELECT robot, log, max(last), min(first_time) FROM segment"
+    head: LiteralString = (
+        "SELECT robot, log, max(last), min(first_time), min(first), max(last_time) FROM segment"
+    )
     return found.statement(head, " GROUP BY robot, log ORDER BY robot, log")
 
 

@@ -203,6 +203,28 @@ def test_a_day_that_is_dropped_while_its_segment_is_indexed(
     site.run("verify", "arm1")
 
 
+@pytest.mark.parametrize("ages", [[50, 1], [50, 40]], ids=["a part", "all"])
+def test_the_logbook_admits_what_retention_removed_and_what_did_not_arrive(
+    ages: list[int], site: FleetSite, make_robot: MakeRobot
+) -> None:
+    robot = make_robot("arm1")
+    _aged(site, robot, ages)
+    _restart_with_retention(site)
+    days = 1 + sum(age < 10 for age in ages)  # with today, on which they arrived
+    eventually(lambda: _days(site.database) == days, "retention removes old days")
+    assert site.data is not None
+    ((heard,),) = [list((site.data / "heard" / "arm1").iterdir())]
+    os.utime(heard, (time.time() - 3 * 3600,) * 2)
+    report = json.loads(site.run("report", "interventions", "--json").stdout)
+    lacks = {gap["event"] for gap in report["gaps"] if gap["appliance"] == "arm1"}
+    assert "not in the index" in lacks
+    assert ("not collected since" in lacks) is (min(ages) < 10)
+    noted = site.run("who-drove", "--at", "1s", "--robot", "arm?", status=1).stderr
+    assert "arm1  not in the index" in noted
+    assert "the index has no record that a host held a group then" in noted
+    assert "arm1" not in site.run("who-drove", "--at", "1s", "--robot", "arm2", status=1).stderr
+
+
 def test_a_day_whose_segments_were_not_indexed_is_dropped(database: str) -> None:
     today = datetime.now(UTC).date()
     with psycopg.connect(database) as connection:

@@ -1,8 +1,9 @@
+import math
 from typing import Any
 
 import msgspec
 import pytest
-from rosrv_fleet.index_commands import CollectedLog, report_of
+from rosrv_fleet.index_commands import CollectedLog, _missing, report_of
 from rosrv_fleet.search_sql import logs_statement, records_statement
 
 from appliance.audit.log.columns import to_columns
@@ -80,6 +81,25 @@ def test_a_state_from_before_the_period_still_counts() -> None:
     report = made(round(3.5 * HOUR))
     assert [intervention.event for intervention in report.interventions] == ["monitor enabled"]
     assert [one.since_utc[11:13] for one in report.switched_off] == ["01"]
+
+
+@pytest.mark.parametrize(
+    ("first", "ends", "heard", "lacks"),
+    [
+        (1, 8, 9, []), (1, 8, math.inf, []), (1, 8, 7, ["not collected since 07"]),
+        (1, 8, 0, ["not collected since 08"]), (1, None, 0, ["not collected since 00"]),
+        (5, 8, 9, ["not in the index 02"]), (5, 8, 7, ["not in the index 02", "not collected since 07"]),
+        (None, None, 9, ["not in the index 09"]),
+    ],
+)  # fmt: skip
+def test_a_state_that_the_index_may_lack_is_a_gap_of_its_robot(
+    first: int | None, ends: int | None, heard: float, lacks: list[str]
+) -> None:
+    """`first` is None without a log; the report ends at 9 hours."""
+    logs = [CollectedLog("arm1", "a", 9, 2 * HOUR, first, ends and ends * HOUR)] if first else []
+    found = list(_missing(logs, {"arm1": heard * 3600}, 9 * HOUR))
+    assert [f"{gap.event} {gap.time_utc[11:13]}" for gap in found] == lacks
+    assert {gap.appliance for gap in found} <= {"arm1"}
 
 
 def test_the_page_says_which_logs_it_read_and_what_it_cannot_know() -> None:
