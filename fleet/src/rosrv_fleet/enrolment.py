@@ -73,14 +73,15 @@ class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An enrolled robot. Its inherited fields describe its first `appliance`; `others` has the rest by name.
 
-    Removed appliances stay in `others`, because their segments are still verified. A robot without a `group`
-    (`SITE/GROUP`) gets no bundles.
+    Removed appliances stay in `others`, because their segments are still verified. Those that were removed at
+    `withdrawn`, with the whole robot, may join again. A robot without a `group` (`SITE/GROUP`) gets no bundles.
     """
 
     name: str
     group: str = ""
     appliance: str = FIRST
     others: dict[str, RobotAppliance] = {}
+    withdrawn: int | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def appliances(self) -> dict[str, RobotAppliance]:
@@ -125,25 +126,43 @@ def new_robot(name: str, made: RobotAppliance, group: str, appliance: str) -> Ro
 
 
 def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
-    if len(robot.connecting) >= _MAX_APPLIANCES or len(robot.appliances) >= _MAX_KNOWN:
+    """Return the robot with another appliance; if it was removed, only this one may connect."""
+    if len(robot.connecting) >= _MAX_APPLIANCES or len({*robot.appliances, appliance}) > _MAX_KNOWN:
         raise EnrolmentError(
             f"{robot.name} has the appliances {', '.join(robot.connecting)}; remove one first:"
             f" rosrv-fleet robot remove {robot.name} --appliance NAME"
         )
-    return msgspec.structs.replace(robot, others=robot.others | {appliance: made})
+    if robot.removed is None:
+        return msgspec.structs.replace(robot, others=robot.others | {appliance: made})
+    others = {
+        name: RobotAppliance(
+            key=one.key,
+            certificate=one.certificate,
+            added=one.added,
+            removed=robot.removed if one.removed in (None, robot.withdrawn) else one.removed,
+        )
+        for name, one in robot.appliances.items()
+        if name != appliance
+    }
+    return msgspec.structs.replace(
+        robot, appliance=appliance, key=made.key, certificate=made.certificate, added=made.added, removed=None,
+        others=others, withdrawn=robot.removed,
+    )  # fmt: skip
 
 
 def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
-    """Return the robot with a new certificate. A removed robot may connect again; its removed appliances may not."""
-    if appliance == robot.appliance:
-        return msgspec.structs.replace(robot, certificate=certificate, removed=None)
-    before = robot.others[appliance]
-    if before.removed is not None:
+    """Return the robot with a new certificate of an appliance, which may connect again if the robot was removed."""
+    before = robot.appliances[appliance]
+    if before.removed not in (None, robot.removed, robot.withdrawn):
         raise EnrolmentError(
             f"appliance {appliance} of {robot.name} was removed; an appliance with this log key cannot join again"
         )
-    changed = msgspec.structs.replace(before, certificate=certificate)
-    return msgspec.structs.replace(robot, others=robot.others | {appliance: changed}, removed=None)
+    if appliance == robot.appliance and robot.removed is None:
+        return msgspec.structs.replace(robot, certificate=certificate)
+    changed = RobotAppliance(key=before.key, certificate=certificate, added=before.added)
+    if appliance in robot.connecting:
+        return msgspec.structs.replace(robot, others=robot.others | {appliance: changed})
+    return with_appliance(robot, appliance, changed)
 
 
 def without_appliance(robot: Robot, appliance: str) -> Robot:

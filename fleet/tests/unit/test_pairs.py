@@ -1,6 +1,9 @@
+import tempfile
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.robots import Robots
 
@@ -52,3 +55,34 @@ def test_an_appliance_is_replaced(gone: str, tmp_path: Path) -> None:
     assert robot.public_keys == {new.raw, *(machine.raw for machine in machines.values())}
     robots.remove("arm7")
     assert (new.of(robots), machines[stays].of(robots)) == ("", "")
+
+
+acts = st.lists(
+    st.tuples(st.sampled_from(["join", "join", "remove", "remove one"]), st.sampled_from("abc")), max_size=9
+)
+
+
+@given(acts)
+def test_an_appliance_may_connect_only_if_its_last_act_is_a_join(steps: list[tuple[str, str]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        robots, machines = Robots(Path(folder) / "robots"), {name: JoiningAppliance() for name in "abc"}
+        joined, removed, known = set[str](), set[str](), set[str]()
+        for act, name in steps:
+            try:
+                if act == "join":
+                    machines[name].certificate = make_own_certificate("arm7", 1)[1]
+                    machines[name].join(robots, name)
+                    joined.add(name)
+                    known.add(name)
+                else:
+                    robots.remove("arm7", name if act == "remove one" else "")
+                    joined = joined - {name} if act == "remove one" else set()
+                    removed |= {name} if act == "remove one" else set()
+            except EnrolmentError:
+                full = len(joined) == 2 and name not in joined
+                assert act != "join" or full or name in removed
+                assert act != "remove" or not known
+            for one, machine in machines.items():
+                expected = f"arm7/{one}" if one in joined else ""
+                if act != "join" or one != name or one in joined:
+                    assert machine.of(robots) == machine.of(Robots(robots.folder)) == expected
