@@ -20,9 +20,11 @@ from tests.support.waiting import eventually
 
 pytestmark = pytest.mark.usefixtures("ros_of_robot")
 NAT = "10.77.0.20"
-SETTINGS = "liveness: {interval: 0.5, silent: 3}\n"
+CLIENTS: list[Client] = ["rospy", "roscpp"]
+SETTINGS = "liveness: {interval: 0.5, silent: 3, shadow: 2}\n"
 DROP = "add table inet wall; add chain inet wall in { type filter hook input priority 0; }; "
 DROP += "add rule inet wall in ip saddr 10.77.0.2 tcp flags & (syn | ack) == syn drop"
+REJECT = f"{DROP.removesuffix('drop')}reject with tcp reset"
 
 
 @pytest.fixture(scope="module", params=["refuses", "drops"])
@@ -81,6 +83,10 @@ def test_a_tool_behind_nat_hears_what_is_there(appliance: Appliance, ros: RosSes
         assert "hello" in ros.run("rostopic", "echo", "-b", str(bag), "-n", "1", topic).stdout
 
 
+def states_of(appliance: Appliance, name: str) -> set[str]:
+    return {node.state for node in appliance.ask(GraphWanted()).nodes if node.name == name}
+
+
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
 def test_a_subscriber_behind_nat_stays_while_connected(
     appliance: Appliance, ros: RosSession, client: Client
@@ -90,17 +96,31 @@ def test_a_subscriber_behind_nat_stays_while_connected(
     began = time.monotonic()
     while time.monotonic() < began + 8:
         ear.wait_for(event="received", since=ear.mark())
-        assert "/ear" in {node.name for node in appliance.ask(GraphWanted()).nodes if node.state == "live"}
+        assert "live" in states_of(appliance, "/ear")
     assert (
         "received by /ear; it cannot be called (NAT)" in appliance.rosrv("topic", "info", "/chatter").stdout
     )
     ear.kill()
     began = time.monotonic()
-    eventually(
-        lambda: all(node.name != "/ear" for node in appliance.ask(GraphWanted()).nodes), "it is forgotten"
-    )
+    eventually(lambda: "live" not in states_of(appliance, "/ear"), "it is lost")
     (lost,) = appliance.recorded(event="node lost", caller_id="/ear")
     assert "it has no connection to a relay" in lost["reason"]
+
+
+@pytest.mark.parametrize(("number", "wall"), [(31, REJECT), (32, DROP)], ids=["rejects", "drops"])
+def test_a_subscriber_behind_a_firewall_stays_while_connected(
+    appliance: Appliance, laptop: tuple[Lab, Host], tmp_path: Path, number: int, wall: str
+) -> None:
+    walled = laptop[0].host(f"walled{number}", f"10.77.0.{number}/24")
+    load(walled.namespace, "nft", wall)
+    with RosSession(appliance.master_uri, tmp_path, walled) as ros:  # its nodes have ROS_IP
+        ears = [ros.listener(client, "/chatter", name=f"{client}_{number}") for client in CLIENTS]
+        began = time.monotonic()
+        while time.monotonic() < began + 8:
+            for ear in ears:
+                ear.wait_for(event="received", since=ear.mark())
+        for client in CLIENTS:
+            assert states_of(appliance, f"/{client}_{number}") == {"live"}
 
 
 def test_a_client_behind_nat_calls_a_service(ros: RosSession) -> None:

@@ -8,7 +8,7 @@ EVENTS: dict[str, str] = {
     "unregistered": "A node withdrew a registration.",
     "revoked": "A registration, grant or connection was revoked because the policy no longer allows it.",
     "node lost": "A node no longer answers; its registrations are suspended until it returns or is removed.",
-    "node returned": "A lost node answers again.",
+    "node returned": "A lost node answers, or is connected, again.",
     "replaced": "A node registered again under its name from the same host; the earlier node got a shutdown call.",
     "takeover": "A node registered under a name that another host holds.",
     "policy loaded": "A policy came into force; `diff` has its changed lines (at most 32,768 characters).",

@@ -28,12 +28,10 @@ from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import Answer
 from appliance.policy.model import Address
 from appliance.rpc.server import Handler
-from roswire.names import ROSOUT
 
 _CONNECT_SECONDS = 1.0
 _PATIENT_SECONDS = 3.0  # also after the loss of a packet
 _AWAY_SECONDS = 600.0  # after which a lost node makes room for those of other hosts: it may be away for a day
-_OF_EVERY_NODE = ("get_loggers", "set_logger_level", "tf2_frames")  # private services of the client libraries
 
 _NOT_REGISTERED = "Because this node cannot be called"
 
@@ -97,7 +95,7 @@ class Arrivals:
         incarnation = await self.incarnation_for(caller, api)
         if incarnation.reached is not False:
             return incarnation
-        if resource == ROSOUT or resource in {f"{incarnation.name}/{service}" for service in _OF_EVERY_NODE}:
+        if incarnation.offered_by_every(resource):
             return None
         if await self.liveness.nodes.client(incarnation).reaches(_PATIENT_SECONDS):
             self.liveness.reached(incarnation)

@@ -189,7 +189,7 @@ class RosGraph:
             if self._others_offer(incarnation, service):
                 self.unregistered(incarnation, Kind.SERVICE, service)
         self.registry.revive(incarnation, clock.now())
-        self._record("node returned", f"{incarnation.name} answers again", incarnation)
+        self._record("node returned", f"{incarnation.name} answers, or is connected, again", incarnation)
 
     def forgotten(self, incarnation: Incarnation) -> None:
         self.registry.forget(incarnation)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 from appliance.channel import rosout_address
 from appliance.policy.model import Address
 from appliance.store.state_file import PermissionRow
+from roswire.names import ROSOUT
 from roswire.uris import NodeUri, node_uri
 
 ANY_TYPE = "*"
@@ -42,6 +43,7 @@ class Kind(enum.StrEnum):
     PARAMETER = "parameter"
 
 
+_OF_EVERY_NODE = ("get_loggers", "set_logger_level", "tf2_frames")  # private services of the client libraries
 OF_TOPICS = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
@@ -106,8 +108,14 @@ class Incarnation:
 
     @property
     def only_listens(self) -> bool:
-        kinds = {kind for kind, _resource in self.registrations}
-        return bool(kinds) and not kinds & {Kind.PUBLICATION, Kind.SERVICE}
+        """Whether it subscribes, and offers nothing but what every node does."""
+        offers = {Kind.PUBLICATION, Kind.SERVICE}
+        kinds = {kind for kind, resource in self.registrations if not self.offered_by_every(resource)}
+        return any(kind not in offers for kind, _resource in self.registrations) and not kinds & offers
+
+    def offered_by_every(self, resource: str) -> bool:
+        """Return whether the client libraries register this publication or service for every node."""
+        return resource == ROSOUT or resource in {f"{self.name}/{service}" for service in _OF_EVERY_NODE}
 
     @property
     def of_monitors(self) -> bool:

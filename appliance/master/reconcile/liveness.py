@@ -7,7 +7,8 @@ its name, and otherwise for a day, because its machine may be suspended or out o
 appliance for a moment, all nodes of a host look lost, so a lost node is checked more often at first.
 
 A node that only subscribes and was never reached, as behind NAT or a firewall, is there while it has a connection to a
-relay. It is forgotten after `silent` seconds without one, because it cannot answer later.
+relay. It is lost after `silent` seconds without one, and returns with the next: a refusal does not show that it ended.
+No lost node is forgotten while it has a connection, because its client would not ask for another grant.
 """
 
 import asyncio
@@ -220,9 +221,11 @@ class Liveness:
             presence = Presence.ANSWERS
         return Probe(incarnation, presence, patience)
 
+    def _only_listens(self, incarnation: Incarnation) -> bool:
+        return incarnation.only_listens and not incarnation.reached
+
     def _only_connects(self, incarnation: Incarnation) -> bool:
-        listens = incarnation.only_listens and not incarnation.reached
-        return listens and self.connects(incarnation.host, incarnation.name)
+        return self._only_listens(incarnation) and self.connects(incarnation.host, incarnation.name)
 
     def revive(self, incarnation: Incarnation) -> None:
         self._answered[incarnation.key] = clock.now()
@@ -250,16 +253,16 @@ class Liveness:
             self._answered[incarnation.key] = now
             self.reached(incarnation)
         refused = there is None and not self.shut_out()
-        if incarnation.life is Life.LIVE and not there and self._only_connects(incarnation):
+        ended = refused and ended and not self._only_listens(incarnation)
+        connected = not there and self._only_connects(incarnation)
+        if connected:
             self._answered[incarnation.key] = now
             incarnation.reached = False
-        elif incarnation.life is Life.LIVE and incarnation.reached is False:
-            if now - max(since, incarnation.touched) >= self.settings.silent:
-                if incarnation.registrations:
-                    self.graph.lost(incarnation, f"{why}, and it has no connection to a relay")
-                self._forget(incarnation)
-        elif incarnation.life is not Life.LIVE:
-            self._look_at_retired(incarnation, answered=bool(there), refused=refused, ended=refused and ended)
+        if incarnation.life is not Life.LIVE:
+            self._look_at_retired(incarnation, answered=there or connected, refused=refused, ended=ended)
+        elif incarnation.reached is False:
+            if not connected and now - max(since, incarnation.touched) >= self.settings.silent:
+                self._lose(incarnation, f"{why}, and it has no connection to a relay")
         elif refused or (not there and now - since >= self.settings.silent):
             self._lose(incarnation, why)
         elif there:
@@ -325,15 +328,20 @@ class Liveness:
     def _look_at_retired(
         self, incarnation: Incarnation, *, answered: bool, refused: bool, ended: bool
     ) -> None:
-        age = clock.now() - incarnation.changed
+        now, key = clock.now(), incarnation.key
         if incarnation.life is Life.REPLACED:
-            if refused or age > _REPLACED_SECONDS:
+            if refused or now - incarnation.changed > _REPLACED_SECONDS:
                 self._forget(incarnation)
             return
         replaced = self.registry.occupant(incarnation.name) is not None
         if answered and not replaced:
             self._bring_back(incarnation)
-        elif age > (self.settings.shadow if ended or replaced else max(self.settings.shadow, _AWAY_SECONDS)):
+            return
+        since = incarnation.changed if replaced else max(incarnation.changed, self._answered[key])
+        shadow = self.settings.shadow if ended or replaced else max(self.settings.shadow, _AWAY_SECONDS)
+        if now - since > shadow and not replaced and self.connects(incarnation.host, incarnation.name):
+            self._answered[key] = now
+        elif now - since > shadow:
             self._forget(incarnation)
 
     def _forget(self, incarnation: Incarnation) -> None:

@@ -11,7 +11,7 @@ from appliance.master.reconcile import liveness
 from appliance.master.reconcile.liveness import Presence
 from appliance.rpc.xmlrpc_client import NoRouteError, RefusedError, UnansweredError
 from roswire.xmlrpc import Value
-from tests.support.control_parts import OPEN, POLICY, ControlParts
+from tests.support.control_parts import HOST, OPEN, POLICY, ControlParts
 from tests.support.scripted_nodes import Answer
 from tests.support.virtual_clock import ShiftedClock
 
@@ -172,8 +172,8 @@ async def test_a_node_that_was_never_reached_is_there_while_it_is_connected(
     assert node.life is Life.LIVE, "it may connect again"
     world.liveness.settings = settings.LivenessSection(silent=0.0)
     await world.look(node)
-    assert world.lives == [Life.LIVE], "the node is forgotten"
     assert world.records.pairs[-1][0] == "node lost"
+    assert sorted(world.lives) == [Life.LIVE, Life.SHADOW], "it may connect again within a day"
 
 
 async def test_a_listener_that_ended_is_forgotten_while_its_next_start_is_connected() -> None:
@@ -210,6 +210,47 @@ async def test_a_node_that_answers_later_gets_what_it_missed(registers: bool) ->
         await world.look(node)
     assert node.reached
     assert {method for name, method, _given in world.deliveries.told if name == "/n"} == {"publisherUpdate"}
+
+
+@pytest.mark.parametrize("more", [None, "/rosout", "/initialpose"])
+@pytest.mark.parametrize("reached", [None, False, True])
+@pytest.mark.parametrize("away", [0.0, 1000.0])
+async def test_a_subscriber_keeps_its_grants_while_it_is_connected(
+    more: str | None, reached: bool | None, away: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its firewall refuses calls, and its link was away for a while: its client never asks for another grant."""
+    monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
+    world = ControlParts(silent=20.0)
+    await world.round()
+    ear, voice = world.node("/ear"), world.node("/voice", 2)
+    await world.register(voice, Kind.PUBLICATION, "/t")
+    await world.register(ear, Kind.SUBSCRIPTION, "/t")
+    if more is not None:
+        await world.register(ear, Kind.PUBLICATION, more)
+        await world.register(ear, Kind.SERVICE, "/ear/get_loggers")
+    world.graph.topic_granted(voice, "/t", HOST, "/ear")
+    ear.reached = reached
+    world.nodes.gone.add("/ear")
+    if away:
+        await world.look(ear)
+        await asyncio.sleep(20.0)
+        await world.look(ear)
+        assert ear.life is Life.SHADOW
+    comes_back = reached is not True and more != "/initialpose"
+    await asyncio.sleep(away if comes_back else 0.0)
+    world.carried.opened(0, messages.ConnectionOpened(1, voice.key, "/t", "topic", str(HOST), "/ear"))
+    for _check in range(3):
+        await world.look(ear)
+        assert len(world.grants.all()) == 1
+        await asyncio.sleep(world.liveness.settings.shadow + 1.0)
+    assert ear.life is (Life.LIVE if comes_back else Life.SHADOW)
+    world.reload(POLICY.format("", "/t=\n"))
+    await world.settle()
+    assert (world.grants.all(), [*ear.shelf]) == ([], [(Kind.SUBSCRIPTION, "/t")]), "the policy decides"
+    world.carried.lost(0)
+    await asyncio.sleep(86_401.0)
+    await world.look(ear)
+    assert ear.life is not Life.LIVE
 
 
 async def _refuses(_node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
