@@ -12,6 +12,7 @@ multimaster_fkie registers the nodes of other machines, in multicalls, which no 
 nodes are refused, because they would be subscribers that never connect.
 """
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,6 +32,7 @@ from appliance.rpc.server import Handler
 
 _CONNECT_SECONDS = 1.0
 _PATIENT_SECONDS = 3.0  # also after the loss of a packet
+_AGAIN_SECONDS = 0.3
 _AWAY_SECONDS = 600.0  # after which a lost node makes room for those of other hosts: it may be away for a day
 
 _NOT_REGISTERED = "Because this node cannot be called"
@@ -97,18 +99,27 @@ class Arrivals:
             return incarnation
         if incarnation.offered_by_every(resource):
             return None
-        if await self.liveness.nodes.client(incarnation).reaches(_PATIENT_SECONDS):
+        if await self._opens(incarnation):
             self.liveness.reached(incarnation)
             self.liveness.look_at(incarnation)
             return incarnation
         if incarnation.evictable:
             self.graph.forgotten(incarnation)
         raise NodeElsewhereError(
-            f"{self._elsewhere(caller, incarnation)}: behind NAT, as in a container's own network, a node can "
-            "subscribe and call services, but no node can connect to it. To publish or offer a service, run it with "
-            f"the host's network (docker run --network host), or publish its ports and set ROS_IP={caller.peer.text}, "
-            "or use a tunnel (rosrv host add)"
+            f"{self._elsewhere(caller, incarnation)}, so it can only subscribe and call services. To publish or offer "
+            f"a service, admit {incarnation.told} in that machine's firewall; behind NAT, as in a container's own "
+            "network, run the node with the host's network (docker run --network host), or publish its ports and set "
+            f"ROS_IP={caller.peer.text}, or use a tunnel (rosrv host add)"
         )
+
+    async def _opens(self, incarnation: Incarnation) -> bool:
+        """Return whether the node's port is open; a program may begin to listen a moment after it registers."""
+        client, end = self.liveness.nodes.client(incarnation), clock.now() + _PATIENT_SECONDS
+        while (left := end - clock.now()) > 0:
+            if await client.reaches(left):
+                return True
+            await asyncio.sleep(_AGAIN_SECONDS)
+        return False
 
     async def _check_place(self, caller: Caller, incarnation: Incarnation) -> None:
         if caller.own or incarnation.api.host == caller.peer.text:
@@ -124,8 +135,8 @@ class Arrivals:
 
     def _elsewhere(self, caller: Caller, incarnation: Incarnation) -> str:
         return (
-            f"{caller.peer.text} registers {caller.caller_id} at {incarnation.api_text[:80]}, but has no node on "
-            f"port {incarnation.api.port}"
+            f"{caller.peer.text} registers {caller.caller_id} at {incarnation.api_text[:80]}, but {incarnation.told} "
+            f"(the appliance) cannot connect to port {incarnation.api.port} of {caller.peer.text}"
         )
 
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:

@@ -78,14 +78,25 @@ async def test_a_node_that_cannot_be_called_may_only_listen() -> None:
         answer = await world.ask(name, "/far", *rest, uri)
         assert answer[0] == 0
         assert (
-            "10.0.0.5 registers /far at http://robot2:4000/, but has no node on port 4000: behind"
+            "10.0.0.5 registers /far at http://robot2:4000/, but 10.0.0.1 (the appliance) cannot connect to port 4000"
             in answer[1]
         )
-        assert all(way in answer[1] for way in ("--network host", "ROS_IP=10.0.0.5", "a tunnel"))
+        ways = "admit 10.0.0.1 in that machine's firewall", "--network host", "ROS_IP=10.0.0.5", "a tunnel"
+        assert all(way in answer[1] for way in ways)
         assert world.records.pairs[-1] == ("deny", rest[0])
     # A node with another address of its machine in its URI has its port open; the caller's own address needs no check.
     for node, api in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):
         assert (await world.ask("registerPublisher", node, "/t", *call, api))[0] == 1  # type: ignore[index]  # an answer is a list
+
+
+async def test_a_program_may_listen_a_moment_after_it_registers() -> None:
+    world = await ControlParts.begun()
+    world.nodes.gone.add("/late")
+    asyncio.get_running_loop().call_later(1.0, world.nodes.gone.clear)
+    answer: Any = await world.ask(
+        "registerPublisher", "/late", "/t", "std_msgs/String", "http://robot2:4000/"
+    )
+    assert answer[0] == 1, answer
 
 
 @pytest.mark.parametrize("method", ["registerSubscriber", "registerPublisher"])
@@ -131,7 +142,7 @@ async def test_a_refused_node_keeps_no_ports() -> None:
         answer: Any = await world.ask(
             "registerPublisher", "/far", "/t", "std_msgs/String", "http://robot2:4000/"
         )
-        assert "has no node on port 4000" in answer[1]
+        assert "cannot connect to port 4000" in answer[1]
     world.sinks.flush()
     assert len(world.places.unused) == 2 * _NODES
 
