@@ -38,6 +38,7 @@ from appliance.rpc.xmlrpc_client import (
     UnansweredError,
     UnreachedError,
 )
+from roswire.xmlrpc import FaultReceived
 
 
 class Presence(enum.Enum):
@@ -296,7 +297,8 @@ class Liveness:
                     return None, f"{incarnation.name}: {error}", not isinstance(error, NoRouteError)
                 await asyncio.sleep(_LOOK_AGAIN_SECONDS)
             except CallFailedError as error:
-                return False, f"{incarnation.name}: {error}", False
+                # A fault is an answer: a small client library may lack getPid.
+                return isinstance(error.__cause__, FaultReceived), f"{incarnation.name}: {error}", False
             else:
                 return True, "", False
         return False, "", False

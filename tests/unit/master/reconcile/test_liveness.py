@@ -9,8 +9,9 @@ from appliance.configuration import settings
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reconcile import liveness
 from appliance.master.reconcile.liveness import Presence
-from appliance.rpc.xmlrpc_client import NoRouteError, RefusedError, UnansweredError
-from roswire.xmlrpc import Value
+from appliance.rpc.xmlrpc_client import NoRouteError, RefusedError, UnansweredError, XmlRpcClient
+from roswire.uris import NodeUri
+from roswire.xmlrpc import Value, build_fault, build_response
 from tests.support.control_parts import HOST, OPEN, POLICY, ControlParts
 from tests.support.scripted_nodes import Answer
 from tests.support.virtual_clock import ShiftedClock
@@ -267,6 +268,49 @@ async def _is_silent(_node: Incarnation, _method: str, _parameters: tuple[Value,
 
 async def _is_another_process(_node: Incarnation, _method: str, _parameters: tuple[Value, ...]) -> Value:
     return [1, "", 77]
+
+
+def _replies(status: str, body: bytes) -> bytes:
+    return f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body
+
+
+@pytest.mark.usefixtures("local_sockets")
+@pytest.mark.parametrize(
+    ("reply", "stays"),
+    [
+        (_replies("200 OK", build_response([1, "", 7])), True),
+        (_replies("200 OK", build_response([0, "no", -1])), True),
+        (_replies("200 OK", build_response([])), True),
+        (_replies("200 OK", build_fault(1, 'method "getPid" is not supported')), True),
+        (_replies("501 Not Implemented", b""), False),
+        (_replies("200 OK", b"<html></html>"), False),
+        (None, False),
+    ],
+    ids=["process", "failure", "nothing", "fault", "501", "html", "silence"],
+)
+async def test_only_silence_refusal_and_another_program_lose_a_node(reply: bytes | None, stays: bool) -> None:
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/a")
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"</methodCall>")
+        if reply is None:
+            await asyncio.sleep(2.0)
+        writer.write(reply or _replies("200 OK", b""))
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    client = XmlRpcClient(NodeUri("http", "127.0.0.1", server.sockets[0].getsockname()[1], "/"), timeout=1.0)
+
+    async def answer(_node: Incarnation, method: str, parameters: tuple[Value, ...]) -> Value:
+        return await client.call(method, *parameters)
+
+    world.nodes.answer = answer
+    await world.liveness.look(node)
+    server.close()
+    await asyncio.sleep(3.0)  # until the connection is closed
+    assert (node.life is Life.LIVE) == stays
 
 
 @pytest.mark.parametrize(
