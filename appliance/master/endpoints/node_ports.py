@@ -194,7 +194,7 @@ class NodePorts:
 
 _log = structlog.get_logger()
 _ANSWER_SECONDS = 3.0
-_AGAIN_SECONDS = 30.0  # without an answer; each call of the host would wait again
+_AGAIN_SECONDS = 30.0  # without an address; each call of the host would wait again
 _MAX_ROUTES = 10_000
 
 
@@ -220,7 +220,7 @@ class AdvertisedAddresses:
         self._fixed = fixed
         self._tunnels = tunnels
         self._route_to = route_to
-        # By host: the address, and how long it is valid. After a question without an answer, it is asked again soon.
+        # By host: the address, and how long it is valid. Without an address, it is asked again soon.
         self._routes: dict[Address, tuple[str | None, float]] = {}
 
     def address_for(self, peer: Peer) -> str:
@@ -247,7 +247,8 @@ class AdvertisedAddresses:
             self._routes.clear()
         try:
             async with asyncio.timeout(_ANSWER_SECONDS):
-                self._routes[peer.host] = await self._route_to(peer.text), math.inf
+                found = await self._route_to(peer.text)
+            self._routes[peer.host] = found, math.inf if found else clock.now() + _AGAIN_SECONDS
         except TimeoutError:
             self._routes[peer.host] = None, clock.now() + _AGAIN_SECONDS
             _log.warning(

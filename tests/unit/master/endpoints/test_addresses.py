@@ -42,6 +42,34 @@ def test_a_host_learns_the_machines_new_address() -> None:
     assert addresses.address_for(host) == "192.168.1.9"
 
 
+@pytest.mark.parametrize(
+    ("answers", "told"),
+    [
+        (["192.168.1.7", "192.168.1.9"], "192.168.1.7"),
+        ([None, "192.168.1.9"], "192.168.1.9"),
+        ([TimeoutError(), "192.168.1.9"], "192.168.1.9"),
+    ],
+)
+def test_a_host_without_an_address_is_looked_up_again(
+    answers: list[str | TimeoutError | None], told: str
+) -> None:
+    async def route(_host: str) -> str | None:
+        answer = answers.pop(0)
+        if isinstance(answer, TimeoutError):
+            raise answer
+        return answer
+
+    addresses, host = AdvertisedAddresses([], route, "0.0.0.0"), peer("10.0.0.5", "10.0.0.1")
+
+    async def calls() -> None:
+        await addresses.learn(host)
+        await asyncio.sleep(31.0)
+        await addresses.learn(host)
+
+    autojump.run(calls())
+    assert addresses.address_for(host) == told
+
+
 def test_a_host_without_an_answer_waits_once_in_a_while() -> None:
     asked: list[str] = []
 
