@@ -67,7 +67,9 @@ class Subscribers:
             return
         self._valued.pop(node, None)
         self.delivery.drop(node)
-        if node.life is Life.REPLACED:
+        holder = self.registry.occupant(node.name)
+        same = holder is not None and holder.api_text == node.api_text  # its machine has another address
+        if node.life is Life.REPLACED and not same:
             reason = f"[{node.name}] Reason: new node registered with same name"
             self.delivery.push(node, NodeCall("shutdown", (reason,)))
 

@@ -1,8 +1,10 @@
 """Nodes get the lists that they missed because control died during a change, or because they were disconnected."""
 
+import ipaddress
+
 import pytest
 
-from appliance.master.graph.registry import Kind
+from appliance.master.graph.registry import Kind, Life
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 from tests.support.control_parts import HOST, POLICY, ControlParts
@@ -46,3 +48,19 @@ async def test_no_subscriber_is_absent_without_the_relay() -> None:
     for node in (ear, own):
         await world.register(node, Kind.SUBSCRIPTION, "/a")
     assert list(world.subscribers.absent(world.registry.live())) == [(own, "/a", [talker])]
+
+
+@pytest.mark.parametrize("other_host", [False, True])
+@pytest.mark.parametrize("other_uri", [False, True])
+async def test_a_replaced_node_is_shut_down_as_by_the_ros_master(other_host: bool, other_uri: bool) -> None:
+    """A laptop on Wi-Fi gets a cable, so the same node calls from another address, with the same URI."""
+    world = await ControlParts.begun()
+    first = world.node("/n", 1)
+    second = world.node("/n", 2, ipaddress.ip_address("10.0.0.6") if other_host else HOST)
+    if not other_uri:
+        second.api_text = first.api_text
+    await world.register(first, Kind.SUBSCRIPTION, "/a")
+    await world.register(second, Kind.SUBSCRIPTION, "/b")
+    assert first.life is Life.REPLACED
+    told = [method for _name, method, _params in world.deliveries.told]
+    assert ("shutdown" in told) == other_uri
