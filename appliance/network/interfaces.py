@@ -56,6 +56,8 @@ class Netlink(Protocol):
 
     def get_routes(self, **fields: int) -> Iterable[_Entry]: ...
 
+    def get_rules(self, **fields: int) -> Iterable[_Entry]: ...
+
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
     """Create a pair of interfaces, and set both up."""
@@ -264,6 +266,23 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
         raise NetworkError(f"no source address for {peer} in {namespace.name}")
 
     return _netlink(namespace, f"looking up the route to {peer}", look_up)
+
+
+def tables_of_sources(namespace: Namespace, link: str) -> list[tuple[str, int]]:
+    """Return each source with a routing table of its own, and that table, unless packets from `link` use it."""
+
+    def read(route: Netlink) -> list[tuple[str, int]]:
+        rules = [*route.get_rules(family=socket.AF_INET), *route.get_rules(family=socket.AF_INET6)]
+        tables = [(entry, entry.get_attr("FRA_TABLE") or entry["table"]) for entry in rules]
+        used = {table for entry, table in tables if entry.get_attr("FRA_IIFNAME") == link}
+        used |= {_LINK_SCOPE, _MAIN_TABLE, _LOCAL_TABLE}
+        return [
+            (str(entry.get_attr("FRA_SRC")), table)
+            for entry, table in tables
+            if entry["src_len"] and table not in used
+        ]
+
+    return _netlink(namespace, "listing routing rules", read)
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Netlink], T]) -> T:

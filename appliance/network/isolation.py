@@ -278,6 +278,11 @@ class Isolation:
             f"{chain} drops forwarded packets by default: let interface {link} pass in it, both ways"
             for chain in (*self._backend.foreign_forward_drops(), *iptables.foreign_forward_drops(self._host))
         ]
+        found += [
+            f"packets from {source} have routing table {table}, but the appliance's answers do not: `ip rule add iif"
+            f" {link} lookup {table}`, and `advertise` {source} to the networks behind it"
+            for source, table in interfaces.tables_of_sources(self._host, link)
+        ]
         if taken := self._listened((*self.settings.ports, *self._tcp)):
             holder = self._host.run(lambda: described(taken))
             found.append(f"{holder}, which leads to the appliance: give it another port")

@@ -419,6 +419,41 @@ def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path
         assert isolation.settings.link in obstacle
 
 
+def test_a_host_behind_a_router_reaches_the_appliance_unless_an_obstacle_is_named(
+    lab: Lab, bare: Host, node: Host, tmp_path: Path
+) -> None:
+    """A plain server is reached by each: its answers have the host's address, for which `ip rule` has a table."""
+    router = lab.host("router", "10.77.0.1/24", "10.78.0.1/24")
+    far = lab.host("far", "10.78.0.5/24", gateway="10.78.0.1")
+    router.namespace.sysctl("net.ipv4.ip_forward", "1")
+    interfaces.add_route(bare.namespace, "10.78.0.0/24", "10.77.0.1")
+
+    def reaches(host: Host) -> bool:
+        def connect() -> bool:
+            try:
+                socket.create_connection(("10.77.0.2", MASTER), timeout=1).close()
+            except OSError:
+                return False
+            return True
+
+        return bool(host.run(connect))
+
+    def ip(*words: str) -> None:
+        assert bare.popen(["ip", *words]).wait(timeout=20) == 0
+
+    with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER):
+        assert (reaches(node), reaches(far), isolation.obstacles()) == (True, True, ())
+        ip("route", "replace", "blackhole", "10.78.0.0/24")
+        ip("route", "add", "10.78.0.0/24", "via", "10.77.0.1", "dev", "eth0", "table", "100")
+        ip("rule", "add", "from", "10.77.0.2", "lookup", "100")
+        (obstacle,) = isolation.obstacles()
+        assert (reaches(node), reaches(far)) == (True, False)
+        remedy = obstacle.split("`")[1]
+        assert remedy == f"ip rule add iif {isolation.settings.link} lookup 100"
+        ip(*remedy.split()[1:])
+        assert (reaches(node), reaches(far), isolation.obstacles()) == (True, True, ())
+
+
 def test_an_unreadable_record_is_named(bare: Host, tmp_path: Path) -> None:
     wanted = settings(tmp_path)
     record = tmp_path / "isolation.json"
