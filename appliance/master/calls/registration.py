@@ -134,9 +134,11 @@ class Arrivals:
         incarnation.reached = False
 
     def _elsewhere(self, caller: Caller, incarnation: Incarnation) -> str:
+        six = caller.peer.host.version == 6
+        hint = " (set ROS_IPV6=on, or use an IPv4 address of the master)" if six else ""
         return (
             f"{caller.peer.text} registers {caller.caller_id} at {incarnation.api_text[:80]}, but {incarnation.told} "
-            f"(the appliance) cannot connect to port {incarnation.api.port} of {caller.peer.text}"
+            f"(the appliance) cannot connect to port {incarnation.api.port} of {caller.peer.text}{hint}"
         )
 
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:

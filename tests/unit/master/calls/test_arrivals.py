@@ -89,6 +89,15 @@ async def test_a_node_that_cannot_be_called_may_only_listen() -> None:
         assert (await world.ask("registerPublisher", node, "/t", *call, api))[0] == 1  # type: ignore[index]  # an answer is a list
 
 
+@pytest.mark.parametrize("host", ["10.0.0.5", "fd77::5"])
+async def test_the_denial_of_a_node_without_ipv6_names_its_variable(host: str) -> None:
+    world = await ControlParts.begun()
+    world.nodes.gone.add("/far")
+    call = ("registerPublisher", "/far", "/t", "std_msgs/String", "http://robot2:4000/")
+    answer: Any = await world.ask(*call, host=host)
+    assert (answer[0], "ROS_IPV6=on" in answer[1]) == (0, ":" in host)
+
+
 async def test_a_program_may_listen_a_moment_after_it_registers() -> None:
     world = await ControlParts.begun()
     world.nodes.gone.add("/late")
