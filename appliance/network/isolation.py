@@ -109,6 +109,9 @@ class IsolationSettings:
     ports: tuple[PortRange, ...]  # TCP
     master: int | None = None  # forwarded by `forward_master` only, when RVMaster answers
     datagrams: tuple[PortRange, ...] = ()  # UDP
+    refused: tuple[
+        tuple[Family, PortRange], ...
+    ] = ()  # ports on which the appliance does not listen in this family
     name: str = "rosrv"
     directory: Path = Path("/run/rosrv")  # for the record and the lock; shared by all appliances of a host
     takes_over: Callable[[], bool] = lambda: False  # whether a ROS master of the robot may listen on `master`
@@ -605,10 +608,21 @@ def isolation_rules(
             no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)
             rules.append(no_router(_no_router(family), PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
-        rules += [_forward("TCP", ports, end, outward) for ports in (*settings.ports, *tcp)]
+        there, refused = (
+            [
+                ports
+                for ports in (*settings.ports, *tcp, *master)
+                if ((family, ports) in settings.refused) is so
+            ]
+            for so in (False, True)
+        )
+        rules += [rule for ports in refused for rule in _refused(family, ports, outward)]
+        rules += [_forward("TCP", ports, end, outward) for ports in there if ports not in master]
         # A node's old connection to its own master may be new to the connection tracker: its packets stay there, so
         # that the node sees it end, and not a reset, after which roscpp looks a service up only once.
-        rules += [replace(_forward("TCP", ports, end, outward), opening=True) for ports in master]
+        rules += [
+            replace(_forward("TCP", ports, end, outward), opening=True) for ports in there if ports in master
+        ]
         rules += [_forward("UDP", ports, end, outward) for ports in (*settings.datagrams, *udp)]
         masqueraded = partial(PacketRule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
         rules.append(masqueraded(f"the appliance's own connections, IPv{family}", PacketVerdict.MASQUERADE))
@@ -640,6 +654,22 @@ def _loopback(family: Family, inward: Interface) -> PacketRule:
         local = partial(PacketRule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
         return local("from the host's own loopback", PacketVerdict.MASQUERADE)
     return PacketRule("not from ::1", PacketVerdict.RETURN, chain=Chain.NAT, destination="::1")
+
+
+def _refused(family: Family, ports: PortRange, outward: Interface) -> tuple[PacketRule, ...]:
+    """Return the rules that refuse connections at once, whichever chain drops what would be forwarded.
+
+    A client with addresses of both families goes on with the other. A program at ::1 is not the appliance's.
+    """
+    opening = partial(PacketRule, chain=Chain.IN, tcp_ports=ports, opening=True)
+    refuse = opening(
+        f"TCP {ports}: the appliance does not listen on IPv{family}",
+        PacketVerdict.RESET,
+        family=family,
+        arrives_on=outward,
+    )
+    own = opening(f"TCP {ports}: ::1 is the host's", PacketVerdict.RETURN, destination="::1")
+    return (own, refuse) if family == 6 else (refuse,)
 
 
 def _forward(

@@ -30,6 +30,7 @@ from appliance.network.esp import Esp, choose_esp, lend_tun
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.firewall_rules import (
     MAX_PORT,
+    Family,
     FirewallSettings,
     ForwarderAccess,
     OwnNetworkAccess,
@@ -71,6 +72,7 @@ class AppliancePorts:
     nodes: range
     own_node: range  # for messages of the appliance's own node
     inner: int | None = None
+    unserved: tuple[Family, ...] = ()  # families in which RVMaster and the nodes' ports do not listen
     api: int | None = None  # None: there is no REST
     api_networks: tuple[str, ...] = ()  # networks that may connect to REST; this machine always may
     own: int | None = None  # the port of the own node's master
@@ -484,6 +486,11 @@ class NetnsIsolation(ContainerIsolation):
                 ports=tuple(forwarded),
                 master=ports.master,
                 datagrams=datagrams,
+                refused=tuple(
+                    (family, span)
+                    for family in ports.unserved
+                    for span in (PortRange.one(ports.master), nodes)
+                ),
                 takes_over=work.takes_over,
                 holds=work.holds,
                 wants=work.wants,

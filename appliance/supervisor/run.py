@@ -23,7 +23,7 @@ from appliance.configuration.settings import Settings, Unasked
 from appliance.features.table import machine_work_in
 from appliance.network.boot_hold import BootHold, HeldPorts, starts_again
 from appliance.network.close_ports import local_port_range
-from appliance.network.firewall.firewall_rules import PeerAccess
+from appliance.network.firewall.firewall_rules import Family, PeerAccess, family_of
 from appliance.network.firewall.iptables import load_modules
 from appliance.network.namespaces import Namespace, NetworkError, has_privileges
 from appliance.supervisor import signals
@@ -300,6 +300,7 @@ def _run(
             master=master,
             rosmaster=settings.rosmaster_port,
             nodes=node_ports,
+            unserved=_unserved(settings.listen_address[0]),
             api=settings.api_address[1] if settings.api_address else None,
             api_networks=tuple(str(network) for network in settings.api_networks),
             receivers=tuple(
@@ -413,6 +414,11 @@ def _built(settings: Settings, isolation: NoIsolation) -> dict[str, socket.socke
     except BaseException:
         isolation.remove()
         raise
+
+
+def _unserved(listen: str) -> tuple[Family, ...]:
+    """Return the families of addresses to which this one does not answer; :: answers to both."""
+    return () if listen == "::" else (4,) if family_of(listen) == 6 else (6,)
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:

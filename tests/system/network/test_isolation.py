@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -429,14 +430,7 @@ def test_a_host_behind_a_router_reaches_the_appliance_unless_an_obstacle_is_name
     interfaces.add_route(bare.namespace, "10.78.0.0/24", "10.77.0.1")
 
     def reaches(host: Host) -> bool:
-        def connect() -> bool:
-            try:
-                socket.create_connection(("10.77.0.2", MASTER), timeout=1).close()
-            except OSError:
-                return False
-            return True
-
-        return bool(host.run(connect))
+        return host.run(lambda: _error("10.77.0.2")) is None
 
     def ip(*words: str) -> None:
         assert bare.popen(["ip", *words]).wait(timeout=20) == 0
@@ -452,6 +446,37 @@ def test_a_host_behind_a_router_reaches_the_appliance_unless_an_obstacle_is_name
         assert remedy == f"ip rule add iif {isolation.settings.link} lookup 100"
         ip(*remedy.split()[1:])
         assert (reaches(node), reaches(far), isolation.obstacles()) == (True, True, ())
+
+
+def test_a_family_without_a_listener_is_refused_whatever_others_drop(
+    bare: Host, node: Host, tmp_path: Path
+) -> None:
+    """rospy tries IPv6 first, without a time limit, and goes on with IPv4 after a refusal."""
+    wanted = settings(tmp_path)
+    wanted = replace(wanted, refused=tuple((6, ports) for ports in wanted.ports))
+
+    def errors() -> list[type[Exception] | None]:
+        return [node.run(partial(_error, address)) for address in (bare.address, bare.address6)]
+
+    isolation = Isolation(bare.namespace, wanted)
+    isolation.up()
+    try:
+        with serving(isolation.namespace, MASTER):
+            assert errors() == [None, ConnectionRefusedError]
+            run_in = ["nft", "add table ip6 engine; add chain ip6 engine FORWARD"]
+            run_in[1] += " { type filter hook forward priority 0; policy drop; }"
+            assert bare.popen(run_in).wait(timeout=20) == 0
+            assert errors() == [None, ConnectionRefusedError]
+    finally:
+        isolation.down()
+
+
+def _error(address: str) -> type[Exception] | None:
+    try:
+        socket.create_connection((address, MASTER), timeout=1).close()
+    except OSError as error:
+        return type(error)
+    return None
 
 
 def test_an_unreadable_record_is_named(bare: Host, tmp_path: Path) -> None:

@@ -61,6 +61,26 @@ def test_a_connection_to_the_own_master_that_began_without_the_rules_does_not_go
     assert isolation_rules(SETTINGS, ENDS, (), restored=True) == isolation_rules(SETTINGS, ENDS, ())
 
 
+@pytest.mark.parametrize("family", [4, 6])
+def test_ports_without_a_listener_are_refused_on_the_host(family: Family) -> None:
+    """Another program's chain cannot drop what is not forwarded, and the robot's own master there stays hidden."""
+    master = (PortRange.one(11312),)
+    refused = tuple((family, ports) for ports in (*master, SETTINGS.ports[1]))
+    rules = isolation_rules(replace(SETTINGS, refused=refused), ENDS, (), master=master)
+    forwarded = [
+        (str(rule.tcp_ports), rule.families()) for rule in rules if rule.verdict is PacketVerdict.DNAT
+    ]
+    other = (10 - family,)
+    assert sorted(forwarded) == sorted(
+        [("11311", (4,)), ("11311", (6,)), ("11312", other), ("20000-20099", other)]
+    )
+    reset = [rule for rule in rules if rule.verdict is PacketVerdict.RESET]
+    assert [(str(rule.tcp_ports), rule.families(), rule.chain, rule.opening) for rule in reset] == [
+        ("20000-20099", (family,), Chain.IN, True),
+        ("11312", (family,), Chain.IN, True),
+    ]
+
+
 def test_tunnels_are_forwarded_on_request() -> None:
     udp = (PortRange.one(500), PortRange.one(4500))
     added = set(isolation_rules(SETTINGS, ENDS, (), udp=udp)) - set(isolation_rules(SETTINGS, ENDS, ()))
