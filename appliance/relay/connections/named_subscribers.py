@@ -25,6 +25,7 @@ _CANCEL = "actionlib_msgs/GoalID"
 _RETRY_SECONDS = 1.0
 _GREETING_SECONDS = 2.0  # after the header, for the first message: some publishers greet in their own rhythm
 _SILENT_SECONDS = 0.1  # after the first bytes, or since the last ones of an unfinished message
+_GREETING_MESSAGES = 200  # more than the publishers of one topic in a node, each of which latches one
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
@@ -218,8 +219,8 @@ class Greeting:
         self._timer = self._context.loop.after(seconds, self._look)
 
     def _look(self) -> None:
-        whole = walk(memoryview(self._data))[0]
-        if whole < len(self._data) != self._seen:
+        whole, messages, _ = walk(memoryview(self._data), _GREETING_MESSAGES)
+        if messages < _GREETING_MESSAGES and whole < len(self._data) != self._seen:
             self._seen = len(self._data)
             self._wait(_SILENT_SECONDS)
         else:

@@ -578,10 +578,15 @@ class RelayedTopic:
 
     def _pass_stops(self, batch: Batch, since: float) -> None:
         """Pass only stops of commands that the publisher had latched before, one by one: others may lie between."""
-        for number, frame in enumerate(batch.frames()):
+        early = batch.head(max(0, batch.messages - _REPLAYS))
+        if early.messages:
+            self.latch.withheld = True
+            if self._stream is not None:
+                self._stream.write(early.view, early.messages, early.first)
+        for number, frame in enumerate(batch.frames(early.messages), batch.first + early.messages):
             one = Batch(memoryview(bytearray(frame)), 1, 0, owned=True)
-            one.first = batch.first + number
-            if number >= batch.messages - _REPLAYS and self._replayed(self, one.view[4:]):
+            one.first = number
+            if self._replayed(self, one.view[4:]):
                 self._receive(one, since)
                 continue
             self.latch.withheld = True

@@ -73,8 +73,8 @@ class Batch:
             return memoryview(bytes(self.view[sent:]))
         return self.keep()[sent:]
 
-    def frames(self) -> Iterator[memoryview]:
-        start = 0
+    def frames(self, after: int = 0) -> Iterator[memoryview]:
+        start = walk(self.view, after)[0]
         while start < len(self.view):
             end = start + _LENGTH.size + _unpack_length(self.view, start)[0]
             yield self.view[start:end]

@@ -840,3 +840,20 @@ def test_a_grant_is_compared_with_the_waiting_peers_of_its_host(
     world.state(GrantInstalled("k", "/chatter", hosts[1], "/stranger"))
     assert set(compared) == {hosts[1]}
     assert list(world.engine.waiting["k"]) == [hosts[0]]
+
+
+def test_a_greeting_of_very_many_messages_ends_early(world: World) -> None:
+    """The relay takes them one by one, in one turn."""
+    first = world.connect(encode_header(ASK))
+    publisher = world.upstream(HEADER | {"latching": "1"})
+    world.gets_header(first)
+    publisher.send(encode_frame(b"a") + encode_frame(b"b"))
+    world.gets(first, encode_frame(b"a") + encode_frame(b"b"))
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/second"))
+    second = world.connect(encode_header(ASK | {"callerid": "/second"}))
+    extra = world.accept(world.publisher)
+    assert world.gets_header(extra)["callerid"] == "/rosrv_newcomer"
+    extra.send(encode_header(HEADER | {"latching": "1"}) + encode_frame(b"") * 5000 + b"torn")
+    world.gets_header(second)
+    assert world.ends(extra) == b""
+    world.gets(second, encode_frame(b"b") + encode_frame(b"") * 200)

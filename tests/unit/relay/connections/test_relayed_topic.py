@@ -1,6 +1,6 @@
 import itertools
 import struct
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 
 import pytest
 from hypothesis import given
@@ -1072,3 +1072,41 @@ def test_an_answer_to_the_pump_holds_for_one_version(
         if topic.plain.number == version and answer is not None:
             assert topic.simple() == answer
         version, answer = topic.plain.number, topic.simple()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["plain", "monitored", "latched", "latched command", "driver", "other", "withheld", "limited", "tapped"],
+)
+def test_no_kind_of_topic_takes_many_messages_of_one_read_one_by_one(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken, frames = [0], Batch.frames
+
+    def counted(of: Batch, *after: int) -> Iterator[memoryview]:
+        for frame in frames(of, *after):
+            taken[0] += 1
+            yield frame
+
+    story = Story(
+        "/arm/goal" if kind == "latched command" else "/chatter", replayed=lambda _topic, _body: False
+    )
+    story.join()
+    if kind in {"driver", "other"}:
+        ranked = RankedTopic(RankPlace(0, 1.0, "driver", 0, "moving"), 0.0, lambda _driver: None)
+        ranked.place(kind, 0, 1.0)
+        story.topic.give_rank(RankedPublication(ranked, kind))
+    for _ in range(2):
+        story.topic.upstream_opened(HEADER | {"latching": "01"["latched" in kind]})
+    if kind == "monitored":
+        story.topic.monitor(lambda batch: batch, wanted=True)
+    elif kind == "withheld":
+        story.topic.withhold(lambda _host: False)
+    elif kind == "limited":
+        story.topic.limit(SharedRateLimit(FlowLimit(messages=1), 0.0).of("a"), None)
+    elif kind == "tapped":
+        story.topic.tap(lambda _batch: None, latched=False)
+    monkeypatch.setattr(Batch, "frames", counted)
+    story.receive(Batch(memoryview(bytes(4 * 5000)), 5000, None))
+    assert taken[0] <= 1000
+    assert story.topic.counters.messages == 5000
