@@ -43,7 +43,7 @@ _INTEGERS = {
 }
 _CONSTANT_TYPES = frozenset({*_INTEGERS, "bool", "float32", "float64", "string"})
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*+(?:/[A-Za-z][A-Za-z0-9_]*+)?)(\[([0-9]{0,10}+)\])?\Z")
-_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*+\Z")
+_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,254}+\Z")
 _MAX_NUMBER_LENGTH = 400  # the maximum number of characters of a numeric constant
 _SEPARATOR = re.compile(r"={40,}+[ \t\r]*+\Z")
 
@@ -159,7 +159,7 @@ def _field(code: str, package: str, source: str, line: int) -> Field:
         raise DefinitionError(f"{notation[:80]!a} is not a type; write type, type[] or type[3]", source, line)
     if _FIELD_NAME.match(name) is None:
         raise DefinitionError(
-            f"{name[:80]!a} is not a field name; it starts with a letter and has letters, digits and '_'",
+            f"{name[:80]!a} is not a field name; it has a letter and then up to 254 letters, digits and '_'",
             source,
             line,
         )

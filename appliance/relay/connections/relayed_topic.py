@@ -818,7 +818,7 @@ class RelayedTopic:
             len(self._served),
             counts,
             seconds,
-            "" if self._header is None else self._header.get("md5sum", ""),
+            "" if self._header is None else self._header.get("md5sum", "")[:32],
             0.0 if messages else silent,
         )
         self._reported = True

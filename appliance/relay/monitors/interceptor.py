@@ -577,9 +577,9 @@ def _other_definition(resource: str, name: str, md5sum: str, header: Mapping[str
     found = header.get("md5sum", "")
     if found == md5sum:
         return ""
-    theirs = header.get("type", "*")
+    theirs = f"{header.get('type', '*')[:200]}/{found[:32]}"  # a peer chooses the texts
     return (
-        f"the specifications define {resource} as [{name}/{md5sum}], but its messages are [{theirs}/{found}];"
+        f"the specifications define {resource} as [{name}/{md5sum}], but its messages are [{theirs}];"
         " add the robot's definition to the specifications (in msg/ beside them)"
     )
 

@@ -4,7 +4,7 @@ import os
 from collections import deque
 from collections.abc import Callable
 
-from appliance.channel.channel import AGAIN_SECONDS, Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.channel import AGAIN_SECONDS, Channel, ChannelClosedError
 from appliance.channel.messages import Message
 from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 
@@ -12,8 +12,8 @@ from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 class LoopLink:
     """One end of a lifeline or link. `ended(reason)` is called once, when the link fails.
 
-    A message of another link, or a backlog beyond its limit, ends the link as if the other end had died. A
-    restatement is carried out one quantum at a time. If `received` returns True, that message and later ones wait for
+    A message of another link ends the link as if the other end had died. A restatement is carried out one quantum at a
+    time. If `received` returns True, that message and later ones wait for
     `go_on`, and nothing more is read until then.
     """
 
@@ -38,11 +38,12 @@ class LoopLink:
         loop.watch(channel.fileno(), READ, self._ready)
 
     def send(self, message: Message) -> None:
+        """Send a message. Raises `ChannelFullError`: a link that only this end gave up would not be opened again."""
         if not self._live:
             return
         try:
             self._channel.send(message)
-        except (ChannelClosedError, ChannelFullError) as error:
+        except ChannelClosedError as error:
             self._end(str(error))
         else:
             self._watch()

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.channel.messages import (
@@ -12,6 +13,8 @@ from appliance.channel.messages import (
     FactWithdrawn,
     FlowLimit,
     GrantInstalled,
+    LookWanted,
+    MessageSeen,
     MessagesLimited,
     MonitorGiven,
     MonitorResumed,
@@ -27,6 +30,7 @@ from appliance.channel.messages import (
     StateGiven,
     StopBegun,
     StopWanted,
+    TrafficReported,
     UpstreamFound,
     UpstreamWanted,
 )
@@ -53,7 +57,7 @@ from tests.unit.relay.monitors.monitored import (
     data_of,
     string,
 )
-from tests.unit.relay.world import LOOPBACK, Peer
+from tests.unit.relay.world import ASK, LOOPBACK, Peer
 from tests.unit.transcripts import transcripts
 
 pytestmark = pytest.mark.usefixtures("sockets")
@@ -820,3 +824,36 @@ def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored
     publisher.send(string("one") + string("stop"))
     world.until(lambda: len(data_of(subscriber)) >= len(string("stop")) * 2)
     assert not subscriber.data.replace(string("stop"), b"")
+
+
+LONG = "n" * 30_000
+
+
+@pytest.mark.parametrize(
+    "sort", ["traffic", "seen", "too long a name", "topic refused", "service refused", "lost"]
+)
+def test_no_peer_makes_a_long_message_to_control(world: Monitored, sort: str) -> None:
+    """Many of them in one turn would end the link."""
+    header, kind, most = TYPED | {"md5sum": LONG, "type": LONG}, PublicationRefused, 4096
+    if sort == "service refused":
+        world.load("a() { event e() service /mode std_srvs/SetBool request '{}' { } }")
+        world.connect(encode_header({"callerid": "/client", "service": "/mode", "md5sum": "*"}))
+        world.accept(world.service).send(encode_header(header))
+    else:
+        if sort == "topic refused":
+            world.load(GUARD)
+        subscriber = world.connect(encode_header(ASK | {"md5sum": "*", "type": "*"}))
+        if sort == "traffic":
+            kind = TrafficReported
+        elif "refused" not in sort:
+            name = LONG if sort == "too long a name" else "n" * 255
+            fields = "\n".join(f"B[] a{number}" for number in range(12))
+            text = f"{fields}\n{'=' * 80}\nMSG: std_msgs/B\nuint8 {name}\n"
+            header, kind, most = TYPED | {"message_definition": text}, MessageSeen, 128 << 10
+        publisher = world.upstream(header)
+        if kind in {TrafficReported, MessageSeen}:
+            world.gets_header(subscriber)
+            world.state(LookWanted(1, "/chatter", 20, latched=False))
+            publisher.send(encode_frame((struct.pack("<I", 16) + bytes(16)) * 12) * 20)
+    found = world.until(lambda: [one for one in world.told if isinstance(one, kind)])
+    assert max(len(msgspec.msgpack.encode(one)) for one in found) <= most

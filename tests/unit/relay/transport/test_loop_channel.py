@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.channel.channel import Channel
+from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.messages import FactWithdrawn, NodePlaced, RelayLink, UpstreamWanted
 from appliance.relay.loop import QUANTUM, EventLoop
 from appliance.relay.transport.loop_channel import LoopLink
@@ -125,3 +125,10 @@ def test_an_end_that_does_not_read_yet_gets_everything_later(ends: Ends) -> None
             if isinstance(message, UpstreamWanted)
         ]
     assert keys == [str(number) for number in range(20_000)]
+
+
+def test_a_backlog_beyond_the_limit_ends_the_process_and_not_the_link_alone(ends: Ends) -> None:
+    """The other end opens a link only to a new process."""
+    with pytest.raises(ChannelFullError):
+        ends.link.send(UpstreamWanted("k", "/" * (65 << 20)))
+    assert ends.ended == []
