@@ -28,16 +28,15 @@ class RankedPublication:
         return self._topic.hears(self._key, now)
 
     def passing(self, batch: Batch, now: float) -> Batch:
-        """Return the messages that pass. They are the last ones of a batch: a publisher that is heard stays so.
+        """Return the messages after the last one that does not pass: an earlier zero is lost with it.
 
         Only the last `_JUDGED` messages are judged: the earlier ones pass if the publisher was heard before.
         """
         early = max(0, batch.messages - _JUDGED)
         dropped = 0 if self.hears(now) else early
-        dropped += sum(
-            not self._topic.passes(self._key, moves=self._moves(frame[4:]), now=now)
-            for frame in batch.frames(early)
-        )
+        for number, frame in enumerate(batch.frames(early), early + 1):
+            if not self._topic.passes(self._key, moves=self._moves(frame[4:]), now=now):
+                dropped = number
         if not dropped:
             return batch
         left = batch.messages - dropped

@@ -1,10 +1,12 @@
 """The messages of one read, on a topic with a rank."""
 
+import itertools
 import struct
+from typing import get_args
 
 import pytest
 
-from appliance.channel.messages.relay_link import RankPlace
+from appliance.channel.messages.relay_link import RankPlace, RankStanding
 from appliance.relay.connections.ranked_publication import RankedPublication
 from appliance.relay.ranked_topic import RankedTopic
 from appliance.relay.transport.frames import Batch
@@ -114,3 +116,31 @@ def test_a_connection_that_ends_after_a_motion_is_a_loss(pair: Pair) -> None:
     pair.pad.receive(batch(GO))
     pair.pad.topic.upstream_closed()
     assert pair.ranked.driver.standing == "lost"
+
+
+@pytest.mark.parametrize("standing", get_args(RankStanding))
+@pytest.mark.parametrize("driver", ["pad", "planner", ""])
+@pytest.mark.parametrize("key", ["pad", "planner"])
+@pytest.mark.parametrize("listens", [True, False])
+def test_messages_of_one_read_pass_as_in_reads_of_their_own(
+    standing: RankStanding, driver: str, key: str, listens: bool
+) -> None:
+    """No further motion passes, and the last message is the same; a zero before a dropped motion may be lost."""
+
+    def passed(*reads: tuple[bytes, ...]) -> list[bytes]:
+        place = RankPlace(0, 0.3, driver, int(driver == "planner"), standing)
+        ranked = RankedTopic(place, 0.0, lambda _driver: None)
+        ranked.place("pad", 0, 0.3)
+        ranked.place("planner", 1, 0.3)
+        publication = RankedPublication(ranked, key)
+        publication.opened(VELOCITY, 0.0)
+        now = 0.1 if listens else 10.0
+        if not listens:
+            settle(ranked, 0.0)
+        return [bytes(one[4:]) for read in reads for one in publication.passing(batch(*read), now).frames()]
+
+    for length in range(1, 5):
+        for read in itertools.product((ZERO, GO), repeat=length):
+            together, alone = passed(read), passed(*((one,) for one in read))
+            assert alone[len(alone) - len(together) :] == together
+            assert together or alone == passed(*((one,) for one in read[:-1]))
