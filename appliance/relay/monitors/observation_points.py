@@ -132,12 +132,12 @@ class Senders:
         self._holders[number] = holder
 
     def names(self, number: int) -> tuple[str, str]:
-        holder = self._holders.get(number)
-        point = self._points.get(number, NOWHERE) if holder is None else holder.point
+        point = self.point(number) or NOWHERE
         return point.host, point.caller_id
 
     def point(self, number: int) -> ObservationPoint | None:
-        return self._points.get(number)
+        holder = self._holders.get(number)
+        return self._points.get(number) if holder is None else holder.point
 
     def last(self, topic: str, node: str = "") -> ObservationPoint | None:
         """Return the last publisher of a topic, also after its end, or this node."""
