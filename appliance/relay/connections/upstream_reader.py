@@ -127,6 +127,9 @@ class UpstreamReader:
                 return
             except OSError as error:
                 count = -(error.errno or 0)
+            except PeerError as error:  # no memory
+                self._lost(str(error), violation_of(error))
+                return
             self._on_data(count)
         elif left.kind == RECEIVED:
             self._on_data(left.end)

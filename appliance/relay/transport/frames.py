@@ -7,8 +7,8 @@ without copying them.
   their WebAssembly module.
 - The pump has the only loop over the lengths of frames (`walk`), which takes about 2 ns for a frame.
 - A frame larger than `LARGE` gets its own area. An area of up to 8 MiB is reused for the next large frame, unless a
-  queue has kept it or memory is short. A larger area is anonymous memory, so a declared length that is never sent
-  costs only address space.
+  queue has kept it or memory is short; it counts as a whole from its frame's first bytes on. A larger area is anonymous
+  memory, so a declared length that is never sent costs only address space.
 """
 
 import mmap
@@ -226,16 +226,18 @@ class FrameReceiver:
         return Batch(buffer[:position], messages, last, owned=owned) if messages else None
 
     def _begin_area(self, need: int, start: memoryview) -> None:
+        if need <= _KEEP_AREA and self._held.share.refusal(need - self._held.size):
+            raise _no_memory()
         area = _new_area(need)
         area[: len(start)] = start
         self._area, self._target, self._filled = area, need, len(start)
-        self._held.set(len(start))
+        self._held.set(_resident(area, len(start)))
 
     def _received_in_area(self, area: memoryview, count: int) -> Batch | None:
         """Receive one frame at a time: a read ends with the frame, or where a next frame of equal length would end."""
         self._filled += count
         if self._filled > self._held.size:  # memory that was once filled stays allocated with the area
-            self._held.set(self._filled)
+            self._held.set(_resident(area, self._filled))
         if self._filled < 4:
             return None
         need = _unpack_length(area, 0)[0] + 4
@@ -259,7 +261,14 @@ class FrameReceiver:
 
 
 def _new_area(size: int) -> memoryview:
-    return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
+    try:
+        return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
+    except (OSError, MemoryError):
+        raise _no_memory() from None
+
+
+def _resident(area: memoryview, filled: int) -> int:
+    return filled if len(area) > _KEEP_AREA else len(area)  # Python fills a `bytearray` with zeros
 
 
 def _no_memory() -> LimitExceededError:

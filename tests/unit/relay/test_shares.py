@@ -2,6 +2,7 @@ import contextlib
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
@@ -17,6 +18,8 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.relay_limits import MIB
+from appliance.relay.transport.frames import FrameReceiver
+from roswire.errors import LimitExceededError
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 
@@ -215,3 +218,14 @@ def test_little_of_a_peers_header_is_kept(world: World, asked: dict[str, str]) -
     members = lambda: [*world.engine.clients, *world.engine.topics["k", "/chatter"].members]  # noqa: E731 - said once
     [member] = world.until(members)
     assert set(member.fields) == set(asked)
+
+
+def test_a_relay_without_memory_for_the_next_image_loses_its_publisher_alone(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FrameReceiver, "buffer", Mock(side_effect=LimitExceededError("no memory")))
+    subscriber = world.connect(encode_header(ASK))
+    publisher = world.upstream(LATCHED)  # the pump leaves it to Python
+    world.gets_header(subscriber)
+    publisher.send(encode_frame(b"x"))
+    assert world.hears(UpstreamLost).reason == "no memory"

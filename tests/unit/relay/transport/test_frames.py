@@ -1,9 +1,11 @@
 import struct
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from appliance.relay.transport import frames
 from appliance.relay.transport.frames import LARGE, SCRATCH, Batch, FrameReceiver, Scratch
 from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import walk
@@ -35,6 +37,14 @@ def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, 
             assert batch.last is not None
             batches.append((bytes(batch.view), batch.messages, batch.last))
     return batches
+
+
+def last_of(one: FrameReceiver, data: bytes) -> Batch:
+    feed(one, data[:-1], [SCRATCH])
+    one.buffer()[0] = data[-1]
+    batch = one.received(1)
+    assert batch is not None
+    return batch
 
 
 sizes = st.lists(
@@ -107,6 +117,36 @@ def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
     assert budget.used == 14
     one.abandon()
     assert budget.used == 0
+
+
+@pytest.mark.parametrize("size", [2 * LARGE, 3 << 20, 8 << 20])
+@pytest.mark.parametrize("earlier", ["none", "reused", "kept"])
+def test_memory_that_is_resident_at_once_is_charged_at_once(size: int, earlier: str) -> None:
+    """That of an area of up to 8 MiB, which is made for the declared length."""
+    one, budget = receiver(limit=16 << 20, memory=64 << 20)
+    if earlier != "none":
+        batch = last_of(one, frame(size - 4))
+        if earlier == "kept":
+            batch.keep()
+    feed(one, struct.pack("<I", size - 4) + b"x", [5])
+    assert budget.used == size
+    other = FrameReceiver(Scratch(), 16 << 20, share(size // 2))
+    with pytest.raises(PeerError, match="no memory"):
+        feed(other, struct.pack("<I", size - 4), [4])
+
+
+@pytest.mark.parametrize("size", [2 * LARGE, 9 << 20])
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_publisher_that_gets_no_memory_is_given_up(
+    size: int, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, _budget = receiver(limit=16 << 20)
+    if kept:
+        last_of(one, frame(2 * LARGE)).keep()
+    monkeypatch.setattr(frames.mmap, "mmap", Mock(side_effect=OSError(12, "no memory")))
+    monkeypatch.setattr(frames, "bytearray", Mock(side_effect=MemoryError), raising=False)
+    with pytest.raises(PeerError, match="no memory"):
+        feed(one, frame(size), [LARGE])
 
 
 def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None:
