@@ -16,7 +16,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import PeerGrant
 from appliance.relay.loop import READ, WRITE
 from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.transport.frames import LARGE, LITTLE, Batch
+from appliance.relay.transport.frames import LARGE, Batch, own
 from appliance.relay.transport.memory import HeldBytes, HostMemory, StallDetector
 from appliance.relay.transport.pump import walk
 from appliance.relay.transport.rate_limit import RateAllowance
@@ -25,7 +25,8 @@ from roswire.tcpros import encode_header
 # The messages that wait for one slow subscriber: bounded, the oldest dropped first, never a torn frame.
 #
 # - Bytes leave in order; a frame whose first byte was sent is sent whole.
-# - The rest of that frame counts as memory of the host; its buffer is less than `LITTLE` times as large.
+# - The rest of that frame counts as memory of the host.
+# - A buffer is less than `LITTLE` times as large as what waits of it (`own`).
 # - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides that frame.
 
 _VECTORS = 64
@@ -72,12 +73,11 @@ class SendQueue:
         if end > sent:
             self.begin(rest[: end - sent])
         if batch.messages > gone:
-            self._waiting.append((rest[end - sent :], batch.messages - gone))
+            self._waiting.append((own(rest[end - sent :]), batch.messages - gone))
             self._count(batch.messages - gone, len(batch.view) - end)
 
     def begin(self, rest: memoryview) -> None:
-        little = LITTLE * len(rest) <= memoryview(rest.obj).nbytes
-        self._started = memoryview(bytes(rest)) if little else rest
+        self._started = own(rest)
         self._count(0, 0)
 
     def vectors(self) -> list[memoryview]:
@@ -117,7 +117,7 @@ class SendQueue:
         view, number = self._waiting.popleft()
         end, gone, _ = max(walk(view, messages), walk(view, size=size))
         if gone < number:
-            self._waiting.appendleft((view[end:], number - gone))
+            self._waiting.appendleft((own(view[end:]), number - gone))
         self._count(-gone, -end)
         return view[:end]
 

@@ -36,6 +36,12 @@ _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
 
 
+def own(view: memoryview) -> memoryview:
+    """Return the view, or a copy if it is little of its buffer."""
+    little = LITTLE * len(view) <= memoryview(view.obj).nbytes
+    return memoryview(bytearray(view)) if little else view
+
+
 class Batch:
     """Consecutive whole frames in a buffer that is reused unless they are kept.
 
@@ -64,7 +70,7 @@ class Batch:
     def keep(self) -> memoryview:
         """Return memory that will not be overwritten; copy the frames at most once."""
         if self._kept is None:
-            self._kept = self.view if self._owned else memoryview(bytes(self.view))
+            self._kept = own(self.view) if self._owned else memoryview(bytes(self.view))
         return self._kept
 
     def rest(self, sent: int) -> memoryview:
@@ -95,7 +101,7 @@ class Batch:
 
     def tail(self, count: int) -> "Batch":
         view = self.view[len(self.head(self.messages - count).view) :]
-        tail = Batch(view if self._owned else memoryview(bytearray(view)), count, None, owned=True)
+        tail = Batch(own(view) if self._owned else memoryview(bytearray(view)), count, None, owned=True)
         tail.first = self.first + self.messages - count
         return tail
 
@@ -106,9 +112,9 @@ class Batch:
 
     def keep_last(self) -> "Batch":
         if self._owned and self.messages == 1:
-            self.keep()
-            return self
-        last = memoryview(bytearray(self.view[self.find_last() :]))
+            last = self.keep()
+        else:
+            last = memoryview(bytearray(self.view[self.find_last() :]))
         return Batch(last, 1, 0, owned=True)
 
 

@@ -1,9 +1,13 @@
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from appliance.relay.connections.relayed_topic import LatchedMessage
+from appliance.relay.connections.startup_replay import StartupReplay
 from appliance.relay.connections.subscriber import SendQueue
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.transport.frames import LITTLE, Batch
@@ -114,3 +118,55 @@ def test_the_rest_of_a_connection_header_goes_first() -> None:
     queue.append(Batch(memoryview(frame(4)), 1, None))
     assert b"".join(queue.vectors()) == b"header" + frame(4)
     assert queue.messages == 1
+
+
+def latched(batch: Batch) -> list[memoryview]:
+    latch = LatchedMessage(share(), lambda _size: None, lambda _size: None)
+    latch.keep(batch)
+    assert latch.batch is not None
+    return [latch.batch.view]
+
+
+def replayed(batch: Batch) -> list[memoryview]:
+    replay = StartupReplay(share(), 1.0)
+    replay.opened(0.0, alone=True)
+    replay.add(batch, 0.0)
+    return [one.view for one in replay.give("/listener", 0.0)]
+
+
+def queued(batch: Batch, *, sent: int = 0, advanced: int = 0) -> list[memoryview]:
+    queue = SendQueue(replace(RelayLimits(), queue_messages=1000), share())
+    queue.append(batch, sent)
+    queue.advance(advanced)
+    queue.trim()
+    return queue.vectors()
+
+
+def kept(batch: Batch) -> Batch:
+    batch.keep()
+    return batch
+
+
+KEEPERS: dict[str, Callable[[Batch], list[memoryview]]] = {
+    "latch": latched,
+    "replay": replayed,
+    "rest of a turn": lambda batch: [batch.tail(1).view],
+    "queue": queued,
+    "queue behind": lambda batch: queued(batch, sent=max(0, len(batch.view) - 6)),
+    "queue of a fast one": lambda batch: queued(batch, advanced=max(0, len(batch.view) - 6)),
+    "second queue": lambda batch: queued(kept(batch), sent=max(0, len(batch.view) - 6)),
+}
+
+
+@pytest.mark.parametrize("keeper", KEEPERS)
+@pytest.mark.parametrize("size", [512 << 10, 8 << 20])
+@pytest.mark.parametrize("messages", [1, 2, 200, 131_072])
+@pytest.mark.parametrize("owned", [False, True])
+def test_little_of_a_read_does_not_keep_its_buffer(
+    keeper: str, size: int, messages: int, owned: bool
+) -> None:
+    """Only the kept bytes are counted."""
+    views = KEEPERS[keeper](Batch(memoryview(bytearray(size))[: 4 * messages], messages, None, owned=owned))
+    assert views or messages > 200
+    for view in views:
+        assert memoryview(view.obj).nbytes < LITTLE * len(view)

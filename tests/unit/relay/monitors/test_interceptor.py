@@ -14,6 +14,7 @@ from appliance.channel.messages import (
     FlowLimit,
     GrantInstalled,
     LookWanted,
+    Message,
     MessageSeen,
     MessagesLimited,
     MonitorGiven,
@@ -834,7 +835,8 @@ LONG = "n" * 30_000
 )
 def test_no_peer_makes_a_long_message_to_control(world: Monitored, sort: str) -> None:
     """Many of them in one turn would end the link."""
-    header, kind, most = TYPED | {"md5sum": LONG, "type": LONG}, PublicationRefused, 4096
+    header, most = TYPED | {"md5sum": LONG, "type": LONG}, 4096
+    kind: type[Message] = PublicationRefused
     if sort == "service refused":
         world.load("a() { event e() service /mode std_srvs/SetBool request '{}' { } }")
         world.connect(encode_header({"callerid": "/client", "service": "/mode", "md5sum": "*"}))

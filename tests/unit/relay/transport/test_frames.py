@@ -1,3 +1,4 @@
+import mmap
 import struct
 from unittest.mock import Mock
 
@@ -122,7 +123,7 @@ def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
 @pytest.mark.parametrize("size", [2 * LARGE, 3 << 20, 8 << 20])
 @pytest.mark.parametrize("earlier", ["none", "reused", "kept"])
 def test_memory_that_is_resident_at_once_is_charged_at_once(size: int, earlier: str) -> None:
-    """That of an area of up to 8 MiB, which is made for the declared length."""
+    """An area of up to 8 MiB is: it is made for the declared length."""
     one, budget = receiver(limit=16 << 20, memory=64 << 20)
     if earlier != "none":
         batch = last_of(one, frame(size - 4))
@@ -143,7 +144,7 @@ def test_a_publisher_that_gets_no_memory_is_given_up(
     one, _budget = receiver(limit=16 << 20)
     if kept:
         last_of(one, frame(2 * LARGE)).keep()
-    monkeypatch.setattr(frames.mmap, "mmap", Mock(side_effect=OSError(12, "no memory")))
+    monkeypatch.setattr(mmap, "mmap", Mock(side_effect=OSError(12, "no memory")))
     monkeypatch.setattr(frames, "bytearray", Mock(side_effect=MemoryError), raising=False)
     with pytest.raises(PeerError, match="no memory"):
         feed(one, frame(size), [LARGE])
