@@ -28,7 +28,7 @@ class RankedPublication:
         return self._topic.hears(self._key, now)
 
     def passing(self, batch: Batch, now: float) -> Batch:
-        """Return the messages after the last one that does not pass: an earlier zero is lost with it.
+        """Return the messages after the last one that does not pass. Earlier zeros are dropped with it.
 
         Only the last `_JUDGED` messages are judged: the earlier ones pass if the publisher was heard before.
         """
