@@ -155,7 +155,12 @@ class _Writer:
         self._add_mode(base)
         batteries = self.graph.sources(base, types.BATTERIES)
         if len(batteries) == 1:
-            self._add("ready", base, _silence(batteries[0], 5, 5, 600), topics={"by": batteries[0].name})
+            name = batteries[0].name
+            self._add("ready", base, _silence(batteries[0], 5, 5, 600), topics={"by": name})
+            self._say(
+                f"ready of {base.name}: what {name} reports as its percentage is not known: read it with rosrv topic"
+                f" echo {name}, and set hundred=true for 0 to 100, or most=1.3 for a charge above 1"
+            )
         elif batteries:
             self._leave("ready", base, "several batteries fit", batteries)
         self._add_diagnostics(base)
