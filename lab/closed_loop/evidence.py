@@ -186,11 +186,11 @@ class ArmWorld(EvidenceWorld):
             self.alone == "fix" or r.random() < 0.5,
             self.alone == "check" or r.random() < 0.5,
         )
-        self.hundred = r.random() < 0.3
+        self.hundred, self.most = r.random() < 0.3, r.choice((1, 1.3))
         self.commands(r.choice((30, 100, 250)))
         self.guarded({
             "charge": self.charge, "hundred": self.hundred, "needFix": self.needs_fix, "needCheck": self.needs_check,
-            "silent": self.silent, "checked": self.checked,
+            "silent": self.silent, "checked": self.checked, "most": self.most,
         })  # fmt: skip
         self.battery = self.fix = self.check = (NEVER, False)
         self.fault = ""
@@ -244,7 +244,7 @@ class ArmWorld(EvidenceWorld):
             0.9 if self.hundred else 15.0
         )  # of 1, where the guard takes it for one of 100, or the other way
         bad = {"low": self.charge - 0.02, "NaN": math.nan, "minus": -1.0}.get(self.fault)
-        charge = (0.9 if bad is None else bad) * (100 if self.hundred else 1)
+        charge = (self.most - 0.1 if bad is None else bad) * (100 if self.hundred else 1)
         if self.fault == "no battery":
             return
         data = battery(wrong if self.fault == "percent" else charge)

@@ -149,7 +149,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "sensor takes frozen values": Fault("L2", "sensor", replaced(r"repeated < frozen", "true")),
     "arm takes any charge for enough": Fault(
-        "L2", "ready", replaced(r"left >= charge && left <= 1", "!(left < charge)")
+        "L2", "ready", replaced(r"left >= charge && left <= most", "!(left < charge)")
     ),
     "agree compares the linear velocity alone": Fault("L2", "agree", replaced(r"&& turned <= turning", "")),
     "fence takes any quaternion for a heading": Fault(

@@ -158,8 +158,8 @@ class _Writer:
             name = batteries[0].name
             self._add("ready", base, _silence(batteries[0], 5, 5, 600), topics={"by": name})
             self._say(
-                f"ready of {base.name}: what {name} reports as its percentage is not known: read it with rosrv topic"
-                f" echo {name}, and set hundred=true for 0 to 100, or most=1.3 for a charge above 1"
+                f"ready of {base.name}: the scale of the charge in {name} is not known: read it with rosrv topic echo"
+                f" {name}, and set hundred=true for 0 to 100, or most=1.3 for a charge above 1"
             )
         elif batteries:
             self._leave("ready", base, "several batteries fit", batteries)

@@ -5,14 +5,13 @@ import pytest
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.config_sources import read
-from appliance.control.operators.limit_use import OwnUses, of_pool
-from appliance.features.limits import verb
+from appliance.control.operators.limit_use import OwnUses
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
-from appliance.quotas.table import NODES, PARAMETER_BYTES, QUOTA_ROWS
+from appliance.quotas.table import NODES, QUOTA_ROWS
 from tests.support.core import FakeTrail
 from tests.support.incarnations import incarnation
 
@@ -74,16 +73,3 @@ def test_without_retention_the_disk_is_the_limit(tmp_path: Path) -> None:
     (tmp_path / "control").mkdir()
     queries = used(tmp_path, {})
     assert queries["bytes of latched messages, one relay"].used == 0
-
-
-@pytest.mark.parametrize("hosts", [1, 1000])
-@pytest.mark.parametrize("quota_class", QuotaClass)
-def test_holders_that_are_refused_are_marked(quota_class: QuotaClass, hosts: int) -> None:
-    pool: Pool[str] = Pool("bytes of parameters", PARAMETER_BYTES.bounds, lambda _host: quota_class)
-    for number in range(hosts):
-        if pool.refusal(f"host {number}", 1 << 16):
-            break
-        while not pool.take(f"host {number}", 1 << 16):
-            pass
-    assert pool.refusal(f"host {number}", 1 << 16)
-    assert verb._is_near(of_pool("bytes of parameters", "", pool))
