@@ -402,18 +402,18 @@ def small_arm(stop_duration: float = 0) -> Guarded:
 @pytest.mark.parametrize(
     ("before", "at", "stamp", "points", "why"),
     [
-        ((), 0.0, -5.0, [(1, [0, 0]), (2, [0, 0])], "of /a that is over: its last point was 3.000 s ago"),
+        ((), 0.0, -5.0, [(1, [0, 0]), (2, [0, 0])], "of /a of 10.0.0.1 that is over: its last point was 3.000 s ago"),
         ((), 0.0, -1.5, [(1, [0.9, 0]), (2, [0.4, 0])], ""),  # in half a second, at the second point
-        ((), 0.0, -1.9, [(1, [0, 0]), (2, [0.4, 0])], "to point 2 of /a at 0.400 rad in 0.100 s is a jump"),
+        ((), 0.0, -1.9, [(1, [0, 0]), (2, [0.4, 0])], "to point 2 of /a of 10.0.0.1 at 0.400 rad in 0.100 s,"),
         ((), 0.0, 5.0, [(1, [0.5, 0])], ""),  # nothing is in force
         ((), 0.0, 5.0, [(1, [1.2, 0])], "has elbow at 1.200 rad"),
         ([RUN], 0.5, 0.3, [(1, [0.5, 0])], "begins in 0.300 s (limit 0.100 s), while elbow moves for 0.5"),
         ([RUN], 0.5, 0.69, [(1, [0.5, 0])], "while elbow moves for 0.500 s, and 0.200 s have to be between them"),
         ([RUN], 0.5, 0.71, [(1, [0.5, 0])], ""),
-        ([RUN], 0.5, 0.71, [(0.1, [0.4, 0])], "from 0.600 rad to point 1 of /a at 0.400 rad in 0.8"),
+        ([RUN], 0.5, 0.71, [(0.1, [0.4, 0])], "from 0.600 rad to point 1 of /a of 10.0.0.1 at 0.400 rad in 0.8"),
         ([RUN], 0.5, 0.09, [(0.5, [0.6, 0])], ""),
         # The bridge of a moving joint overshoots the limit; one that stands reaches the same point.
-        ([RUN], 0.98, 0.0, [(1, [0.6, 0], [0, 0])], "of elbow from 0.588 rad to point 1 of /a at 0.600 rad"),
+        ([RUN], 0.98, 0.0, [(1, [0.6, 0], [0, 0])], "elbow from 0.588 rad to point 1 of /a of 10.0.0.1 at 0.600 rad"),
         ([RUN], 1.02, 0.0, [(1, [0.6, 0], [0, 0])], ""),
         ([RUN], 0.98, 0.0, [(1, [0.6, 0])], ""),  # straight, without a velocity
         ([RUN], 0.98, 0.0, [(1, [0.6, 0], [0, 0], [0, 0])], "the way of elbow"),
