@@ -269,7 +269,9 @@ SILENT = f"no message from {LIDAR} on {{}} for {{}} s (limit {{}} s)"
 INTRUDER = f"{OTHER} also publishes on {{}}, last 0.00 s ago (limit 1 s)"
 NOT_FINITE = f"{TELEOP} commands a velocity that is not a finite number"
 ZERO_FIRST = f"{TELEOP} must command zero before its motion passes"
-STAND_FIRST = "the base stands, and a command to stand must come before a motion"
+STAND_FIRST = (
+    f"the base stands, as {LIDAR} measures it on /odom, and a command to stand must come before a motion"
+)
 NOT_VALID = f"0 of 360 values from {LIDAR} on /scan are valid (at least one and 10 % must be)"
 SCAN, ODOM, DIAGNOSTICS, JOINTS = "/scan", "/odom", "/diagnostics", "/joint_states"
 CASES: list[Case] = [
@@ -609,21 +611,21 @@ CASES: list[Case] = [
         "fence",
         {},
         sees(at(7)),
-        "the base is 5.00 m outside the fence, at 7.00 and 0.00 m, and its command does not lead straight"
-        " back",
+        f"the base is 5.00 m outside the fence, at 7.00 and 0.00 m by {LIDAR} on /odom, and its command does not lead"
+        " straight back",
     ),
     (
         "fence",
         {},
         sees(at(1.9)),
-        "the base is 0.10 m from the fence (margin 0.2 m), at 1.90 and 0.00 m, and its command does not"
-        " lead straight back",
+        f"the base is 0.10 m from the fence (margin 0.2 m), at 1.90 and 0.00 m by {LIDAR} on /odom, and its command"
+        " does not lead straight back",
     ),
     (
         "fence",
         {},
         then(driven(at(0)), at(1.75)),
-        "the base is 0.25 m from the fence, at 1.75 and 0.00 m, and could come nearer than"
+        f"the base is 0.25 m from the fence, at 1.75 and 0.00 m by {LIDAR} on /odom, and could come nearer than"
         " 0.2 m with 0.20 m/s before the next position",
     ),
     ("fence", {}, sees(then(at(0), drive(math.inf))), NOT_FINITE),
