@@ -60,6 +60,17 @@ def test_a_silent_mode_is_manual_and_stops_a_fast_base() -> None:
     assert 1000 < stops(guard)[0] <= 1030
 
 
+def test_a_node_must_be_slow_again_after_the_modes_nodes_are_forgotten() -> None:
+    guard = Guarded("mode")
+    guard.tell("by", switch(False), 0, "/b")
+    guard.drive(SLOW, 10)
+    guard.monitors.give({"guard": {"forget": 1}})
+    guard.tell("by", switch(False), 12, "/b")
+    assert guard.drive(FAST, 14)[0] == 0.25
+    guard.drive(SLOW, 16)
+    assert guard.drive(FAST, 18)[0] == 1.0
+
+
 def test_a_parked_base_without_odometry_gets_no_stream_of_stops() -> None:
     guard = Guarded("standstill")
     guard.advance(60_000)
