@@ -57,7 +57,7 @@ class EnrolmentTokens:
         return row, text
 
     def find(self, text: str, request: str, hosts: Mapping[str, HostRow]) -> EnrolmentTokenRow:
-        """Return the row of an unused token, or of one that was used with this request for the host's certificate.
+        """Return the row of a token that is unused, or whose use with this request made the host's certificate.
 
         Raises `BadEnrolmentTokenError`.
         """

@@ -197,7 +197,7 @@ def leaves(settings: "DataclassInstance", *path: str) -> Iterator[tuple[str, obj
 
 
 def test_each_value_can_be_given_in_the_environment() -> None:
-    """Also the text that a message proposes, and a value that is none."""
+    """An address that a message proposes and `null` are given in the same way."""
     default = resolve(None, {}, {})
     given = dict(leaves(default))
     assert len(given) > 100

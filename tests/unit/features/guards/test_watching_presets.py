@@ -112,7 +112,7 @@ HONEST: dict[str, list[dict[str, Any]]] = {
     "nav_msgs/Odometry": [{"pose__pose__position__x": 3.25, "pose__pose__orientation__w": 1.0}],
     "sensor_msgs/JointState": [{"name": list("abcdef"), "position": [0.5] * 6}],
 }  # fmt: skip
-"""The same message for a minute, by type: of a base that stands, or in open space."""
+"""For each type, a minute of equal messages of a standing base, or of readings in open space."""
 
 
 @pytest.mark.parametrize("kind", [kind for kind in PRESETS["sensor"].topics["by"] if kind != "*"])
