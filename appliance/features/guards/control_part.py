@@ -61,7 +61,6 @@ class DriverChecks:
         self._monitors, self._trail, self._graph, self._processes = monitors, trail, graph, processes
         self._check = DriverCheck()
         self._who = ""
-        self._revision = 0
         self._asked_at = self._until = 0.0
         self._relays: list[int] = []
         self._changing = asyncio.Lock()
@@ -91,7 +90,7 @@ class DriverChecks:
         self._check, self._who = DriverCheck(request.command, request.by), who
         self._ended.clear()
         try:
-            self._revision = (await monitors.load(order, who, enable=True)).revision
+            await monitors.load(order, who, enable=True)
         except BaseException:
             self._check = before
             raise
@@ -144,8 +143,8 @@ class DriverChecks:
     async def _remove(self) -> None:
         try:
             monitors, request = self._monitors, admin.MonitorRemove([_FILE])
-            # A change during the check has its time limit, or one of its own.
-            settled = monitors.revision == self._revision
+            # A change during the check has its time limit, or one of its own. Control may have restarted.
+            settled = monitors.in_force.note == described(monitors.sources.files[_FILE])
             await monitors.remove(request, self._who or NAME, settled=settled)
         except (SpecificationsRefusedError, StoreError) as error:
             _log.warning("the monitor of a driver check is not removed yet", error=str(error))

@@ -28,13 +28,8 @@ SAYS = ("no change", "no difference", "no topic", "no tunnel", "nothing to upgra
 def changes(appliance: Appliance) -> list[object]:
     eventually(lambda: appliance.status()["audit"]["lag_records"] == 0, appliance.story)
     status = appliance.status()
-    later = {
-        "registered",
-        "unregistered",
-        "guard loaded",
-        "stop begun",
-        "stop ended",
-    }  # of nodes and the relay
+    nodes = {"decision", "registered", "reconciled", "unregistered"}
+    later = nodes | {"guard loaded", "stop begun", "stop ended"}  # of the relay
     records = [one for one in appliance.recorded() if one["event"] not in later]
     return [status["policy"]["revision"], status["monitors"]["tag"], len(records)]
 

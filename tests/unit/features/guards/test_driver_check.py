@@ -164,6 +164,7 @@ async def test_a_control_that_starts_removes_the_monitor_of_the_last_one(site: S
     assert (await again.checks.wanted(DriverCheckWanted())).command == ""
     await again.checks.look()
     assert site.removed() and not again.trail.records
+    assert site.monitors.confirm_by is None  # else all changes of the next minutes would be undone
 
 
 async def test_a_removal_that_fails_is_tried_again(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
