@@ -61,7 +61,8 @@ class Heartbeat:
         self._index = 0
         self._shared = memoryview(bytearray(8 * _WORDS)).cast("q")
         self._line = -1
-        self._asked = self._fit_from = loop.clock()
+        self._asked = loop.clock()
+        self._fit_from = self._asked + REST
         self._cause = "the relay has begun"
         self._edge = 0
         self._stops: str = ""

@@ -219,8 +219,10 @@ class GuardedRobot:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.ros.__exit__(*exc)
-        self.ask(admin.MonitorRemove(list(self.texts)))
+        try:
+            self.ros.__exit__(*exc)
+        finally:  # the next test has the same appliance
+            self.ask(admin.MonitorRemove(list(self.texts)))
 
     def load(self) -> None:
         self.ask(admin.MonitorLoad({f"{name}.rv": text for name, text in self.texts.items()}, hold=True))

@@ -186,6 +186,21 @@ def test_each_relay_has_to_be_fit() -> None:
     assert first.beats
 
 
+def test_a_relay_that_replaces_another_rests_first() -> None:
+    """Also if it has its specifications before its first check: a drive has to notice the death."""
+    memory = memoryview(bytearray(2 * 16))
+    first, other = (Relay(memory, index) for index in range(2))
+    for relay in (first, other):
+        relay.load(GUARD)
+    run(2 * REST, first, other)
+    new, before = Relay(memory, 1), len(first.edges)
+    new.load(GUARD)
+    run(REST - PERIOD, first, new)
+    assert len(first.edges) <= before + 1
+    run(2 * PERIOD, first, new)
+    assert first.beats
+
+
 def test_a_line_that_is_lost_ends_both_heartbeats_until_there_is_another() -> None:
     relay = Relay(heartbeat_line="/dev/ttyUSB0")
     relay.load(GUARD)
