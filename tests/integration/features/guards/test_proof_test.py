@@ -40,7 +40,11 @@ def test_copies_act_and_the_stop_reaches_the_driver_of_a_standing_robot(
         "estop": text_of(Guard("estop", PRESETS["estop"], values={"publishers": "1"})),
         "limit": text_of(Guard("limit", PRESETS["speed"])),
     }
-    own_appliance.ask(admin.MonitorLoad({f"{name}.rv": text for name, text in texts.items()}, hold=True))
+
+    def load(*names: str) -> None:
+        own_appliance.ask(admin.MonitorLoad({f"{name}.rv": texts[name] for name in names}, hold=True))
+
+    load("limit")
     with RosSession(own_appliance.master_uri, tmp_path, common_robot) as ros:
 
         def talker(name: str, **streams: Stream) -> Process:
@@ -56,6 +60,7 @@ def test_copies_act_and_the_stop_reaches_the_driver_of_a_standing_robot(
         base = ros.node("rospy", "frame_listener", "/cmd_vel", "/rosrv", "/cmd_vel", name="base")
         talker("button", emergency_stop=OFF, emergency_stop_reset=PRESSED)
         assert "not known to stand still" in test("limit", status=1)
+        load("deadman", "estop")  # which stop the base at first
         teleop = talker("teleop", cmd_vel=ZERO)
         eventually(lambda: guards(own_appliance)["deadman"]["times"], "the guards judge commands")
         states, heard = guards(own_appliance), counted(base)
