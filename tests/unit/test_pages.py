@@ -252,6 +252,18 @@ def test_the_quickstart_is_quick() -> None:
     assert (text.count("\n## "), len(denied), len(words) <= 250) == (5, 1, True), len(words)
 
 
+@pytest.mark.parametrize("page", ["quickstart.md", "try-for-an-hour.md", "audit.md"])
+def test_a_reader_types_no_id_of_another_run(page: str) -> None:
+    """Numbers are short, and the output above the step shows where the reader's own one is."""
+    shown, typed = "", list[str]()
+    for step in steps(page):
+        numbers = re.findall(r"#\d+", step.script)
+        assert [number for number in numbers if f"'{number}'" not in step.script or number not in shown] == []
+        typed += re.findall(r"\b[0-9a-f]{20}\b", step.script)
+        shown += "\n".join(step.shown)
+    assert typed == []
+
+
 STEPS = ("quickstart.md", "close-the-ports.md", "policy.md", "guards.md", "driving.md", "operating.md")
 
 
