@@ -20,7 +20,6 @@ from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 
 KINDS = ("drop", "change", "verdict", "warning", "fault")
-EVER = (0, 1 << 63)
 _LONGEST = 4096  # characters of the text of an effect
 
 

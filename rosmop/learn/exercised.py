@@ -59,6 +59,7 @@ def covered(texts: Mapping[str, str], definitions: Definitions, recording: Recor
     monitors.start(recording.began, frozenset(recording.topics))
     for number, (topic, time, data) in enumerate(recording.messages(), 1):
         monitors.process(topic, data, time, MessageSender(number))
+    monitors.advance(recording.ended)
     for monitor in monitors.monitors:
         for name, item in marked.items.items():
             if item.specification == monitor.name:

@@ -138,12 +138,17 @@ def _alarms(step: AlarmStep, source: RecordingSource, definitions: Definitions) 
     found: dict[int, int] = {}
     monitors = MonitorSet.of(compiled_from(named_files(step.texts), definitions))
     monitors.start(step.began, frozenset(source.topics))
+    for outcome in _outcomes(monitors, step, source):
+        for number in _warned(outcome, step.says):
+            found[number] = found.get(number, 0) + 1
+    return AlarmFacts(found)
+
+
+def _outcomes(monitors: MonitorSet, step: AlarmStep, source: RecordingSource) -> Iterator[Outcome]:
     for (topic, time, data), _window in step.messages(source):
         outcome = monitors.process(topic, data, time)
-        for each in (*outcome.before, outcome):
-            for number in _warned(each, step.says):
-                found[number] = found.get(number, 0) + 1
-    return AlarmFacts(found)
+        yield from (*outcome.before, outcome)
+    yield from monitors.advance(step.ended)
 
 
 def _warned(outcome: Outcome, says: Mapping[str, list[tuple[int, str]]]) -> Iterator[int]:

@@ -4,7 +4,7 @@ Messages are dropped if their topic's definition differs from that of the specif
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,9 @@ from rosmop.recordings.recording import (
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import DROPPED, MessageSender, Outcome, Verdict, bound
 from roswire.definitions import Definitions
+
+EVER = (0, 1 << 63)
+"""The span, in nanoseconds, of a whole recording."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +110,11 @@ def replay(
     reader: Reader,
     output: OutputBag | None,
     topics: Sequence[str] = ("*",),
-    span: tuple[int, int] = (0, 1 << 63),
+    span: tuple[int, int] = EVER,
     *,
     own: str = OWN,
 ) -> Iterator[ReplayStep]:
-    """Run monitors on a recording in its order, with its times as their clock.
+    """Run monitors on a recording in its order, with its times as their clock, up to its end or that of the span.
 
     `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch; `own` is the node name
     under which monitors published.
@@ -137,15 +140,22 @@ def replay(
         if started is not None:
             outcome = _after(started, outcome)
             started = None
-        for earlier in outcome.before:
-            if output is not None:
-                output.publish(earlier)
-            yield from _steps(ReplayStep(earlier))
+        yield from _timed(outcome.before, output)
         if output is not None:
             if outcome.result != "dropped":
                 output.relay(connection, time_ns, bytes(outcome.buffer))
             output.publish(outcome)
         yield from _steps(ReplayStep(outcome, index, connection.topic))
+    if begun:
+        selection.now = reader.end_time - 1 if span[1] == EVER[1] else span[1]
+        yield from _timed(monitors.advance(selection.now), output)
+
+
+def _timed(outcomes: Iterable[Outcome], output: OutputBag | None) -> Iterator[ReplayStep]:
+    for outcome in outcomes:
+        if output is not None:
+            output.publish(outcome)
+        yield from _steps(ReplayStep(outcome))
 
 
 def _steps(step: ReplayStep) -> Iterator[ReplayStep]:

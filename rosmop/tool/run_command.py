@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rosmop.batch.jobs import Failure
 from rosmop.batch.recording_list import RecordingName
-from rosmop.batch.replay_job import EVER, Replayed, ReplayJob, Specifications, replayed
+from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replayed
 from rosmop.form.findings import SpecificationError
 from rosmop.recordings.recording import Reader, definitions_of, open_recording
-from rosmop.recordings.replay import OutputBag, refusals, replay
+from rosmop.recordings.replay import EVER, OutputBag, refusals, replay
 from rosmop.run.engine import MonitorSet
 from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session, progress
 from rosmop.tool.command_context import CommandContext

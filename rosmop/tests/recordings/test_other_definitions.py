@@ -10,7 +10,8 @@ from rosbags.rosbag1 import Writer
 
 from rosmop.batch.jobs import packed, unpacked, work
 from rosmop.batch.recording_list import recordings_of
-from rosmop.batch.replay_job import EVER, Replayed, ReplayJob, Specifications
+from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications
+from rosmop.recordings.replay import EVER
 from rosmop.tests.batch.test_many_recordings import rosmop
 from roswire.definitions import Definitions
 
