@@ -14,7 +14,9 @@ from rosmop.fast.build import fast_path_of
 from rosmop.recordings.recording import OWN, Reader, definitions_of, open_recording
 from rosmop.recordings.replay import ReplayStep, refusals, replay
 from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import OnFault
 from rosmop.run.outcomes import Outcome, Verdict, bound, why_of
+from rosmop.run.slices import LIMIT
 from rosmop.run.why_lines import lines_of_why
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
@@ -27,7 +29,7 @@ class Specifications(msgspec.Struct, frozen=True):
     """Specifications by file name, and message and service definitions by file name (`package/Type.msg`).
 
     With `chosen`, only this monitor runs, with those that share its variables. `topics` and `given` replace
-    values of the texts, by monitor and name.
+    values of the texts, by monitor and name. `on_fault` and `slices` are settings of the appliance.
     """
 
     texts: dict[str, str]
@@ -35,6 +37,8 @@ class Specifications(msgspec.Struct, frozen=True):
     chosen: str | None = None
     topics: dict[str, dict[str, str]] = msgspec.field(default_factory=dict)
     given: dict[str, dict[str, bool | int | float | str]] = msgspec.field(default_factory=dict)
+    on_fault: OnFault = "drop"
+    slices: int = LIMIT
 
     def known(self, recorded: Definitions) -> Definitions:
         """Return the definitions of the recording, of ROS, and the given ones; later ones replace earlier ones."""
@@ -44,7 +48,13 @@ class Specifications(msgspec.Struct, frozen=True):
     def monitors(self, recorded: Definitions, *, margins: bool = False) -> MonitorSet:
         compiled = compiled_from(self.texts, self.known(recorded), margins=margins, topics=self.topics)
         fast = fast_path_of(compiled) if find_spec("wasmtime") is not None else None
-        monitors = MonitorSet.of(compiled, fast=fast)
+        monitors: MonitorSet = MonitorSet.of(
+            compiled,
+            self.on_fault,
+            fast=fast,
+            slices=self.slices,
+            holder_of=lambda source: monitors.interpreter.turn.names(source)[0] or None,
+        )
         monitors.give(self.given)
         if self.chosen is not None:
             (together,) = compiled.groups([self.chosen])

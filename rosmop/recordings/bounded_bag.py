@@ -57,6 +57,8 @@ class BoundedReader(Reader):
         super().__init__(regular_files.BoundedPath(path))
         self._size = path.stat().st_size
         self._left = PER_BYTE * self._size + regular_files.LARGEST_CHUNK
+        self.hosts: dict[int, str] = {}
+        """The host of each connection by its id, if the flight recorder wrote it."""
         self._entries = 0
         self._unread = Counter[
             int
@@ -84,6 +86,8 @@ class BoundedReader(Reader):
         for fields in (record, header):
             fields.update({name: data.decode("utf-8", "replace").encode() for name, data in fields.items()})
         latching = int(header["latching"] == b"1") if "latching" in header else None
+        if "host" in header:
+            self.hosts[number] = header.get_string("host")
         caller = header.get_string("callerid") if "callerid" in header else None
         text = MessageDefinition(MessageDefinitionFormat.MSG, header.get_string("message_definition"))
         topic, kind = record.get_string("topic"), normalize_msgtype(header.get_string("type"))

@@ -112,6 +112,7 @@ class BoundedMcap:
         self.message_count = count or len(chunks)
         self.start_time = min((chunk.first for chunk in chunks), default=0)
         self.end_time = max((chunk.last + 1 for chunk in chunks), default=0)
+        self.hosts = {row.id: row.metadata["host"] for row in ros if "host" in row.metadata}
         self.connections = [self._connection(channel, schemas[channel.schema_id]) for channel in ros]
         if channels and not self.connections:
             encodings = ", ".join(sorted({channel.message_encoding for channel in channels.values()}))

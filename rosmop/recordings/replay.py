@@ -134,6 +134,7 @@ def replay(
         if not begun:
             started, begun = monitors.start(time_ns, expected), True
         selection.now, caller.name = time_ns, sender_of(connection).callerid or ""
+        caller.host = reader.hosts.get(connection.id, "")
         outcome = _outcome(
             monitors, connection, time_ns, data, refusals[connection.id], MessageSender(index + 1)
         )
@@ -166,12 +167,12 @@ def _steps(step: ReplayStep) -> Iterator[ReplayStep]:
 
 
 class _Caller:
-    """The sender of a recorded message, whose host is not recorded."""
+    """The sender of a recorded message; only the flight recorder notes its host."""
 
-    name = ""
+    host = name = ""
 
     def __call__(self, _source: int) -> tuple[str, str]:
-        return "", self.name
+        return self.host, self.name
 
 
 class _ExplainOnce:

@@ -147,6 +147,10 @@ class Monitors(msgspec.Struct, frozen=True):
         dict[str, dict[str, str]] | None,
         doc("with `texts=1`: topics that replace those given in the texts, by monitor and name"),
     ] = None
+    on_fault: Annotated[
+        Literal["drop", "pass"], doc("whether a message at which a monitor faults is dropped or passes")
+    ] = "drop"
+    slices: Annotated[int, doc("maximum number of slices of a monitor with parameters")] = 100_000
 
 
 class GivenSet(msgspec.Struct, frozen=True):

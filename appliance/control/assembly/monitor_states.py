@@ -27,6 +27,8 @@ def monitors_of(monitors: SpecificationManager, rv_state: list[object], *, texts
         site_keys=list(monitors.site_keys),
         rv_state=msgspec.convert(rv_state, answers.RvState),
         monitors=states_of(monitors),
+        on_fault=monitors.rollout.on_fault,
+        slices=monitors.rollout.slices,
         **(msgspec.structs.asdict(monitors.sources) if texts else {}),
     )
 

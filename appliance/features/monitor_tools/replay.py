@@ -119,7 +119,7 @@ def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) ->
         if row.given
     }
     return Specifications(
-        loaded.files or {}, loaded.definitions or {}, what, topics=loaded.topics or {}, given=given
+        loaded.files or {}, loaded.definitions or {}, what, loaded.topics or {}, given, loaded.on_fault, loaded.slices
     )
 
 
