@@ -84,9 +84,8 @@ class ReplayReport:
         counts = self._counts
         if not counts:
             if len(self.failures) < len(self._recordings):
-                say(
-                    "no message would have been dropped or changed, and no monitor reached a verdict", "green"
-                )
+                alone = "with these monitors alone, no message would have been dropped or changed"
+                say(f"{alone}, and no monitor reached a verdict", "green")
             return
         columns = (Column(head, justify="right") for head in _HEADS)
         table = table_of("monitor", Column("topic", overflow="fold"), *columns)

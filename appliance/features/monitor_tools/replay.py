@@ -73,7 +73,7 @@ def replay_monitor(
     report_file: ReportFile = None,
     show_progress: ShowProgress = False,
 ) -> None:
-    """List and count the recorded messages that a monitor would have dropped or changed.
+    """List and count the recorded messages that a monitor alone would have dropped or changed.
 
     Read bags and MCAP files (--bag, --bags), or the running appliance's flight recorder (--since), with its recordings
     and its memory; gaps are reported. Each recording starts in the monitor's initial state. With --json, print up to
@@ -118,9 +118,8 @@ def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) ->
         for row in loaded.monitors
         if row.given
     }
-    return Specifications(
-        loaded.files or {}, loaded.definitions or {}, what, loaded.topics or {}, given, loaded.on_fault, loaded.slices
-    )
+    settings = loaded.topics or {}, given, loaded.on_fault, loaded.slices
+    return Specifications(loaded.files or {}, loaded.definitions or {}, what, *settings)
 
 
 def _topics(specifications: Specifications, patterns: Sequence[str]) -> dict[str, str]:
