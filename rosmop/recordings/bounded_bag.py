@@ -59,6 +59,8 @@ class BoundedReader(Reader):
         self._left = PER_BYTE * self._size + regular_files.LARGEST_CHUNK
         self.hosts: dict[int, str] = {}
         """The host of each connection by its id, if the flight recorder wrote it."""
+        self.dropped: set[int] = set()
+        """The ids of connections whose messages no monitor got, as the flight recorder wrote."""
         self._entries = 0
         self._unread = Counter[
             int
@@ -88,6 +90,8 @@ class BoundedReader(Reader):
         latching = int(header["latching"] == b"1") if "latching" in header else None
         if "host" in header:
             self.hosts[number] = header.get_string("host")
+        if header.get("carried") == b"0":
+            self.dropped.add(number)
         caller = header.get_string("callerid") if "callerid" in header else None
         text = MessageDefinition(MessageDefinitionFormat.MSG, header.get_string("message_definition"))
         topic, kind = record.get_string("topic"), normalize_msgtype(header.get_string("type"))

@@ -113,6 +113,7 @@ class BoundedMcap:
         self.start_time = min((chunk.first for chunk in chunks), default=0)
         self.end_time = max((chunk.last + 1 for chunk in chunks), default=0)
         self.hosts = {row.id: row.metadata["host"] for row in ros if "host" in row.metadata}
+        self.dropped = {row.id for row in ros if row.metadata.get("carried") == "0"}
         self.connections = [self._connection(channel, schemas[channel.schema_id]) for channel in ros]
         if channels and not self.connections:
             encodings = ", ".join(sorted({channel.message_encoding for channel in channels.values()}))

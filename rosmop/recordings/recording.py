@@ -105,11 +105,13 @@ def sender_of(connection: Connection) -> ConnectionExtRosbag1:
 
 
 def received(reader: Reader, patterns: Sequence[str], own: str = OWN) -> list[Connection]:
-    """Return the connections of nodes on topics that match a pattern. Monitors publish as `own`."""
+    """Return the connections on topics that match a pattern whose messages monitors got. Monitors publish as `own`."""
     return [
         row
         for row in by_size(reader)
-        if sender_of(row).callerid != own and any(fnmatchcase(row.topic, pattern) for pattern in patterns)
+        if sender_of(row).callerid != own
+        and row.id not in reader.dropped
+        and any(fnmatchcase(row.topic, pattern) for pattern in patterns)
     ]
 
 

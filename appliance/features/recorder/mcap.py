@@ -9,9 +9,10 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from appliance.features.recorder.bag_reader import BagReader
+from appliance.features.recorder.ring import CARRIED
 
 _LONGEST = 1 << 32
-_OF_SENDER = ("md5sum", "callerid", "host", "latching")
+_OF_SENDER = ("md5sum", "callerid", "host", "latching", CARRIED)
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:

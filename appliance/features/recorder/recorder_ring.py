@@ -63,8 +63,10 @@ class ExcludedStream:
     def __init__(self, marked: RingStream) -> None:
         self._marked = marked
 
-    def write(self, _frames: memoryview, _messages: int, first: int, judged: int = 0) -> None:
-        self._marked.write(_NOTHING, 0, first, judged)
+    def write(
+        self, _frames: memoryview, _messages: int, first: int, judged: int = 0, *, carried: bool = True
+    ) -> None:
+        self._marked.write(_NOTHING, 0, first, judged, carried=carried)
 
     def close(self) -> None:
         self._marked.close()

@@ -33,6 +33,8 @@ from appliance.features.recorder.recording_answers import (
 )
 from appliance.features.recorder.recording_store import ABOUT, BAG, PROGRESS
 from appliance.features.recorder.ring import (
+    CARRIED,
+    DROPPED,
     HEADER,
     LEFT_OUT,
     MARK,
@@ -76,6 +78,8 @@ class RecordedFrames(NamedTuple):
     time: int
     first: int
     frames: list[memoryview]
+    carried: bool
+    """Whether monitors and subscribers got them."""
 
 
 class StreamFrames(NamedTuple):
@@ -185,7 +189,7 @@ class RingReader:
                 if at + RECORD.size > len(view):
                     break
                 mark, messages, size, time, first = RECORD.unpack_from(view, at)
-                if mark != MARK or first > MAX_MESSAGES:
+                if mark not in {MARK, DROPPED} or first > MAX_MESSAGES:
                     torn, done = True, len(view)  # the start of the next record is unknown
                     break
                 torn, in_doubt = torn or (in_doubt and time >= since), False
@@ -201,7 +205,7 @@ class RingReader:
                     if frames is None:
                         torn = True
                     else:
-                        batches.append(RecordedFrames(time, first, frames))
+                        batches.append(RecordedFrames(time, first, frames, mark == MARK))
             torn = torn or in_doubt
             blocks_read, offset = divmod(done, self._geometry.block)
             self.places[stream] = ReadPosition(run.number + blocks_read, offset)
@@ -321,10 +325,14 @@ class RecordingInProgress:
             progress.torn.append(header["topic"])
         if not found.batches:
             return
-        if _key(header) not in self._numbers and self._headers + _length(header) > _MAX_HEADERS:
+        connections: dict[bool, int] = {}
+        for carried in {batch.carried for batch in found.batches}:
+            head = header if carried else header | {CARRIED: "0"}
+            if _key(head) in self._numbers or self._headers + _length(head) <= _MAX_HEADERS:
+                connections[carried] = self._connection(head)
+        if not connections:
             progress.unconnected += sum(len(batch.frames) for batch in found.batches)
             return
-        connection = self._connection(header)
         row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
         if row is None:
             row = self._topics[kind] = RecordedTopic(*kind, 0, 0, 0)
@@ -335,12 +343,15 @@ class RecordingInProgress:
             gap = max(0, batch.first - following.get(found.stream, batch.first))
             row.missed = min(row.missed + gap, MAX_MESSAGES)
             following[found.stream] = batch.first + len(batch.frames)
+            if batch.carried not in connections:
+                progress.unconnected += len(batch.frames)
+                continue
             if progress.size + size + self._headers > self._largest:
                 progress.why_not = f"it reached {self._largest} bytes, an eighth of recorder.disk"
                 row.missed += len(batch.frames)
                 continue
             for frame in batch.frames:
-                waiting.append(BagMessage(connection, batch.time, frame))
+                waiting.append(BagMessage(connections[batch.carried], batch.time, frame))
                 size += len(frame)
             row.messages += len(batch.frames)
             if size > _CHUNK:

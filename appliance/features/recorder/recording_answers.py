@@ -175,6 +175,10 @@ class RecordedMessage(msgspec.Struct, frozen=True):
     size: Annotated[int, doc("bytes, without the length prefix")]
     fields: Annotated[dict[str, Any], doc("fields as in a message of /v1/messages")]
     why: Annotated[str, doc("why only the first bytes are shown instead of the fields; else empty")]
+    carried: Annotated[
+        bool,
+        doc("false if the relay dropped it before monitors: by a limit, a rank, or as a repeated command"),
+    ] = True
 
 
 class RecordedMessages(msgspec.Struct, frozen=True):

@@ -2,7 +2,8 @@
 
 One relay writes the memory, and one recorder reads it. Each connection to a publisher is a *stream*: a chain of
 header blocks (the connection's TCPROS header) and a chain of data blocks, numbered from 0. The data are records,
-which may span blocks: number of frames, size in bytes, time, number of the first frame, frames.
+which may span blocks: whether they were carried, number of frames, size in bytes, time, number of the first frame,
+frames.
 
 1. A block is valid up to `used`, which is stored after its data. A row is valid while `birth`, which is stored last,
    is not 0. So a writer that is killed at any instruction leaves at most one torn record at the end of a chain, which
@@ -35,9 +36,12 @@ SMALLEST = 1 << 20
 LEFT_OUT = "left_out"
 """The field of a header with the reason why its messages are not recorded; a publisher cannot set it."""
 
+CARRIED = "carried"
+"""The field of a connection in a bag: "0" if the relay dropped its messages before monitors; else it has none."""
+
 HEADER, DATA = 1, 2
 RECORD = struct.Struct("<IIQQQ")  # mark, frames, bytes of the frames, time, number of the first frame
-MARK, PAD = 0x0001_D00D, 0x0002_D00D
+MARK, PAD, DROPPED = 0x0001_D00D, 0x0002_D00D, 0x0003_D00D
 _PAD = struct.Struct("<I")
 NONE_BEGINS = (1 << 32) - 1
 
@@ -145,22 +149,24 @@ class RingStream:
         self._place = self._end = 0  # offsets in the memory
         self._used = 0  # the index of the block's word
 
-    def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
+    def write(
+        self, frames: memoryview, messages: int, first: int, judged: int = 0, *, carried: bool = True
+    ) -> None:
         """Append a record of frames from number `first`. `judged` is the time when monitors got them, or 0."""
-        ring = self._ring
+        ring, mark = self._ring, MARK if carried else DROPPED
         size = len(frames)
         now = self.written = ring.clock(judged)
         place = self._place
         end = place + RECORD.size + size
         if end <= self._end:
-            RECORD.pack_into(ring.memory, place, MARK, messages, size, now, first)
+            RECORD.pack_into(ring.memory, place, mark, messages, size, now, first)
             ring.memory[place + RECORD.size : end] = frames
             ring.words[self._used] = end - self._end + ring.block
             self._place = end
         elif size > ring.longest:
             ring.count(MISSED, messages)
         else:
-            self._append(memoryview(RECORD.pack(MARK, messages, size, now, first)), frames)
+            self._append(memoryview(RECORD.pack(mark, messages, size, now, first)), frames)
 
     def close(self) -> None:
         self._ring.close_chain(self._stream, self._chain)

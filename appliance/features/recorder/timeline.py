@@ -35,6 +35,7 @@ from appliance.features.recorder.recording_answers import (
     Timeline,
 )
 from appliance.features.recorder.recording_plan import kinds_of
+from appliance.features.recorder.ring import CARRIED
 from roswire.message_view import PublisherReader
 
 COLUMNS, MAX_COLUMNS = 200, 1000
@@ -276,6 +277,7 @@ def messages_around(
                     size,
                     fields,
                     why,
+                    header.get(CARRIED) != "0",
                 )
             )
     return RecordedMessages(recording.id, messages, len(before))

@@ -208,7 +208,8 @@ def messages(
             continue
         mark = "->" if number == found.chosen else "  "
         sender = _sender(message.sender, appliance.host_in_words)
-        words = (local_text(message.time), message.topic, sender, f"{message.size} bytes", message.why)
+        size = f"{message.size} bytes{'' if message.carried else ', not carried'}"
+        words = (local_text(message.time), message.topic, sender, size, message.why)
         say(f"{mark} {'  '.join(printable(word) for word in words if word)}", "dim")
         for line in lines_of(message.fields, 2):
             say(line)

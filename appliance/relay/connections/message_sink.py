@@ -10,10 +10,13 @@ class MessageStream(Protocol):
     @property
     def keeps(self) -> bool: ...
 
-    def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
+    def write(
+        self, frames: memoryview, messages: int, first: int, judged: int = 0, *, carried: bool = True
+    ) -> None:
         """Take frames; `first` is the number of the first one.
 
-        `judged` is the time for which monitors judged them; 0 means now.
+        `judged` is the time for which monitors judged them; 0 means now. Those that are not `carried` were dropped
+        before monitors and subscribers.
         """
 
     def close(self) -> None:

@@ -582,7 +582,7 @@ class RelayedTopic:
         if early.messages:
             self.latch.withheld = True
             if self._stream is not None:
-                self._stream.write(early.view, early.messages, early.first)
+                self._stream.write(early.view, early.messages, early.first, carried=False)
         for number, frame in enumerate(batch.frames(early.messages), batch.first + early.messages):
             one = Batch(memoryview(bytearray(frame)), 1, 0, owned=True)
             one.first = number
@@ -591,7 +591,7 @@ class RelayedTopic:
                 continue
             self.latch.withheld = True
             if self._stream is not None:
-                self._stream.write(one.view, 1, one.first)
+                self._stream.write(one.view, 1, one.first, carried=False)
 
     def _receive(self, batch: Batch, since: float) -> Batch | None:
         passing = batch
@@ -600,7 +600,7 @@ class RelayedTopic:
         if passing is not batch:
             if self._stream is not None:
                 dropped = batch.head(batch.messages - passing.messages)
-                self._stream.write(dropped.view, dropped.messages, dropped.first)
+                self._stream.write(dropped.view, dropped.messages, dropped.first, carried=False)
             if not passing.messages:
                 return None
             batch = passing
@@ -636,13 +636,13 @@ class RelayedTopic:
             whole.first = batch.first
         rest = self._admit(passing, since) if passing.messages else None
         if stream is not None and stream is self._stream:
-            head = whole
-            if rest is not None:
-                head = whole.head(passing.messages - rest.messages)
-                if passing.messages < whole.messages:  # limits have dropped the others
-                    dropped = whole.tail(whole.messages - passing.messages)
-                    stream.write(dropped.view, dropped.messages, dropped.first)
-            stream.write(head.view, head.messages, head.first, passing.judged)
+            taken = passing.messages - (0 if rest is None else rest.messages)
+            if taken:
+                head = whole if taken == whole.messages else whole.head(taken)
+                stream.write(head.view, taken, head.first, passing.judged)
+            if passing.messages < whole.messages:  # limits or a rank have dropped the others
+                dropped = whole.tail(whole.messages - passing.messages)
+                stream.write(dropped.view, dropped.messages, dropped.first, carried=False)
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:

@@ -428,7 +428,9 @@ class _Recorder:
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> "_Recorder":
         return self
 
-    def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
+    def write(
+        self, frames: memoryview, messages: int, first: int, judged: int = 0, *, carried: bool = True
+    ) -> None:
         self.written += bytes(frames)
 
     def close(self) -> None: ...
