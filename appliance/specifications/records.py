@@ -137,7 +137,7 @@ class Repetitions:
         number = event.count or 1
         known.total += number
         if not known.count:
-            known.first = int(event.detail.get("first_time") or event.time)
+            known.first = event.first or event.time
         known.count += number
         if not known.allowance.take(now):
             known.waits = event
@@ -148,14 +148,13 @@ class Repetitions:
         known.count = 0
         return event
 
-    def ended(self, now: float) -> Iterator[MonitorEvent]:
-        """Yield the last reports of actions that have ended, with their whole number and time."""
+    def ended(self, now: float) -> Iterator[tuple[MonitorEvent, dict[str, float]]]:
+        """Yield the last reports of actions that have ended, and their whole number (`total`) and time in seconds."""
         for key, known in list(self._known.items()):
             quiet = now - known.at >= QUIET
             if known.waits is not None and quiet and known.allowance.take(now):
                 seconds = round((known.last - known.begun) / 1e9, 3)
-                whole = {"total": known.total, "seconds": seconds}
-                yield _counted(known.waits, known, whole)
+                yield _counted(known.waits, known), {"total": known.total, "seconds": seconds}
                 known.waits = None
             if known.waits is None and quiet and known.allowance.full(now):
                 del self._known[key]
@@ -205,7 +204,7 @@ class Stops:
     def take(self, event: MonitorEvent, now: float) -> StoppedTopic | None:
         """Return the stop if it begins with this event."""
         cause = str(event.detail.get("cause", ""))
-        key, last = (event.monitor, event.resource), int(event.detail.get("last_time") or event.time)
+        key, last = (event.monitor, event.resource), event.time
         going = self._going.get(key)
         if going is not None:
             stop = going.stop
@@ -218,10 +217,9 @@ class Stops:
         if key not in self._allowances and len(self._allowances) >= _MAX:
             self._allowances = {one: each for one, each in self._allowances.items() if not each.full(now)}
         allowance = self._allowances.setdefault(key, _Allowance(STOPS, LONG_QUIET, STOPS, now))
-        first = int(event.detail.get("first_time") or event.time)
         found = StoppedTopic(
             *key,
-            first,
+            event.first or last,
             last,
             event.count or 1,
             cause,
@@ -248,15 +246,14 @@ class Stops:
 
 
 def _only(event: MonitorEvent) -> tuple[str, str]:
-    publishers = event.detail.get("publishers", ())
-    return (str(publishers[0]["host"]), str(publishers[0]["node"])) if len(publishers) == 1 else ("", "")
+    match event.detail.get("publishers"):
+        case [{"host": str(host), "node": str(node)}]:
+            return host, node
+    return "", ""
 
 
-def _counted(
-    event: MonitorEvent, known: _GoingOn, more: Mapping[str, object] = MappingProxyType({})
-) -> MonitorEvent:
-    detail = {**event.detail, "first_time": known.first, "last_time": known.last, **more}
-    counted = msgspec.structs.replace(event, count=known.count, detail=detail)
+def _counted(event: MonitorEvent, known: _GoingOn) -> MonitorEvent:
+    counted = msgspec.structs.replace(event, count=known.count, first=known.first, time=known.last)
     known.count = 0
     return counted
 
@@ -312,8 +309,8 @@ class MonitorRecords:
 
     def tick(self) -> None:
         now = clock.now()
-        for event in self.repetitions.ended(now):
-            self._record(event)
+        for event, whole in self.repetitions.ended(now):
+            self._record(event, whole)
         for stop in self.stops.ended(now):
             seconds = (stop.until - stop.since) / 1e9
             text = f"{stop.monitor} stopped {stop.topic} for {seconds:.1f} s, {counted(stop.count, 'time')}"
@@ -366,7 +363,7 @@ class MonitorRecords:
             begun = msgspec.structs.replace(event, text=f"{stop.monitor} stops {stop.topic}: {cause}")
             self.stops.recorded(stop, self._record(begun))
 
-    def _record(self, event: MonitorEvent) -> str:
+    def _record(self, event: MonitorEvent, whole: Mapping[str, float] = MappingProxyType({})) -> str:
         name, severity = _STOP if event.safe else _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
         detail: dict[str, Any] = {"monitor": event.monitor}
         shadowed = _SHADOW_KINDS.get(event.kind)
@@ -387,9 +384,11 @@ class MonitorRecords:
         text = event.text
         if shadowed in _SENT:
             text = f"{event.monitor} {_SENT[shadowed]} {text}"
+        if event.first:
+            detail |= {"first_time": event.first, "last_time": event.time}
         if event.count:
-            detail["count"] = event.count
-            text = _number(event) + (f": {text}" if text else "")
+            detail |= {"count": event.count, **whole}
+            text = _number(event, whole) + (f": {text}" if text else "")
         if shadowed is not None:
             text = f"in shadow mode, not done: {text}" if shadowed in _NOT_DONE else f"in shadow mode: {text}"
         return self.trail.happened(
@@ -409,16 +408,17 @@ def moment(time_ns: int) -> str:
     return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat()
 
 
-def _number(event: MonitorEvent) -> str:
-    detail = event.detail
-    if "seconds" in detail:
-        return f"{event.count} more, {detail['total']} in {detail['seconds']:.0f} s, until it ended"
-    first, last = int(detail.get("first_time", 0)), int(detail.get("last_time", 0))
-    if last - first <= _SECOND:
+def _number(event: MonitorEvent, whole: Mapping[str, float]) -> str:
+    if whole:
+        return f"{event.count} more, {whole['total']} in {whole['seconds']:.0f} s, until it ended"
+    length = event.time - (event.first or event.time)
+    if length <= _SECOND:
         return f"{event.count} more in the same second"
-    return f"{event.count} more in {(last - first) / _SECOND:.0f} s"
+    return f"{event.count} more in {length / _SECOND:.0f} s"
 
 
 def _monitors(event: MonitorEvent) -> set[str]:
-    together = event.detail.get("changed_by", ())
-    return {event.monitor, *(str(other).partition(".")[0] for other in together)}
+    match event.detail.get("changed_by"):
+        case [*together]:
+            return {event.monitor, *(str(other).partition(".")[0] for other in together)}
+    return {event.monitor}

@@ -853,9 +853,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.values.relay_lost()
 
     def _tick(self) -> None:
-        self.records.tick()
-        going_on = self.records.some
-        self._ticking = asyncio.get_running_loop().call_later(1.0, self._tick) if going_on else None
+        try:
+            self.records.tick()
+        finally:
+            going_on = self.records.some
+            self._ticking = asyncio.get_running_loop().call_later(1.0, self._tick) if going_on else None
 
     # --- inside ---
 

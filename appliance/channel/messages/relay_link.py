@@ -3,7 +3,7 @@
 `key` is the key of an incarnation. `named`: the policy names the host, not only all hosts (`*`).
 """
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
@@ -506,12 +506,15 @@ class PublicationRefused(Message):
     reason: str
 
 
+_Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
+
+
 class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     """An action of a monitor. The first action of each kind in a second is complete; the others are only counted.
 
     `kind` is verdict, drop, change, fault, log, publish or call, with the prefix "shadow " in shadow mode ("shadow
     missed": a message that it did not get). `time` is in nanoseconds since the epoch. `count` is 0 for a complete
-    event.
+    event; for a count, `time` is that of the last action, and `first` that of the first one, or 0 if it is unknown.
 
     `before` and `after` are the first bytes of the message; `size` is its whole length. For a change, `monitor` is
     the last one; `changed_by` in the detail names the events of all. `host` and `caller_id` identify the message's
@@ -529,10 +532,11 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     before: bytes = b""
     after: bytes = b""
     size: int = 0
-    count: int = 0
+    count: _Count = 0
     host: str = ""
     caller_id: str = ""
     safe: bool = False
+    first: int = 0
 
 
 class MonitorsReported(Message):

@@ -68,8 +68,6 @@ class _Repeated:
 
     def detail(self) -> dict[str, object]:
         found = dict(self.shared)
-        if self.first_time:
-            found |= {"first_time": self.first_time, "last_time": self.last_time}
         if self.alike and self.first_text != self.last_text:
             found |= {"first_text": self.first_text, "last_text": self.last_text}
         return found
@@ -245,6 +243,7 @@ def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:
         host=host,
         caller_id=repeated.caller_id,
         safe=safe,
+        first=repeated.first_time,
     )
 
 

@@ -1,5 +1,8 @@
 """An action that goes on takes few records, with the right sum; a stop has one begin and one end."""
 
+import contextlib
+import itertools
+import math
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -76,8 +79,7 @@ class Site:
 
 
 def _at(event: MonitorEvent, now: int) -> MonitorEvent:
-    times = {name: now for name in ("first_time", "last_time") if name in event.detail}
-    return msgspec.structs.replace(event, time=now, detail={**event.detail, **times})
+    return msgspec.structs.replace(event, time=now, first=now if event.first else 0)
 
 
 @pytest.fixture
@@ -183,8 +185,8 @@ def _kinds(events: list[MonitorEvent]) -> Counter[tuple[str, bool]]:
 
 
 def drop(text: str = "", count: int = 0, kind: str = "drop", host: str = "10.0.0.7") -> MonitorEvent:
-    detail = {"first_time": 1, "last_time": 2} if count else {}
-    return MonitorEvent(kind, "gun", "key", "/trigger", 0, text, detail, count=count, host=host)
+    first = 1 if count else 0
+    return MonitorEvent(kind, "gun", "key", "/trigger", 0, text, {}, count=count, host=host, first=first)
 
 
 def stop(count: int = 0, cause: str = "the scan is silent") -> MonitorEvent:
@@ -252,6 +254,48 @@ def test_a_stop_has_one_begin_and_one_end(site: Site) -> None:
     assert end.reason == "scan stopped /cmd_vel for 29.0 s, 300 times: the scan is silent"
     assert (end.detail["begun_in"], end.detail["actions"], end.detail["seconds"]) == (begin.id, 300, 29)
     assert site.records.stops.last["scan"].record == begin.id
+
+
+ANY_VALUES: tuple[Any, ...] = (-(1 << 63), -1, 0, 1, (1 << 32) - 1, 10**19, (1 << 64) - 1, 1e308, math.nan, "9" * 30,
+    "", b"\xff", None, True, [], [1], [{}], [{"host": 1}], {}, {"x": [None]})  # fmt: skip
+DETAILS = (
+    "cause",
+    "publishers",
+    "changed_by",
+    "level",
+    "category",
+    "first_time",
+    "last_time",
+    "seconds",
+    "total",
+)
+
+
+def test_no_report_of_another_relay_ends_the_record_of_stops(site: Site) -> None:
+    """A relay may send any value in each field, and in each detail that control reads."""
+    fields = {field: index for index, field in enumerate(MonitorEvent.__struct_fields__)}
+    decoder = msgspec.msgpack.Decoder(MonitorsReported)
+    names = fields | dict.fromkeys(DETAILS)
+    for number, (name, value, count) in enumerate(itertools.product(names, ANY_VALUES, (0, 1))):
+        good = MonitorEvent("log", f"ghost{number}", "k", "/cmd_vel", 1, "", {}, count=count, safe=True)
+        row = [getattr(good, field) for field in fields]
+        if name in fields:
+            row[fields[name]] = value
+        else:
+            row[fields["detail"]] = {name: value}
+        plain = [*row]
+        plain[fields["safe"]] = False
+        hostile = {"message": "MonitorsReported", "events": [row, row, plain]}
+        with contextlib.suppress(Exception):  # the event loop logs it
+            site.records.reported(decoder.decode(msgspec.msgpack.encode(hostile)).events, 0)
+    for _ in range(2):
+        site.second([stop()])
+        for _ in range(130):
+            site.second([])
+    ours = [one.event for one in site.found() if one.detail.get("monitor") == "scan"]
+    assert ours == ["stop begun", "stop ended"] * 2
+    msgspec.msgpack.encode(site.records.counts.most_common())  # answers to operators have the counts
+    site.restart()
 
 
 def test_stops_that_follow_each_other_closely_become_one(site: Site) -> None:
