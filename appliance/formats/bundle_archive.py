@@ -17,6 +17,7 @@ import io
 import re
 import tarfile
 from collections.abc import Mapping
+from typing import Annotated
 
 import msgspec
 
@@ -31,9 +32,13 @@ _SPECIFICATION = re.compile(rf"monitors/({_WORD}\.rv)")
 _DEFINITION = re.compile(rf"monitors/msg/({_WORD}/{_WORD}\.(?:msg|srv))")
 _SIGNATURE = ".sig"
 
+_END = r"$(?!\n)"  # Python's `$` also matches before a final newline
+_SpecificationName = Annotated[str, msgspec.Meta(pattern=rf"^{_WORD}\.rv{_END}")]
+_DefinitionName = Annotated[str, msgspec.Meta(pattern=rf"^{_WORD}/{_WORD}\.(?:msg|srv){_END}")]
+
 
 class BundleContents(msgspec.Struct, frozen=True):
-    """The texts of a bundle; missing signatures are empty.
+    """The texts of a bundle; missing signatures are empty. Decoded contents have only names that an archive may have.
 
     `definitions` is keyed by `package/Type.msg` (or `.srv`), and `signatures` by the names of the signed files.
     """
@@ -42,8 +47,8 @@ class BundleContents(msgspec.Struct, frozen=True):
     hosts: str
     policy_signature: str = ""
     cases: str | None = None
-    files: dict[str, str] = {}
-    definitions: dict[str, str] = {}
+    files: dict[_SpecificationName, str] = {}
+    definitions: dict[_DefinitionName, str] = {}
     signatures: dict[str, str] = {}
 
 

@@ -93,12 +93,14 @@ class Sources(msgspec.Struct, frozen=True):
     def _signed(self, site_keys: Sequence[str]) -> tuple[set[str], dict[str, str]]:
         found: set[str] = set()
         unsigned = {}
-        for name, text in (self.files | self.definitions).items() if site_keys else ():
+        # One name may be in both, with one signature: it must fit both texts.
+        texts = [("", *item) for item in self.files.items()]
+        texts += [("msg/", *item) for item in self.definitions.items()]
+        for folder, name, text in texts if site_keys else ():
             try:
                 found.add(signer(site_keys, text, self.signatures.get(name, "")))
             except UnsignedError as error:
-                place = name if name in self.files else f"msg/{name}"
-                unsigned[place] = f"{place}:1:1: error: {error}"
+                unsigned[folder + name] = f"{folder}{name}:1:1: error: {error}"
         return found, unsigned
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:

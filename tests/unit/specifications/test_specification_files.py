@@ -10,6 +10,7 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
     read_folder,
 )
+from tests.support.site_key import LINE, NAME, signed
 from tests.support.unreadable_folders import make_unreadable
 
 SPEC = "a() { event said() /chatter std_msgs/String '{}' { } }"
@@ -107,3 +108,20 @@ def test_an_unusable_folder_has_no_files(tmp_path: Path) -> None:
     assert SpecificationFolder(tmp_path).looked_at() is None
     assert SpecificationFolder(tmp_path / "gone").looked_at() is None
     assert SpecificationFolder(None).looked_at() == Sources()
+
+
+@pytest.mark.parametrize("name", ["a.rv", "own_msgs/Trigger.msg", "msg/own_msgs/Trigger.msg"])
+@pytest.mark.parametrize("unsigned", ["files", "definitions"])
+def test_a_text_needs_its_own_signature_although_another_of_its_name_has_one(
+    name: str, unsigned: str
+) -> None:
+    texts = {"files": {name: SPEC}, "definitions": {name: SPEC}}
+    good = Sources(texts["files"], texts["definitions"], {name: signed(SPEC)})
+    assert good.signers([LINE]) == [NAME]
+    texts[unsigned] = {name: OWN}
+    sources = Sources(texts["files"], texts["definitions"], good.signatures)
+    with pytest.raises(SpecificationsRefusedError, match="is not the text"):
+        sources.signers([LINE])
+    left, errors = sources.signed([LINE])
+    assert OWN not in left.named().values()
+    assert list(errors) == [name if unsigned == "files" else f"msg/{name}"]
