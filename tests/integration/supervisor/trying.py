@@ -3,8 +3,10 @@ import errno
 import json
 import mmap
 import os
+import resource
 import signal
 import socket
+import struct
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -58,7 +60,7 @@ def _executable() -> list[str]:
 
 def tried(wanted: dict[str, Any]) -> dict[str, Any]:
     return {
-        "calls": {name: _call(name) for name in FORBIDDEN if name not in _ENDS_THE_TRIAL},
+        "calls": {name: _forbidden(name) for name in FORBIDDEN if name not in _ENDS_THE_TRIAL},
         "new namespace": _new_namespace(),
         "fork": _outcome(_fork),
         "program": _outcome(lambda: _run("/bin/true")),
@@ -69,7 +71,7 @@ def tried(wanted: dict[str, Any]) -> dict[str, Any]:
         "connect": [_outcome(partial(_connect, port)) for port in wanted["ports"]],
         "read": {path: _outcome(Path(path).read_bytes) for path in wanted["reads"]},
         "write": {path: _outcome(partial(Path(path).write_text, "x")) for path in wanted["writes"]},
-        "signal": _outcome(lambda: os.kill(wanted["pid"], signal.SIGUSR1)),
+        "other process": _other_process(wanted["pid"]),
         "filtered": "Seccomp:\t2" in Path("/proc/self/status").read_text(),
     }
 
@@ -95,16 +97,39 @@ def _connect(port: int) -> None:
         sock.connect(("127.0.0.1", port))
 
 
-def _call(name: str) -> str:
+def _forbidden(name: str) -> str:
+    # 0 is PTRACE_TRACEME: the process would then stop at its next signal
+    return _call(name, _PTRACE_ATTACH if name == "ptrace" else 0)
+
+
+def _call(name: str, *given: int) -> str:
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(name.encode())
     if number < 0:
         return "not there"
     libc = ctypes.CDLL(None, use_errno=True)
-    first = (
-        _PTRACE_ATTACH if name == "ptrace" else 0
-    )  # 0 is PTRACE_TRACEME: the process would then stop at its next signal
-    result = libc.syscall(ctypes.c_long(number), ctypes.c_long(first), *(ctypes.c_long(0) for _ in range(5)))
+    arguments = (number, *given, *[0] * (6 - len(given)))
+    result = libc.syscall(*(ctypes.c_long(argument) for argument in arguments))
     return "done" if result >= 0 else errno.errorcode[ctypes.get_errno()]
+
+
+def _other_process(pid: int) -> dict[str, str]:
+    """Try every call that may change another process of the user; the last signal ends it."""
+    queued = ctypes.create_string_buffer(struct.pack("iii", 0, 0, -1), 128)  # a siginfo_t with SI_QUEUE
+    none, all_cores = ctypes.create_string_buffer(16), ctypes.create_string_buffer(b"\xff" * 128, 128)
+    queue, no_limit, cores = map(ctypes.addressof, (queued, none, all_cores))
+    idle, core_files = 19, resource.RLIMIT_CORE
+    other = os.pidfd_open(pid)
+    return {
+        "setpriority": _call("setpriority", os.PRIO_PROCESS, pid, idle),
+        "sched_setaffinity": _call("sched_setaffinity", pid, 128, cores),
+        "prlimit64": _call("prlimit64", pid, core_files, no_limit),
+        "pidfd_send_signal": _call("pidfd_send_signal", other),
+        "tkill": _call("tkill", pid),
+        "tgkill": _call("tgkill", pid, pid),
+        "rt_sigqueueinfo": _call("rt_sigqueueinfo", pid, 0, queue),
+        "rt_tgsigqueueinfo": _call("rt_tgsigqueueinfo", pid, pid, 0, queue),
+        "kill": _call("kill", pid, signal.SIGUSR1),
+    }
 
 
 def _new_namespace() -> str:
