@@ -127,7 +127,8 @@ EVENTS: dict[str, str] = {
     "recording closed": "The flight recorder finished a recording.",
     "recording fetched": "The messages of a recording were fetched.",
     "recording read": "Messages of a recording were read, decoded.",
-    "recording removed": "A recording was removed; `who` is `recorder` if it was removed for space or age.",
+    "recording removed": "A recording was removed; `who` is `recorder` if it was removed for space or age,"
+    " or if control restarted after the order.",
     "recording missed": "A trigger made no recording: `reason` says why (limit of recordings per hour, or disk space),"
     " or which recording has its time; `detail.recording` is the id that the trigger's record had promised.",
     "topic looked into": "Messages of a topic were shown; the record covers `seconds`.",

@@ -57,6 +57,7 @@ class RecordingOrders:
         self._kept: dict[str, Recording] = {}
         self._lent: dict[str, Recording] = {}  # temporary recordings of the data in memory
         self._open: dict[str, OpenRecording] = {}
+        self._removed_by: dict[str, str] = {}  # who ordered the removals that are not recorded yet
         self._notes: set[asyncio.Future[None]] = set()
 
     def state(self) -> RecorderState | None:
@@ -185,10 +186,15 @@ class RecordingOrders:
 
     async def remove(self, request: recording_requests.RecordingRemove, who: str) -> Recording:
         self._require()
-        removed = await self._ask(
-            lambda number: recorder_link.RecordingRemovalWanted(number, request.id, who),
-            recorder_link.RecordingRemoved,
-        )
+        self._removed_by[request.id] = who
+        try:
+            removed = await self._ask(
+                lambda number: recorder_link.RecordingRemovalWanted(number, request.id, who),
+                recorder_link.RecordingRemoved,
+            )
+        except UnknownThingError:
+            self._removed_by.pop(request.id, None)
+            raise
         return removed.recording
 
     def _require(self) -> None:
@@ -246,11 +252,13 @@ class RecordingOrders:
                     about["recording"] = planned
                     self._plan.missed(trigger.charged_to, planned, reason, clock.wall_ns(), instead)
                 self._trail.happened("recording missed", reason, more=about)
-            case recorder_link.RecordingRemoved(_number, recording, who, reason):
+            case recorder_link.RecordingRemoved(_number, recording, claimed, reason):
                 self._kept.pop(recording.id, None)
+                who = "" if reason else self._removed_by.get(recording.id, "")
+                by = f"by {who}" if who else f"the recorder reports an order of {claimed}"
                 self._trail.happened(
                     "recording removed",
-                    reason or f"by {who}",
+                    reason or by,
                     recording=recording.id,
                     sha256=recording.sha256,
                     who=who or "recorder",
@@ -267,6 +275,7 @@ class RecordingOrders:
     def _note(self, recording_id: str) -> None:
         async def note() -> None:
             if await self._trail.durable() is None:
+                self._removed_by.pop(recording_id, None)
                 with suppress(ChannelFullError):
                     self.link.send(recorder_link.RecordingNoted(recording_id))
 

@@ -215,6 +215,26 @@ async def test_orders_have_the_name_of_their_operator() -> None:
     recorder.close()
 
 
+@pytest.mark.parametrize("reason", ["", "recorder.disk is full"])
+@pytest.mark.parametrize("by", ["", "eve", "dave"])
+async def test_only_an_order_puts_the_name_of_an_operator_into_the_log(
+    scene: Scene, by: str, reason: str
+) -> None:
+    """The recorder may be compromised. An order that it answers too late, or again, still has its name."""
+    ours, recorder = memory_link(recorder_link.RecorderLink)
+    scene.orders.link.attach(ours)
+    removed = [recorder_link.RecordingRemoved(number, KEPT, "eve", reason) for number in (0, 1, 7)]
+    if by:
+        ordered = asyncio.ensure_future(scene.orders.remove(recording_requests.RecordingRemove(KEPT.id), by))
+        await asyncio.sleep(0)
+        ordered.cancel()
+    for message in removed:
+        recorder.send(message)
+    await told(scene, lambda: len(scene.trail.rows) == 3)
+    expected = "recorder" if reason or not by else by
+    assert {row["who"] for row in scene.trail.rows} == {expected}
+
+
 async def test_an_open_recording_is_listed(scene: Scene) -> None:
     ours, recorder = memory_link(recorder_link.RecorderLink)
     scene.orders.link.attach(ours)
