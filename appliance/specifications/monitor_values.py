@@ -30,16 +30,22 @@ class _Kept:
 
 
 class MonitorValues:
-    """Returns the variables of monitors. `tell(monitor, message)` sends to its relay; False if that is away."""
+    """Returns the variables of monitors. `send(message, relay)` returns False if that relay is away."""
 
     def __init__(
-        self, tell: Callable[[str, Message], bool], revision: Callable[[], int], trail: AuditTrail
+        self,
+        send: Callable[[Message, int], bool],
+        relay_of: Callable[[str], int],
+        revision: Callable[[], int],
+        trail: AuditTrail,
     ) -> None:
-        self._tell = tell
+        self._send = send
+        self._relay_of = relay_of
         self._revision = revision
         self._trail = trail
         self._number = clock.now_ns()  # relays may outlive control, so no number may be repeated
-        self._asked: dict[str, tuple[int, asyncio.Future[str]]] = {}
+        self._asked: dict[str, tuple[tuple[int, int], asyncio.Future[str]]] = {}
+        """The relay that is asked about a monitor, the number, and the answer."""
         self._kept: dict[str, _Kept] = {}
         self._shown: dict[tuple[str, str], float] = {}
 
@@ -62,31 +68,33 @@ class MonitorValues:
         """Ask the relay, or join a query that waits for its answer. Return why there is no answer, or an empty text."""
         if monitor not in self._asked:
             self._number += 1
-            if not self._tell(monitor, ValuesWanted(self._number, monitor)):
+            relay = self._relay_of(monitor)
+            if not self._send(ValuesWanted(self._number, monitor), relay):
                 return _AWAY
-            self._asked[monitor] = self._number, asyncio.get_running_loop().create_future()
-        number, answer = self._asked[monitor]
+            self._asked[monitor] = (relay, self._number), asyncio.get_running_loop().create_future()
+        asked, answer = self._asked[monitor]
         try:
             async with asyncio.timeout(ANSWER_SECONDS):
                 return await asyncio.shield(answer)
         except TimeoutError:
-            if self._asked.get(monitor, (0, None))[0] == number:
+            if self._asked.get(monitor, ((0, 0), None))[0] == asked:
                 del self._asked[monitor]
             return _SILENT
 
-    def received(self, seen: ValuesSeen) -> None:
-        for monitor, (number, answer) in list(self._asked.items()):
-            if number == seen.number:
+    def received(self, seen: ValuesSeen, relay: int) -> None:
+        for monitor, (asked, answer) in list(self._asked.items()):
+            if asked == (relay, seen.number):
                 del self._asked[monitor]
                 if seen.values is not None:
                     self._kept[monitor] = _Kept(seen, clock.now(), self._revision())
                 answer.set_result("" if seen.values is not None else _ELSEWHERE)
 
-    def relay_lost(self) -> None:
-        """Answer all readers: which relay they wait for is not known here, and another query costs little."""
-        asked, self._asked = self._asked, {}
-        for _number, answer in asked.values():
-            answer.set_result(_AWAY)
+    def relay_lost(self, relay: int) -> None:
+        """Answer the readers that wait for it."""
+        for monitor, (asked, answer) in list(self._asked.items()):
+            if asked[0] == relay:
+                del self._asked[monitor]
+                answer.set_result(_AWAY)
 
     def _record(self, monitor: str, who: str) -> None:
         now = clock.now()

@@ -91,7 +91,7 @@ class Rollout:
     _held: dict[int, dict[str, str]] = field(default_factory=dict)
     _inherited: InheritedState = field(default_factory=InheritedState)
     _heirs: set[int] = field(default_factory=set)  # relays that have not taken the inherited state yet
-    _left: dict[int, asyncio.Future[messages.StateLeft]] = field(default_factory=dict)
+    _left: dict[tuple[int, int], asyncio.Future[messages.StateLeft]] = field(default_factory=dict)
     _leaving: bool = False  # whether the relays drop all messages, because this appliance hands over
     _inheritance_taken: Callable[[], None] = lambda: None
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
@@ -146,7 +146,7 @@ class Rollout:
             wanted = messages.StateWanted(next(self._numbers), copy, full)
             if not self.relays.send(wanted, relay):
                 raise ConnectionError("a relay is being restarted")
-            self._left[wanted.number] = loop.create_future()
+            self._left[relay, wanted.number] = loop.create_future()
         async with asyncio.timeout(seconds):
             return [await answer for answer in [*self._left.values()]]
 
@@ -290,11 +290,12 @@ class Rollout:
         return moved
 
     def _merge_rows(self) -> None:
+        files = self._now.checked.monitors
         self.rows = {
             row.name: row
             for relay, rows in self._rows.items()
             for row in rows
-            if self.allocation.of_file(row.file) == relay
+            if self.allocation.of_file(files.get(row.name, row.file)) == relay
         }
 
     def _say_moved(self, plan: AllocationPlan, monitors: list[str]) -> None:
@@ -363,8 +364,8 @@ class Rollout:
         match message:
             case messages.SpecificationsTaken():
                 self._taken(relay, message)
-            case messages.StateLeft(number) if number in self._left:
-                self._left.pop(number).set_result(message)
+            case messages.StateLeft(number) if (relay, number) in self._left:
+                self._left.pop((relay, number)).set_result(message)
             case messages.SpecificationsRefused(number, findings, statement):
                 self._refused(relay, number, findings, statement)
             case messages.MonitorsCounted(rows, unfit, acting):

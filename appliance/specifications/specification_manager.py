@@ -149,7 +149,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             [*told],
             lambda stops: store.save_setting(_STOPS, stops),
         )
-        self.values = MonitorValues(self.rollout.tell, lambda: self.revision, trail)
+        self.values = MonitorValues(relays.send, self.rollout.relay_of, lambda: self.revision, trail)
         self._published = published
         self._ticking: asyncio.TimerHandle | None = None
         self._returning: asyncio.Task[None] | None = None
@@ -844,13 +844,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if self._ticking is None:
                 self._tick()
         elif isinstance(message, messages.ValuesSeen):
-            self.values.received(message)
+            self.values.received(message, relay)
         else:
             self.rollout.received(message, relay)
 
     def relay_lost(self, relay: int) -> None:
         self.rollout.lost(relay)
-        self.values.relay_lost()
+        self.values.relay_lost(relay)
 
     def _tick(self) -> None:
         try:

@@ -168,7 +168,7 @@ class RelayControl:
             RelayOutbox(index, partial(self._on_message, index), partial(self._lost, index))
             for index in range(self.allocation.relays)
         )
-        self.taps = TapRequests(lambda topic: self._post(TOPIC, topic).send)
+        self.taps = TapRequests(partial(self.allocation.of, TOPIC), self.send)
         self.ranks = RankStates(lambda order: self._post(TOPIC, order.topic).send(order))
 
     @property
@@ -419,11 +419,12 @@ class RelayControl:
                 for row in message.rows:
                     self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
             case messages.RankReported():
-                self.ranks.reported(message)
+                if self._post(TOPIC, message.topic) is post:
+                    self.ranks.reported(message)
             case messages.OrdersCarriedOut():
                 post.carried_out()
             case messages.MessageSeen() | messages.StopBegun() | messages.GuardTested():
-                self.taps.seen(message)
+                self.taps.seen(message, index)
             case _ if not self.carried.received(index, message):
                 self.monitors().received(message, index)
 

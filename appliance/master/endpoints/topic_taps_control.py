@@ -20,15 +20,18 @@ class TooManyTapsError(Exception):
 class TapRequests:
     """The open taps, and the open requests for the safe messages and tests of monitors.
 
-    `sender(topic)` returns the function that sends a message to the relay that carries the topic.
+    `relay_of(topic)` returns the relay that carries the topic; only that one answers. `send(message, relay)` returns
+    whether the relay is there.
     """
 
-    def __init__(self, sender: Callable[[str], Callable[[messages.Message], bool]]) -> None:
-        self._sender = sender
+    def __init__(self, relay_of: Callable[[str], int], send: Callable[[messages.Message, int], bool]) -> None:
+        self._relay_of = relay_of
+        self._send = send
         self._number = 0
         self._people: Pool[str] = Pool("queries", TOPIC_LOOKS.bounds, lambda _who: QuotaClass.REGISTERED)
-        self._open: dict[int, tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
-        self._asked: dict[int, asyncio.Future[messages.StopBegun | messages.GuardTested]] = {}
+        self._open: dict[tuple[int, int], tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
+        self._asked: dict[tuple[int, int], asyncio.Future[messages.StopBegun | messages.GuardTested]] = {}
+        """By relay and number."""
 
     async def look(
         self, topic: str, count: int, seconds: float, who: str, *, latched: bool
@@ -39,20 +42,20 @@ class TapRequests:
             raise TooManyTapsError(
                 f"{total} queries of topics' messages are running, {mine} of {who}: try again"
             )
-        send = self._sender(topic)
+        relay = self._relay_of(topic)
         self._number += 1
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()
-        self._open[number] = count, seen, enough
+        self._open[relay, number] = count, seen, enough
         try:
-            if send(messages.LookWanted(number, topic, count, latched)):
+            if self._send(messages.LookWanted(number, topic, count, latched), relay):
                 async with asyncio.timeout(seconds):
                     await enough.wait()
         except TimeoutError:
             pass
         finally:
-            del self._open[number]
+            del self._open[relay, number]
             self._people.give_back(who)
-            send(messages.LookEnded(number))
+            self._send(messages.LookEnded(number), relay)
         return seen
 
     async def stop(self, topic: str) -> list[str] | None:
@@ -80,28 +83,30 @@ class TapRequests:
         self, topic: str, numbered: Callable[[int], messages.Message], seconds: float
     ) -> messages.StopBegun | messages.GuardTested | None:
         self._number += 1
-        number = self._number
+        relay, number = self._relay_of(topic), self._number
         answer: asyncio.Future[messages.StopBegun | messages.GuardTested] = (
             asyncio.get_running_loop().create_future()
         )
-        self._asked[number] = answer
+        self._asked[relay, number] = answer
         try:
-            if not self._sender(topic)(numbered(number)):
+            if not self._send(numbered(number), relay):
                 return None
             async with asyncio.timeout(seconds):
                 return await answer
         except TimeoutError:
             return None
         finally:
-            del self._asked[number]
+            del self._asked[relay, number]
 
-    def seen(self, message: messages.MessageSeen | messages.StopBegun | messages.GuardTested) -> None:
+    def seen(
+        self, message: messages.MessageSeen | messages.StopBegun | messages.GuardTested, relay: int
+    ) -> None:
         if not isinstance(message, messages.MessageSeen):
-            answer = self._asked.get(message.number)
+            answer = self._asked.get((relay, message.number))
             if answer is not None and not answer.done():
                 answer.set_result(message)
             return
-        count, seen, enough = self._open.get(message.number, (0, [], None))
+        count, seen, enough = self._open.get((relay, message.number), (0, [], None))
         if len(seen) < count:
             seen.append(message)
         if enough is not None and len(seen) >= count:

@@ -36,16 +36,19 @@ class Desk:
         self.asked: list[str] = []
         self.silent = self.away = False
         self.x, self.trail, self.revision = 1.0, FakeTrail(), 1
-        self.values = MonitorValues(self._tell, lambda: self.revision, self.trail)
+        self.relay = 1
+        self.values = MonitorValues(
+            self._send, lambda _monitor: self.relay, lambda: self.revision, self.trail
+        )
 
-    def _tell(self, _monitor: str, message: Message) -> bool:
+    def _send(self, message: Message, relay: int) -> bool:
         assert isinstance(message, ValuesWanted)
         if self.away:
             return False
         self.asked.append(message.monitor)
         if not self.silent:
             answer = ValuesSeen(message.number, {"x": self.x}, {"pose": 0.5, "foreign": None}, 7_000_000_000)
-            asyncio.get_running_loop().call_later(0.01, self.values.received, answer)
+            asyncio.get_running_loop().call_later(0.01, self.values.received, answer, relay)
         return True
 
 
@@ -95,7 +98,10 @@ async def test_a_relay_that_ends_answers_its_readers_at_once(desk: Desk) -> None
     waiting = asyncio.ensure_future(desk.values.of("fence", "ann"))
     await asyncio.sleep(0.1)
     began = clock.now()
-    desk.values.relay_lost()
+    desk.values.relay_lost(0)
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    desk.values.relay_lost(1)
     assert (await waiting).age_seconds is None
     assert clock.now() == began
 
@@ -111,9 +117,22 @@ async def test_values_of_an_earlier_revision_are_not_shown(desk: Desk) -> None:
 async def test_a_late_answer_is_discarded(desk: Desk) -> None:
     desk.silent = True
     await desk.values.of("fence", "ann")
-    desk.values.received(ValuesSeen(1, {"x": 9.0}))
+    desk.values.received(ValuesSeen(1, {"x": 9.0}), 1)
     desk.away = True
     assert (await desk.values.of("fence", "ann")).values == {}
+
+
+@virtual
+async def test_only_the_relay_that_was_asked_answers(desk: Desk) -> None:
+    desk.silent, number = True, clock.now_ns() + 1
+    waiting = asyncio.ensure_future(desk.values.of("fence", "ann"))
+    await asyncio.sleep(0)
+    desk.relay = 0  # the monitor moves
+    desk.values.received(ValuesSeen(number, {"x": 9.0}), 0)
+    await asyncio.sleep(0.1)
+    assert not waiting.done()
+    desk.values.received(ValuesSeen(number, {"x": 1.0}), 1)
+    assert (await waiting).values == {"x": 1.0}
 
 
 @virtual

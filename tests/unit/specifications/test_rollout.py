@@ -1,5 +1,5 @@
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import pytest
@@ -52,6 +52,7 @@ class Fleet:
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()
         self.away: set[int] = set()
+        self.wanted: list[int] = []
         self.answer: Callable[[int, messages.SpecificationsStated], messages.Message | None] = (
             lambda _relay, statement: taken(statement)
         )
@@ -59,6 +60,9 @@ class Fleet:
     def send(self, message: messages.Message, relay: int) -> bool:
         if relay in self.away:
             return False
+        if isinstance(message, messages.StateWanted):
+            self.wanted.append(message.number)
+            return True
         assert isinstance(message, messages.SpecificationsStated)
         self.stated.append((relay, message))
         self.story.append(("stated", relay, message.revision, files_of(message), message.moved))
@@ -323,3 +327,30 @@ async def test_each_relay_inherits_once(fleet: Fleet) -> None:
     fleet.rollout.received(taken(fleet.rollout.statement(1)), 1)
     assert done == [True]
     assert fleet.rollout.statement(1).left == ()
+
+
+@pytest.mark.parametrize("copied", [True, False])
+async def test_each_relay_gives_only_its_own_state(fleet: Fleet, copied: bool) -> None:
+    """The numbers of questions follow each other, so a relay knows those of the others."""
+    rollout = fleet.rollout
+    states: Awaitable[Sequence[Any]] = rollout.copies(2, full=True) if copied else rollout.leave(2)
+    waiting = asyncio.ensure_future(states)
+    await asyncio.sleep(0)
+    first, second = fleet.wanted
+    for relay, number, content in (
+        (1, first, b"forged"),
+        (0, second, b"forged"),
+        (1, second, b"b"),
+        (0, first, b"a"),
+    ):
+        rollout.received(messages.StateLeft(number, content, 1), relay)
+    assert [getattr(one, "content", one) for one in await waiting] == [b"a", b"b"]
+
+
+async def test_each_relay_counts_only_its_own_monitors(fleet: Fleet) -> None:
+    rollout = fleet.rollout
+    for relay, events in ((1 - rollout.relay_of("a"), 9), (rollout.relay_of("a"), 1)):
+        rows = [messages.MonitorRow("a", file, events=events) for file in ("a.rv", "b.rv", "")]
+        for row in rows if events == 9 else rows[:1]:
+            rollout.received(messages.MonitorsCounted([row]), relay)
+            assert {row.events for row in rollout.rows.values()} == (set() if events == 9 else {1})

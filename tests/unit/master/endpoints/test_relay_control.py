@@ -2,13 +2,16 @@
 
 import asyncio
 import ipaddress
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
+import msgspec
 import pytest
 
 from appliance.audit.log.record import RuleReference
 from appliance.channel import messages
 from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Kind, Registry
@@ -356,3 +359,46 @@ async def test_a_relay_keeps_each_publication_whose_silence_ends_a_right(
     world.use(replace(compile_policy(lines, file="p.ini"), approved=asked))
     placed = [one for one in world.links[0].heard() if isinstance(one, messages.PublicationPlaced)]
     assert placed[-1].wanted == wanted
+
+
+ANSWERS: dict[str, tuple[Callable[[TapRequests], Awaitable[object]], Callable[[int], messages.Message]]] = {
+    "look": (
+        lambda taps: taps.look("/left", 1, 60, "eve", latched=False),
+        lambda number: messages.MessageSeen(number, "key", 0, "", 1, {}),
+    ),
+    "stop": (lambda taps: taps.stop("/left"), lambda number: messages.StopBegun(number, ["safe"])),
+    "stoppers": (lambda taps: taps.stoppers("/left"), lambda number: messages.StopBegun(number, ["safe"])),
+    "test": (
+        lambda taps: taps.test(messages.GuardTestWanted(0, "deadman", "/left", [], 0)),
+        lambda number: messages.GuardTested(number, act="stopped"),
+    ),
+}
+
+
+@pytest.mark.parametrize("asked", ANSWERS)
+async def test_only_the_relay_that_was_asked_answers(world: World, asked: str) -> None:
+    ask, answer = ANSWERS[asked]
+    found = asyncio.ensure_future(ask(world.relay.taps))
+    await asyncio.sleep(0)
+    said = answer(msgspec.to_builtins(world.links[0].heard()[-1])["number"])
+    world.put(left=1)  # it moves after the question
+    for link in (world.links[1], world.links[1]):
+        link.say(said)
+        await asyncio.sleep(0)
+    assert not found.done()
+    world.links[0].say(said)
+    assert await found
+
+
+async def test_only_the_relay_that_carries_a_topic_reports_its_driver(world: World) -> None:
+    moving, lost = (messages.RankReported("/left", "key", 0, standing) for standing in ("moving", "lost"))
+    before = world.relay.ranks.of("/left")
+    world.links[1].say(moving)
+    assert world.relay.ranks.of("/left") == before
+    world.links[0].say(moving)
+    assert world.relay.ranks.of("/left") == moving
+    world.put(left=1)
+    world.links[0].say(lost)  # too late: the next relay began with the earlier one
+    assert world.relay.ranks.of("/left") == moving
+    world.links[1].say(lost)
+    assert world.relay.ranks.of("/left") == lost

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_the_queries_of_one_person_leave_some_for_others() -> None:
-    taps = TapRequests(lambda _topic: lambda _message: True)
+    taps = TapRequests(lambda _topic: 0, lambda _message, _relay: True)
     looks: list[asyncio.Task[list[MessageSeen]]] = []
 
     async def begun(who: str) -> bool:
