@@ -85,7 +85,9 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     report = yield
     if report.failed and isinstance(item, pytest.Function):
         running: dict[int, tuple[str, Any]] = {
-            id(value): (name, value) for name, value in item.funcargs.items() if hasattr(value, "story")
+            id(value): (name, value)
+            for name, value in item.funcargs.items()
+            if callable(getattr(value, "story", None))
         }
         for name, said in running.values():
             report.sections.append((f"What {name} said", said.story()[-_LONGEST_STORY:]))

@@ -31,7 +31,8 @@ BUILD = ROOT / "build" / "tests"
 # rospy ends in its signal handler. A signal in the middle of `publish`, of a line of its log, or of its own end, waits
 # for a lock that a lower frame of the thread holds, or for a thread that waits for that lock.
 _IN_ITS_OWN_WAY = re.compile(
-    r"Current thread.*in signal_shutdown.*in _ros_signal.*(in (publish|_ros_atexit)|/logging/__init__\.py)", re.DOTALL
+    r"Current thread.*in signal_shutdown.*in _ros_signal.*(in (publish|_ros_atexit)|/logging/__init__\.py)",
+    re.DOTALL,
 )
 
 
