@@ -18,6 +18,10 @@ _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = (bytes([op]) for op in (2, 3, 4, 5, 6, 7))
 INDEX_ENTRY = struct.Struct("<III")
 _COUNT = struct.Struct("<II")
+MESSAGE_SIZE = 46 + INDEX_ENTRY.size
+"""The bytes that a message takes besides its body."""
+
+_CHUNK_SIZE, _INFO_SIZE = 212, 108  # bytes for one connection, and bytes of them in the index
 _BILLION = 1_000_000_000
 
 
@@ -38,13 +42,22 @@ class BagWriter:
         whole = self._whole(size)
         self.lost = whole < size
         """Whether some of the first `size` bytes are missing or damaged, as after a power cut."""
+        self._index = sum(map(len, self._chunk_infos(whole))) + sum(
+            map(connection_size, connections.values())
+        )
         self._file.truncate(whole)
         self._file.seek(whole)
         if not whole:
             self._file.write(MAGIC + _bag_header(0, 0, 0))
 
+    @property
+    def closed_size(self) -> int:
+        """The bytes of the bag if it is closed now."""
+        return self._file.tell() + self._index
+
     def connect(self, header: Mapping[str, str]) -> int:
         number = len(self._connections)
+        self._index += connection_size(header)
         self._connections[number] = dict(header)
         return number
 
@@ -66,6 +79,7 @@ class BagWriter:
             for number, entries in index.items():
                 fields = {"op": INDEX, "ver": _U32.pack(1), "conn": _U32.pack(number)}
                 self._file.write(_record(fields | {"count": _U32.pack(len(entries))}, b"".join(entries)))
+            self._index += _INFO_SIZE + _COUNT.size * len(index)
         self._file.flush()
         return self._file.tell()
 
@@ -87,12 +101,7 @@ class BagWriter:
             self._file.write(_bag_header(end, len(self._connections), len(infos)))
 
     def _connection(self, number: int) -> bytes:
-        header = self._connections[number]
-        fields = {"op": CONNECTION, "conn": _U32.pack(number), "topic": header["topic"].encode()}
-        return _record(
-            fields,
-            _fields({name: value.encode("utf-8", "surrogateescape") for name, value in header.items()}),
-        )
+        return _connection_record(number, self._connections[number])
 
     def _whole(self, size: int) -> int:
         whole, at, there = 0, _FIRST, self._file.seek(0, os.SEEK_END)
@@ -141,6 +150,24 @@ class BagWriter:
             )
             for place, counts, times in chunks
         ]
+
+
+def connection_size(header: Mapping[str, str]) -> int:
+    """Return the bytes that a connection takes in the index, and in each chunk with its messages."""
+    return len(_connection_record(0, header))
+
+
+def chunk_size(header: Mapping[str, str]) -> int:
+    """Return the most bytes that a chunk of one connection takes besides its messages."""
+    return _CHUNK_SIZE + _COUNT.size + 2 * connection_size(header)
+
+
+def _connection_record(number: int, header: Mapping[str, str]) -> bytes:
+    fields = {"op": CONNECTION, "conn": _U32.pack(number), "topic": header["topic"].encode()}
+    return _record(
+        fields,
+        _fields({name: value.encode("utf-8", "surrogateescape") for name, value in header.items()}),
+    )
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:

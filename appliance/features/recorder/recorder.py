@@ -20,7 +20,13 @@ from appliance.audit.search.search import Follower, export, search
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.features.recorder import recorder_link
-from appliance.features.recorder.recording import MAX_TRIGGERS, Progress, RecordingInProgress, load_progress
+from appliance.features.recorder.recording import (
+    MAX_RECORDS,
+    MAX_TRIGGERS,
+    Progress,
+    RecordingInProgress,
+    load_progress,
+)
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
 from appliance.features.recorder.recording_plan import (
     UNLIMITED,
@@ -37,7 +43,6 @@ SETTLE_SECONDS = 0.5
 
 _IDLE_SECONDS, _BUSY_SECONDS = 0.5, 0.25
 _PAGES = 20  # pages of the log in one step
-_MAX_RECORDS = 200_000  # records of the log in one recording
 _SECOND = 1_000_000_000
 _TELL_AGAIN = 600 * _SECOND
 _MAX_TOLD = 4096
@@ -218,7 +223,7 @@ class Recorder:
         begun = Filter(since=self._memory - int(self._rules.before * _SECOND), until=self._memory)
         unmade: dict[str, Trigger] = {}
         try:
-            for entry in islice(export(self._log, begun), _MAX_RECORDS):
+            for entry in islice(export(self._log, begun), MAX_RECORDS):
                 trigger = trigger_of(entry.record, self._rules.triggers)
                 planned = str(entry.record.detail.get("recording", ""))
                 if trigger is not None and planned and not self._store.has(planned):
@@ -346,7 +351,7 @@ class Recorder:
         progress = making.progress
         within = Filter(since=progress.began, until=progress.ends + 1)
         try:
-            records = list(islice(export(self._log, within), _MAX_RECORDS))
+            records = list(islice(export(self._log, within), MAX_RECORDS + 1))
         except LogUnreadableError as error:
             records = []
             progress.why_not = progress.why_not or f"the audit log could not be read: {error}"

@@ -20,7 +20,13 @@ from appliance.audit.log.record import Severity
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.base.atomic_files import write_whole
 from appliance.base.counted import counted
-from appliance.features.recorder.bag_writer import BagMessage, BagWriter
+from appliance.features.recorder.bag_writer import (
+    MESSAGE_SIZE,
+    BagMessage,
+    BagWriter,
+    chunk_size,
+    connection_size,
+)
 from appliance.features.recorder.excluded_topics import NAMED
 from appliance.features.recorder.recorder_link import RevisionsStated
 from appliance.features.recorder.recording_answers import (
@@ -234,10 +240,14 @@ def _frames(view: memoryview, messages: int) -> list[memoryview] | None:
 
 RECORDS, LOG = "/rosrv/records", "/rosrv/log"
 MAX_TRIGGERS = 200
+MAX_RECORDS = 200_000
+"""The number of audit records in a recording."""
+
 _CHUNK = 1 << 20
 _MAX_NAMED = 10
 _MAX_LEFT_OUT = 100
 _MAX_HEADERS = 8 << 20
+_FOR_RECORDS = 16  # messages leave this fraction of the largest size to audit records
 _LENGTH = struct.Struct("<I")
 _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
@@ -292,7 +302,8 @@ class RecordingInProgress:
         if self._bag.lost:
             progress.why_not = progress.why_not or "the disk lost the last data written"
         self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
-        self._headers = sum(map(_length, progress.connections))
+        self._records_fit = True
+        self._headers = sum(map(connection_size, progress.connections))
         self._left_out = set(progress.left_out)
         self._topics = {(row.topic, row.type, row.md5sum): row for row in progress.topics}
         places = progress.places or [{} for _ring in rings]
@@ -325,12 +336,15 @@ class RecordingInProgress:
             progress.torn.append(header["topic"])
         if not found.batches:
             return
-        connections: dict[bool, int] = {}
-        for carried in {batch.carried for batch in found.batches}:
-            head = header if carried else header | {CARRIED: "0"}
-            if _key(head) in self._numbers or self._headers + _length(head) <= _MAX_HEADERS:
-                connections[carried] = self._connection(head)
-        if not connections:
+        heads = {
+            batch.carried: header if batch.carried else header | {CARRIED: "0"} for batch in found.batches
+        }
+        fitting = {
+            carried: head
+            for carried, head in heads.items()
+            if _key(head) in self._numbers or self._headers + connection_size(head) <= _MAX_HEADERS
+        }
+        if not fitting:
             progress.unconnected += sum(len(batch.frames) for batch in found.batches)
             return
         row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
@@ -338,27 +352,28 @@ class RecordingInProgress:
             row = self._topics[kind] = RecordedTopic(*kind, 0, 0, 0)
             progress.topics.append(row)
         waiting: list[BagMessage] = []
-        size = 0
+        size = empty = chunk_size(header)
         for batch in found.batches:
             gap = max(0, batch.first - following.get(found.stream, batch.first))
             row.missed = min(row.missed + gap, MAX_MESSAGES)
             following[found.stream] = batch.first + len(batch.frames)
-            if batch.carried not in connections:
+            if batch.carried not in fitting:
                 progress.unconnected += len(batch.frames)
                 continue
-            if progress.size + size + self._headers > self._largest:
+            bodies = sum(map(len, batch.frames))
+            longer = size + bodies + MESSAGE_SIZE * len(batch.frames)
+            if self._bag.closed_size + longer > self._largest - self._largest // _FOR_RECORDS:
                 progress.why_not = f"it reached {self._largest} bytes, an eighth of recorder.disk"
                 row.missed += len(batch.frames)
                 continue
-            for frame in batch.frames:
-                waiting.append(BagMessage(connections[batch.carried], batch.time, frame))
-                size += len(frame)
+            connection, size = self._connection(fitting[batch.carried]), longer
+            waiting += [BagMessage(connection, batch.time, frame) for frame in batch.frames]
             row.messages += len(batch.frames)
+            row.bytes += bodies
             if size > _CHUNK:
                 progress.size = self._bag.write(waiting)
-                row.bytes, waiting, size = row.bytes + size, [], 0
+                waiting, size = [], empty
         progress.size = self._bag.write(waiting)
-        row.bytes += size
 
     def _leave_out(self, header: dict[str, str], *, seen: bool) -> None:
         """Note, once, a publisher whose messages are not recorded, if it sent any."""
@@ -375,7 +390,7 @@ class RecordingInProgress:
         if number is None:
             number = self._numbers[_key(header)] = self._bag.connect(header)
             self.progress.connections.append(dict(header))
-            self._headers += _length(header)
+            self._headers += connection_size(header)
         return number
 
     def leave(self) -> None:
@@ -413,6 +428,8 @@ class RecordingInProgress:
     def _missing(self) -> str:
         progress = self.progress
         reasons = [progress.why_not] if progress.why_not else []
+        if not self._records_fit:
+            reasons.append("later audit records did not fit (the audit log has them)")
         missed = sum(row.missed for row in progress.topics)
         if missed:
             reasons.append(f"{counted(missed, 'message')} did not fit (see topics)")
@@ -441,39 +458,41 @@ class RecordingInProgress:
         return "; ".join(reasons)
 
     def _write_records(self, records: Iterable[LogEntry]) -> None:
-        """Write each record as JSON, and as a log message for rqt_console."""
+        """Write each record as JSON, and as a log message for rqt_console, as far as they fit."""
         definitions = standard_definitions()
-        numbers = {
-            topic: self._connection({
+        headers = [
+            {
                 "topic": topic,
                 "type": kind,
                 "md5sum": definitions.md5sum(kind),
                 "message_definition": definitions.full_text(kind),
                 "callerid": "/rosrv",
                 "latching": "0",
-            })
+            }
             for topic, kind in ((RECORDS, "std_msgs/String"), (LOG, TYPE))
-        }  # fmt: skip
+        ]
+        of_record, of_log = map(self._connection, headers)
         waiting: list[BagMessage] = []
-        for entry in records:
+        size = empty = sum(map(chunk_size, headers))
+        for number, entry in enumerate(records):
             record = entry.record
             line = as_json(entry).encode()
-            waiting.append(BagMessage(numbers[RECORDS], record.time, _LENGTH.pack(len(line)) + line))
             text = f"{record.event}: {record.reason}" if record.reason else record.event
             level = _LEVELS.get(record.severity, INFO)
             file, function = record.resource or "", record.caller_id or ""
             said = log_message(
                 entry.sequence, record.time, level, "/rosrv", text, file=file, function=function
             )
-            waiting.append(BagMessage(numbers[LOG], record.time, said))
-            if len(waiting) >= _CHUNK >> 9:
+            size += len(line) + _LENGTH.size + len(said) + 2 * MESSAGE_SIZE
+            if number == MAX_RECORDS or self._bag.closed_size + size > self._largest:
+                self._records_fit = False
+                break
+            waiting.append(BagMessage(of_record, record.time, _LENGTH.pack(len(line)) + line))
+            waiting.append(BagMessage(of_log, record.time, said))
+            if size > _CHUNK:
                 self._bag.write(waiting)
-                waiting = []
+                waiting, size = [], empty
         self._bag.write(waiting)
-
-
-def _length(header: dict[str, str]) -> int:
-    return sum(len(name) + len(value.encode()) for name, value in header.items())
 
 
 def _key(header: dict[str, str]) -> tuple[tuple[str, str], ...]:

@@ -3,7 +3,13 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from appliance.features.recorder.bag_writer import BagMessage, BagWriter
+from appliance.features.recorder.bag_writer import (
+    MESSAGE_SIZE,
+    BagMessage,
+    BagWriter,
+    chunk_size,
+    connection_size,
+)
 
 HEADER = {
     "topic": "/chatter",
@@ -50,8 +56,15 @@ def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
     bag.write(
         [BagMessage(0, 2 * SECOND, body(b"two")), BagMessage(bag.connect(HEADER), 3 * SECOND, body(b"three"))]
     )
+    size = bag.closed_size
+    bag.write([BagMessage(0, 4 * SECOND, body(b"four"))])
+    size += chunk_size(HEADER) - connection_size(HEADER) + MESSAGE_SIZE + len(body(b"four"))
+    assert bag.closed_size == size
     bag.close()
-    assert [data for _topic, _time, data in read(path)] == [body(b"one"), body(b"two"), body(b"three")]
+    assert path.stat().st_size == size
+    assert [data for _topic, _time, data in read(path)] == [
+        body(text) for text in (b"one", b"two", b"three", b"four")
+    ]
 
 
 def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@ import json
 import mmap
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -344,17 +344,62 @@ def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None
     scene.log.close()
 
 
-def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
+def fill_with_headers(scene: Scene) -> None:
+    for number in range(25):
+        host, definition = f"10.0.1.{number}", f"# {number} {'x' * 5000}\nstring data\n"
+        stream = opened(scene.writer, "/many", host, message_definition=definition)
+        stream.write(memoryview(frame(TEXT)), 1, 1)
+        stream.close()
+
+
+def fill_with_records(scene: Scene) -> None:
+    for _record in range(150):
+        denied = decision(scene.log, event="topic denied", time=scene.clock.now, reason="x" * 400)
+        scene.log.record(denied)
+    settle(scene.log)
+
+
+def fill_with_messages(scene: Scene, number: int, size: int) -> None:
+    for _message in range(number):
+        scene.say(bytes(size))
+
+
+FILLED: dict[str, tuple[Callable[[Scene], None], int]] = {
+    "nothing": (lambda _scene: None, 0),
+    "messages": (lambda scene: fill_with_messages(scene, 12, 20_000), 12),
+    "empty messages": (lambda scene: fill_with_messages(scene, 3000, 0), 3000),
+    "connections": (fill_with_headers, 25),
+    "records": (fill_with_records, 150),
+}
+
+
+@pytest.mark.parametrize("filled", FILLED)
+def test_no_recording_exceeds_an_eighth_of_the_disk(tmp_path: Path, filled: str) -> None:
+    """All together never exceed the disk, whatever fills them, and each recording reports what did not fit."""
     scene = Scene(tmp_path, disk=8 * 100_000)
-    scene.happen()
-    for _message in range(12):
-        scene.say(bytes(20_000))
-    [recording] = scene.closed(scene.later(0.1))
-    assert recording.ended == scene.clock.now
-    [topic] = recording.topics
-    assert (topic.messages + topic.missed, topic.missed > 0) == (12, True)
-    assert "an eighth of recorder.disk" in recording.why_not
-    assert not recording.complete
+    fill, number = FILLED[filled]
+    for again in range(9):
+        assert scene.stream is not None
+        scene.stream.close()
+        scene.stream, scene.said = opened(scene.writer, "/chatter", "10.0.0.1"), 0
+        order = Trigger(scene.clock.now + SECOND, "order", "", "eve")
+        scene.later(1, recorder_link.RecordingRequested(1, order, 0, 5))
+        fill(scene)
+        told = scene.later(0.1)
+        if again % 2:
+            scene.begin_anew()
+        [recording] = scene.closed(told + scene.later(6))
+        assert recording.size <= scene.disk // 8
+        assert recording.complete == (filled == "nothing"), recording.why_not
+        if filled == "records":
+            records = sum(topic == "/rosrv/records" for topic, _time, _data in scene.bag(recording))
+            assert (0 < records < number, "did not fit" in recording.why_not) == (True, True)
+        elif filled != "nothing":
+            [topic] = recording.topics
+            assert (topic.messages + topic.missed, topic.missed > 0) == (number, True)
+            assert "an eighth of recorder.disk" in recording.why_not
+            assert recording.size > 0.75 * scene.disk // 8
+        assert sum(path.stat().st_size for path in scene.folder.glob("*/recording.bag")) <= scene.disk
     scene.log.close()
 
 
