@@ -123,7 +123,7 @@ class Definitions:
         return _fingerprint("".join(map(self._md5_text, parts)))
 
     def full_text(self, name: str) -> str:
-        own, *parts = self._parts(name)
+        own, *parts = self.parts(name)
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
     def fingerprint(self, name: str) -> str:
@@ -134,7 +134,7 @@ class Definitions:
         """
         lines = [
             line
-            for part in self._parts(name)
+            for part in self.parts(name)
             for line in (
                 f"MSG: {part.name}",
                 *(f"{constant.type} {constant.name}={constant.text}" for constant in part.constants),
@@ -143,7 +143,7 @@ class Definitions:
         ]
         return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
 
-    def _parts(self, name: str) -> Collection[MessageDefinition]:
+    def parts(self, name: str) -> Collection[MessageDefinition]:
         """Return a type, and all types that it contains."""
         self._depth(name, ())
         order: dict[str, MessageDefinition] = {}

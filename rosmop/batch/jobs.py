@@ -7,7 +7,7 @@ recording's length.
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from rosmop.recordings.recording import RecordedFile, RecordingError, definition
 from rosmop.recordings.replay import refusals
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 
@@ -152,8 +153,10 @@ def _result(job: Job) -> Result:
             return replayed(job, path)
         if isinstance(job, SurveyJob):
             recording = RecordedFile(path, job.topics, name)
-            kinds = recording.definitions.message_types
-            definitions = {kind: recording.definitions.message(kind).text for kind in kinds}
+            definitions: dict[str, str] = {}
+            for kind in recording.topics.values():
+                with suppress(DefinitionError):  # no node sent its text
+                    definitions |= {part.name: part.text for part in recording.definitions.parts(kind)}
             return Survey(
                 recording.name, recording.began, recording.ended, recording.topics, definitions, recording.notes
             )  # fmt: skip

@@ -17,6 +17,7 @@ from rosmop.recordings.regular_files import open_regular
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import MessageDefinition
+from roswire.standard import standard_definitions
 
 Reader = BoundedReader | BoundedMcap
 OWN = "/rosrv"
@@ -81,14 +82,16 @@ def by_size(reader: Reader) -> list[Connection]:
 
 
 def _definitions_of(connections: Iterable[Connection]) -> Definitions:
+    """Return the definitions whose text has its connection's md5sum: small client libraries send none."""
     found: dict[str, MessageDefinition] = {}
-    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in connections)
-    for name, text in sent:
+    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data, row.digest) for row in connections)
+    for name, text, digest in sorted(sent, key=lambda row: row[2] == "*"):
         try:
             own = Definitions.from_full_text(name, text)
+            if digest == own.md5sum(name) or (digest == "*" and text.strip()):
+                found = {part.name: part for part in own.parts(name)} | found
         except DefinitionError:
             continue
-        found = {kind: own.message(kind) for kind in own.message_types} | found
     return Definitions(found)
 
 
@@ -120,7 +123,8 @@ class RecordedFile:
 
     The recording must have messages. Connections are left out, and named in `notes`, if their type is not that of
     their topic in `kinds`, or if its definition is not in `known`; topics that `kinds` lacks may have any. Without
-    those, the connections with the most messages determine both. `name` is for messages to the user.
+    those, the connections with the most messages determine both, and ROS the types that none defines. `name` is for
+    messages to the user.
     """
 
     def __init__(
@@ -141,7 +145,7 @@ class RecordedFile:
             if not self.message_count:
                 raise RecordingError(f"the bag {path} has no messages")
             rows = received(reader, patterns)
-            self.definitions = known or _definitions_of(rows)
+            self.definitions = known or standard_definitions().extended(_definitions_of(rows))
             wanted = dict(kinds or {})
             self._connections: set[int] = set()
             self.notes: list[str] = []

@@ -2,7 +2,8 @@
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -45,8 +46,7 @@ def learn_monitors(
     if len({os.path.realpath(bag) for bag in options.bags}) < len(options.bags):
         raise program.usage_error("a recording is given twice: it would test itself; give each one once")
     with batch_session(program, options) as session:
-        surveys, failures = _surveys(session, topics or ["*"])
-        recorded = _definitions(program, [survey for _number, survey in surveys])
+        surveys, failures, recorded = _surveys(session, topics or ["*"])
         try:
             learnt = learn(
                 [survey for _number, survey in surveys],
@@ -64,7 +64,9 @@ def learn_monitors(
     return SOME_FAILED if failures else 0
 
 
-def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, Survey]], dict[int, Failure]]:
+def _surveys(
+    session: BatchSession, topics: list[str]
+) -> tuple[list[tuple[int, Survey]], dict[int, Failure], Definitions]:
     jobs = [SurveyJob(recording, topics) for recording in session.recordings]
     surveys: list[tuple[int, Survey]] = []
     failures: dict[int, Failure] = {}
@@ -75,29 +77,35 @@ def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, 
                 session.program.warn(note)
         elif isinstance(result, Failure):
             failures[number] = result
+    definitions = {number: definitions_by_type(survey.definitions) for number, survey in surveys}
+    recorded = _usual(definitions.values())
+    for number, own in definitions.items():
+        others = [
+            kind for kind in own.message_types if _lines(own.message(kind)) != _lines(recorded.message(kind))
+        ]
+        if others:
+            failures[number] = Failure(f"its definition of {others[0]} differs from that of most recordings")
+    surveys = [(number, survey) for number, survey in surveys if number not in failures]
     session.require(list(failures.values()))
     if not surveys:
         session.failed_rows(sorted(failures.items()))
         raise session.program.usage_error("no recording can be read")
-    return surveys, failures
+    return surveys, failures, recorded
 
 
-def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definitions:
-    recorded = Definitions({})
-    for survey in surveys:
-        own = definitions_by_type(survey.definitions)
-        for kind in sorted(set(own.message_types) & set(recorded.message_types)):
-            if _lines(recorded.message(kind)) != _lines(own.message(kind)):
-                raise program.usage_error(
-                    f"{survey.name} has a different definition of {kind} than the recordings before it"
-                )
-        if not set(own.message_types) <= set(recorded.message_types):
-            recorded = recorded.extended(own)
-    return recorded
+def _usual(definitions: Iterable[Definitions]) -> Definitions:
+    """Return the definition of each type that most recordings have, and of equally many the first."""
+    found = [own.message(kind) for own in definitions for kind in own.message_types]
+    numbers = Counter(map(_lines, found))
+    usual: dict[str, MessageDefinition] = {}
+    for message in sorted(found, key=lambda one: -numbers[_lines(one)]):
+        usual.setdefault(message.name, message)
+    return Definitions(usual)
 
 
 def _lines(message: MessageDefinition) -> tuple[object, ...]:
-    return message.fields, [(constant.type, constant.name, constant.text) for constant in message.constants]
+    constants = tuple((constant.type, constant.name, constant.text) for constant in message.constants)
+    return message.name, message.fields, constants
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications
 from rosmop.recordings.replay import EVER
 from rosmop.tests.batch.test_many_recordings import rosmop
 from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 RULE = "=" * 80
 OWN = f"pkg/N n\n{RULE}\nMSG: pkg/N\nfloat64 x\nfloat64 y\n"
@@ -56,6 +57,14 @@ def record(path: Path, others: Sequence[Sent], *, first: bool, caller: str = "/o
                     writer.write(row, 10**12 + tick * 10**8, data or own)
 
 
+def strictly_replayed(path: Path) -> object:
+    (recording,) = recordings_of([path], [])
+    specifications = Specifications({"m.rv": Path("m.rv").read_text()}, {})
+    return unpacked(
+        work(packed(ReplayJob(recording, specifications, ["*"], EVER, 1, margins=False, strict=True)))
+    )
+
+
 @pytest.mark.parametrize("first", [False, True])
 @pytest.mark.parametrize("other", OTHERS)
 def test_a_connection_that_does_not_fit_changes_nothing_and_is_named(
@@ -83,11 +92,51 @@ def test_a_connection_that_does_not_fit_changes_nothing_and_is_named(
             ]
             results.append(counts or out)
         assert results[0] == results[1]
-    (recording,) = recordings_of([], ["beside"])
-    specifications = Specifications({"m.rv": SPECIFICATION}, {})
-    strict = ReplayJob(recording, specifications, ["*"], EVER, 1, margins=False, strict=True)
-    result = unpacked(work(packed(strict)))
+    result = strictly_replayed(Path("beside/x.bag"))
     assert isinstance(result, Replayed) and bool(result.notes) == (OTHERS[other][0] == "/a")
+
+
+TWIST = "geometry_msgs/Twist"
+TYPES = {
+    "own type": ("pkg/A", OWN, "n.x", 2),
+    "type of ROS": (TWIST, standard_definitions().full_text(TWIST), "linear.x", 6),
+}
+USELESS = {"none": "\n", "of another md5sum": "float64 x\n", "no definition": "= float64 =\n"}
+
+
+@pytest.mark.parametrize("senders", [("/few", "/many"), ("/many", "/few"), ("/many", "/many")])
+@pytest.mark.parametrize("useless", USELESS)
+@pytest.mark.parametrize("kind", TYPES)
+def test_a_useless_text_of_a_connection_changes_nothing(
+    kind: str, useless: str, senders: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The messages of all connections with the right md5sum are judged, and none is named."""
+    monkeypatch.chdir(tmp_path)
+    name, text, field, numbers = TYPES[kind]
+    useless_sender, other_sender = senders
+    if useless_sender == other_sender and name != TWIST:
+        return  # without any text, only a type of ROS is known
+    digest = Definitions.from_full_text(name, text).md5sum(name)
+    Path("m.rv").write_text(SPECIFICATION.replace("pkg/A", name).replace("n.x", field))
+    results = []
+    for sent in (text, USELESS[useless]):
+        with Writer(Path("x.bag")) as writer:
+            rows = {
+                caller: writer.add_connection(
+                    "/a", name.replace("/", "/msg/"), msgdef=each, md5sum=digest, callerid=caller
+                )
+                for caller, each in {other_sender: text, useless_sender: sent}.items()
+            }
+            for tick in range(400):
+                row = rows.get("/few" if tick % 3 == 0 else "/many", rows["/many"])
+                data = pack(f"<{numbers}d", 100 + math.sin(tick), *[math.sin(tick)] * (numbers - 1))
+                writer.write(row, 10**12 + tick * 10**8, data)
+        outputs = [rosmop(f"{verb} --bag x.bag") for verb in ("run m.rv --json", "coverage m.rv", "learn")]
+        results.append((outputs, strictly_replayed(Path("x.bag"))))
+        Path("x.bag").unlink()
+    assert results[0] == results[1]
+    assert [(status, err) for status, _out, err in results[0][0]] == [(0, "")] * 3
+    assert isinstance(results[0][1], Replayed) and results[0][1].effects
 
 
 @pytest.mark.parametrize("other", [("/a", "pkg/A", OWN, pack("<dd", 500, 0)), *OTHERS.values()])
