@@ -114,15 +114,18 @@ def work(job: bytes) -> bytes:
         else:
             with _limit(_SECONDS + _SECONDS_PER_MB * envelope.job.recording.size / 1e6) as seconds:
                 return msgspec.msgpack.encode(_result(envelope.job))
-    except SpecificationError as error:
-        failure = Failure(_text(str(error)), [_text(str(finding)) for finding in error.findings])
-    except (RecordingError, LearningError) as error:
-        failure = Failure(_text(str(error)))
     except _TooLong:
         failure = Failure(f"it takes more than {seconds:.0f} s of processor time")
     except Exception as error:  # noqa: BLE001  a recording may be damaged in ways that no reader knows
-        failure = Failure(_text(f"{type(error).__name__}: {error}"))
+        failure = failure_of(error)
     return msgspec.msgpack.encode(failure)
+
+
+def failure_of(error: Exception) -> Failure:
+    if isinstance(error, SpecificationError):
+        return Failure(_text(str(error)), [_text(str(finding)) for finding in error.findings])
+    is_known = isinstance(error, RecordingError | LearningError)
+    return Failure(_text(str(error) if is_known else f"{type(error).__name__}: {error}"))
 
 
 @contextmanager

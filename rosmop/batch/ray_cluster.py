@@ -6,7 +6,8 @@ Ray's token authentication is on unless the environment switches it off (`RAY_AU
 import logging
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rosmop.batch.executor import Work, WorkerDeath
@@ -49,18 +50,30 @@ class RayCluster:
         self._running: dict[object, int] = {}
 
     def submit(self, number: int, job: bytes) -> None:
-        self._running[self._task.remote(job)] = number
+        with _reached():
+            self._running[self._task.remote(job)] = number
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
-        (ready,), _others = self._ray.wait(list(self._running), num_returns=1)
-        number = self._running.pop(ready)
-        try:
-            return [(number, self._ray.get(ready))]
-        except self._ray.exceptions.RayError as error:
-            return [(number, WorkerDeath(f"its worker in the cluster failed: {_reason(error)}"))]
+        with _reached():
+            (ready,), _others = self._ray.wait(list(self._running), num_returns=1)
+            number = self._running.pop(ready)
+            try:
+                return [(number, self._ray.get(ready))]
+            except self._ray.exceptions.RayError as error:
+                return [(number, WorkerDeath(f"its worker in the cluster failed: {_reason(error)}"))]
 
     def close(self) -> None:
-        self._ray.shutdown()
+        with suppress(Exception):  # whatever failed was reported, and all results are here
+            self._ray.shutdown()
+
+
+@contextmanager
+def _reached() -> Iterator[None]:
+    """Turn any error of Ray's client, whose types are not documented, into a `ClusterError`."""
+    try:
+        yield
+    except Exception as error:
+        raise ClusterError(f"the cluster cannot be reached any more: {_reason(error)}") from error
 
 
 def _print_to_stderr(data: Mapping[str, Any], **_options: object) -> None:

@@ -112,14 +112,7 @@ class BatchSession:
             yield from self.runner.in_order(jobs, done)
 
     def require(self, failures: Sequence[Failure]) -> None:
-        """Exit if all recordings failed with the same errors of specifications, or if the only one failed."""
-        if len(failures) < len(self.recordings):
-            return
-        findings = [failure.findings for failure in failures]
-        if findings[0] and all(other == findings[0] for other in findings):
-            raise refused(findings[0])
-        if len(failures) == 1:
-            raise self.program.usage_error(failures[0].text)
+        require(self.program, failures, len(self.recordings))
 
     def failed_rows(self, failures: Iterable[tuple[int, Failure]]) -> list[dict[str, object]]:
         rows: list[dict[str, object]] = []
@@ -156,6 +149,17 @@ class BatchSession:
             yield done
 
 
+def require(program: CommandContext, failures: Sequence[Failure], recordings: int) -> None:
+    """Exit if all recordings failed with the same errors of specifications, or if the only one failed."""
+    if len(failures) < recordings:
+        return
+    findings = [failure.findings for failure in failures]
+    if findings[0] and all(other == findings[0] for other in findings):
+        raise refused(findings[0])
+    if len(failures) == 1:
+        raise program.usage_error(failures[0].text)
+
+
 @contextmanager
 def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterator[BatchSession]:
     if not options.bags and not options.sets:
@@ -163,17 +167,20 @@ def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterat
     if options.report is not None and not os.access(options.report.parent, os.W_OK):
         raise program.usage_error(f"cannot write {options.report}: its folder is missing or not writable")
     with ExitStack() as opened:
+        advice = "add --resume FILE to keep what is finished"
+        if options.resume is not None:
+            advice = f"{options.resume} has what is finished; the same command continues"
         try:
             recordings = recordings_of(options.bags, options.sets)
             journal = None if options.resume is None else opened.enter_context(ResumeJournal(options.resume))
             executor = opened.enter_context(executor_for(len(recordings), options.workers, options.on))
             kept = opened.enter_context(TemporaryStore())
-            yield BatchSession(program, recordings, options, JobRunner(executor, journal), kept)
+            try:
+                yield BatchSession(program, recordings, options, JobRunner(executor, journal), kept)
+            except ClusterError as error:
+                raise program.usage_error(f"{error}; {advice}") from error
         except (RecordingError, JournalError, ClusterError) as error:
             raise program.usage_error(str(error)) from error
         except KeyboardInterrupt:
-            advice = "add --resume FILE to keep what is finished"
-            if options.resume is not None:
-                advice = f"{options.resume} has what is finished; the same command continues"
             program.warn(f"interrupted; {advice}")
             raise typer.Exit(_INTERRUPTED) from None

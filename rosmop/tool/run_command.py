@@ -4,14 +4,21 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from rosmop.batch.jobs import Failure
+from rosmop.batch.jobs import Failure, failure_of
 from rosmop.batch.recording_list import RecordingName
 from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replayed
 from rosmop.form.findings import SpecificationError
-from rosmop.recordings.recording import Reader, definitions_of, open_recording
+from rosmop.recordings.recording import Reader, RecordingError, definitions_of, open_recording
 from rosmop.recordings.replay import EVER, OutputBag, refusals, replay
 from rosmop.run.engine import MonitorSet
-from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session, progress
+from rosmop.tool.batch_session import (
+    SOME_FAILED,
+    BatchSession,
+    RecordingsOptions,
+    batch_session,
+    progress,
+    require,
+)
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
 from rosmop.tool.replay_report import MAX_IN_ROWS, ReplayReport
@@ -70,19 +77,25 @@ def run_batch(
 
 
 def run_spans(
+    program: CommandContext,
     specifications: Specifications,
     spans: Sequence[tuple[str, Path, tuple[int, int]]],
     report: ReplayReport,
     topics: list[str],
-    own: str,
     *,
+    own: str,
     margins: bool,
-) -> None:
+) -> int:
     for name, path, span in spans:
         recording = RecordingName(name, path.stat().st_size, "")
         job = ReplayJob(recording, specifications, topics, span, MAX_IN_ROWS, margins, strict=True, own=own)
-        report.add(name, replayed(job, path))
+        try:
+            report.add(name, replayed(job, path))
+        except (SpecificationError, RecordingError) as error:
+            report.add(name, failure_of(error))
+    require(program, report.failures, len(spans))
     report.show(specifications.texts)
+    return SOME_FAILED if report.failures else 0
 
 
 def _run_single(

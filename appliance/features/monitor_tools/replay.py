@@ -99,7 +99,9 @@ def replay_monitor(
         if recorded is None:
             raise MONITOR.usage_error("this appliance has no flight recorder: give --bag FILE or --bags DIR")
         with recorded(appliance, since, until, _topics(specifications, patterns)) as (spans, own):
-            run_spans(specifications, spans, report, patterns, own, margins=margins)
+            status = run_spans(MONITOR, specifications, spans, report, patterns, own=own, margins=margins)
+        if status:
+            raise typer.Exit(status)
     except SpecificationError as error:
         raise refused(error.findings) from None
 

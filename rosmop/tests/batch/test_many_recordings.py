@@ -26,17 +26,20 @@ limit() { event e(int n) /n std_msgs/Int32 '{data:n}' { if (n > 96) { ROS_WARN("
 ROSMOP = [sys.executable, "-P", "-c", "from rosmop.tool.command import app; app()"]
 
 
-def make_bag(path: Path, seed: int, count: int = 400, step: int = 10**8) -> Path:
+def make_bag(path: Path, seed: int, count: int = 400, step: int = 10**8, kind: str = KIND) -> Path:
     definitions = standard_definitions()
     with Writer(path) as writer:
         connection = writer.add_connection(
-            "/n", "std_msgs/msg/Int32", msgdef=definitions.full_text(KIND), md5sum=definitions.md5sum(KIND)
+            "/n",
+            kind.replace("/", "/msg/"),
+            msgdef=definitions.full_text(kind),
+            md5sum=definitions.md5sum(kind),
         )
         for number in range(count):
             writer.write(
                 connection,
                 (seed * 1000 + 1) * 10**9 + number * step,
-                message(KIND, data=(number * 7 + seed) % 100),
+                message(kind, data=(number * 7 + seed) % 100),
             )
     return path
 
