@@ -17,7 +17,7 @@ from appliance.cli.monitor_changes import Hold, say_held, say_replaced, say_shad
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.tables import say_table, table_of
-from rosmop.tool.terminal import printable, say
+from rosmop.tool.terminal import printable, refused, say
 
 _Names = Annotated[
     list[str],
@@ -254,7 +254,7 @@ def set_given(
         if not found:
             names = ", ".join(row.name for row in rows)
             known = f"there are: {names}" if names else "none is loaded"
-            raise usage_error(f"no monitor is named {printable(name)}; {known}", "rosrv monitor set")
+            raise refused([f"rosrv monitor set: no monitor is named {name}; {known}"])
         given = found[0].given
     if appliance.as_json:
         for one in given:
