@@ -40,7 +40,7 @@ class _Process:
             memory_given=self._memory_given,
         )
         self._rings: dict[int, memoryview] = {}
-        self._memory = 0
+        self._memory = self._ahead = 0
         self._said: list[object] = []
         self._wake = asyncio.Event()
 
@@ -79,6 +79,7 @@ class _Process:
             settings.state / "control" / "audit.db",
             [ring for _index, ring in sorted(self._rings.items())],
             memory=self._memory,
+            ahead=self._ahead,
         )
 
     def _hear(self, message: object) -> None:
@@ -88,6 +89,6 @@ class _Process:
     def _memory_given(self, message: messages.MemoryGiven, descriptor: int) -> None:
         given = msgspec.convert(message.terms, RingTerms)
         self._rings[given.index] = memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
-        self._memory = max(self._memory, given.since)
+        self._memory, self._ahead = given.since, given.ahead  # equal in all rings
         os.close(descriptor)
         self._wake.set()

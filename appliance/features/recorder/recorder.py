@@ -24,7 +24,9 @@ from appliance.features.recorder.recording import (
     MAX_RECORDS,
     MAX_TRIGGERS,
     Progress,
+    ReadPosition,
     RecordingInProgress,
+    RingReader,
     load_progress,
 )
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
@@ -50,7 +52,10 @@ _log = structlog.get_logger()
 
 
 class Recorder:
-    """Records `rings`, which were created at the time `memory`. Times are nanoseconds since the epoch."""
+    """Records `rings`, which were created at the time `memory`. Times are nanoseconds since the epoch.
+
+    The machine's clock was then `ahead` nanoseconds ahead of the monotonic one, `steady`.
+    """
 
     def __init__(
         self,
@@ -60,7 +65,9 @@ class Recorder:
         rings: Sequence[memoryview],
         *,
         memory: int,
+        ahead: int,
         clock: Callable[[], int] = clock.wall_ns,
+        steady: Callable[[], int] = clock.now_ns,
     ) -> None:
         self._rules = rules
         self._store = store
@@ -68,6 +75,10 @@ class Recorder:
         self._rings = rings
         self._memory = memory
         self._clock = clock
+        self._steady = steady
+        self._ahead = ahead
+        self._since = memory  # the clock was not set since
+        self._places: list[dict[int, ReadPosition]] = []  # and these positions follow all earlier messages
         self._ids = IdSource(clock=clock)
         self._limit = HourlyLimit(rules.per_hour, store.recordings)
         self._follower: Follower | None = None
@@ -76,9 +87,11 @@ class Recorder:
         self._asked_for: set[str] = set()  # ids of recordings that wait for the revisions in force
         self._told: dict[tuple[str, str], int] = {}  # when a trigger without a recording was last reported
         self._answers: list[messages.Message] = []
+        self._notice_set_clock()
         self._take_up()
 
     def step(self, said: Iterable[object] = ()) -> list[messages.Message]:
+        self._notice_set_clock()
         for message in said:
             try:
                 self._obey(message)
@@ -141,7 +154,7 @@ class Recorder:
 
     def _record_temporarily(self, wanted: recorder_link.MemoryWanted) -> None:
         now = self._clock()
-        since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
+        since = max(self._since, wanted.since, now - int(self._rules.before * _SECOND))
         until = min(wanted.until, now)
         if since > until:
             reason = f"the memory has the last {self._rules.before:g} seconds, and none of that period"
@@ -159,7 +172,7 @@ class Recorder:
             self._store.mark_temporary(progress.id)
             temporary = self._in_progress(progress)
             try:
-                temporary.step()
+                temporary.step(now)
                 recording = temporary.finish((), self._revisions)
             finally:
                 temporary.leave()
@@ -273,12 +286,12 @@ class Recorder:
     def _record(
         self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""
     ) -> tuple[RecordingInProgress | None, str]:
-        charged_to, now = trigger.charged_to, trigger.time
+        charged_to, now = trigger.charged_to, min(max(trigger.time, self._since), self._clock())
         for making in tuple(self._making):
             progress = making.progress
             if recording_owner(progress.charged_to) == recording_owner(charged_to):
                 if now <= progress.ends:
-                    _prolong(progress, trigger, after)
+                    _prolong(progress, trigger, now, after)
                     return making, ""
                 try:
                     self._close(making)
@@ -302,13 +315,11 @@ class Recorder:
         ]
         ended = max(own, default=0)
         times = span(self._rules, now, ended, before, after)
-        began = (
-            max(self._memory, times.began) if self._memory <= now else times.began
-        )  # otherwise the clock was set back since
+        began = max(self._since, times.began)
         latest = began + int(self._rules.longest * _SECOND)
         progress = Progress(
             planned or self._ids.next(), self._memory, began, min(times.ends, latest), [trigger],
-            charged_to=charged_to, hold=times.hold, latest=latest,
+            charged_to=charged_to, hold=times.hold, latest=latest, ahead=self._ahead, reached=began,
         )  # fmt: skip
         try:
             making = self._in_progress(progress)
@@ -322,17 +333,15 @@ class Recorder:
 
     def _in_progress(self, progress: Progress) -> RecordingInProgress:
         folder = self._store.part(progress.id)
+        progress.places = progress.places or list(self._places)
         return RecordingInProgress(folder, progress, self._rings, largest=self._store.largest)
 
     # --- the recording ------------------------------------------------------------------------------------
 
     def _go_on(self, making: RecordingInProgress) -> None:
         now, progress = self._clock(), making.progress
-        if now < progress.began:
-            progress.why_not = "the clock was set back during the recording"
-            now = progress.began
         if now <= progress.ends:
-            making.step()
+            making.step(now)
         elif progress.id not in self._asked_for:
             self._asked_for.add(progress.id)
             self._answers.append(recorder_link.RevisionsWanted())
@@ -343,8 +352,25 @@ class Recorder:
         if progress.why_not or now >= progress.ends + int(SETTLE_SECONDS * _SECOND):
             self._close(making)
 
+    def _notice_set_clock(self) -> None:
+        """Forget the memory when the clock was set: times before and after it do not measure silences."""
+        now = self._clock()
+        ahead = now - self._steady()
+        for making in tuple(self._making):
+            progress = making.progress
+            if abs(ahead - progress.ahead) > recorder_link.CLOCK_STEP:
+                progress.why_not = "the clock was set, or the machine was suspended, during the recording"
+                progress.ends = progress.reached
+                try:
+                    self._finish(making)
+                except OSError as error:
+                    self._give_up(making, error)
+        if abs(ahead - self._ahead) > recorder_link.CLOCK_STEP:
+            self._ahead, self._since = ahead, now
+            self._places = [RingReader(ring).skip() for ring in self._rings]
+
     def _close(self, making: RecordingInProgress) -> None:
-        making.step()
+        making.step(self._clock())
         self._finish(making)
 
     def _finish(self, making: RecordingInProgress) -> None:
@@ -416,9 +442,9 @@ class Recorder:
         self._answers.append(recorder_link.RecordingRemoved(0, recording, "", reason))
 
 
-def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
+def _prolong(progress: Progress, trigger: Trigger, now: int, after: float | None) -> None:
     hold = progress.hold if after is None else int(after * _SECOND)
-    progress.ends = max(progress.ends, min(trigger.time + hold, progress.latest))
+    progress.ends = max(progress.ends, min(now + hold, progress.latest))
     if trigger.charged_to in UNLIMITED and progress.charged_to not in UNLIMITED:
         progress.charged_to = trigger.charged_to  # from now on it does not use up the appliance's quota
     known = any(trigger.record == other.record for other in progress.triggers)

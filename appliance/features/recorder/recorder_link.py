@@ -5,6 +5,9 @@ import msgspec
 from appliance.channel.messages.message import Message
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
 
+CLOCK_STEP = 100_000_000
+"""The nanoseconds by which the machine's clock must be set before the recorder notices it."""
+
 
 class RingTerms(msgspec.Struct, frozen=True):
     """The terms of the memory of relay `index`, made at `since` (nanoseconds since the epoch)."""
@@ -17,6 +20,8 @@ class RingTerms(msgspec.Struct, frozen=True):
     """Globs for topics and types."""
     sums: dict[str, str] = msgspec.field(default_factory=dict)
     """The known md5sums of excluded types. A topic with another md5sum is recorded."""
+    ahead: int = 0
+    """How far the machine's clock was ahead of the monotonic one at `since`, in nanoseconds."""
 
 
 class RecordingsAsked(Message, frozen=True):

@@ -9,11 +9,10 @@ import msgspec
 from appliance.base import clock
 from appliance.features.recorder.excluded_topics import fits, left_out_because
 from appliance.features.recorder.quotas import RECORDER_MEMORY
-from appliance.features.recorder.recorder_link import RingTerms
+from appliance.features.recorder.recorder_link import CLOCK_STEP, RingTerms
 from appliance.features.recorder.ring import LEFT_OUT, RingStream, RingWriter
 
 _TOPIC_SHARE = 0.25
-_STEP = 100_000_000  # nanoseconds
 _NOTHING = memoryview(b"")
 
 
@@ -41,7 +40,7 @@ class RecorderRing:
     def _clock(self, judged: int) -> int:
         now = self._now()
         ahead = clock.wall_ns() - now - self._set
-        if abs(ahead) > _STEP:
+        if abs(ahead) > CLOCK_STEP:
             self._set += ahead
         return (judged or now) + self._set
 

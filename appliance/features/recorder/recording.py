@@ -28,7 +28,7 @@ from appliance.features.recorder.bag_writer import (
     connection_size,
 )
 from appliance.features.recorder.excluded_topics import NAMED
-from appliance.features.recorder.recorder_link import RevisionsStated
+from appliance.features.recorder.recorder_link import CLOCK_STEP, RevisionsStated
 from appliance.features.recorder.recording_answers import (
     OPERATORS,
     LeftOutTopic,
@@ -67,6 +67,7 @@ _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
 MAX_MESSAGES = 1 << 53
+_NEVER = 1 << 64  # no time reaches it
 
 _Blocks = dict[int, tuple[int, BlockRow]]
 
@@ -136,6 +137,12 @@ class RingReader:
                 batches, torn = self._new(stream, blocks, since, until)
                 if batches or torn:
                     yield StreamFrames(stream, header, batches, torn)
+
+    def skip(self) -> dict[int, ReadPosition]:
+        """Return the positions after all messages."""
+        for _found in self.read(_NEVER, _NEVER):
+            pass
+        return self.places
 
     def _header(self, blocks: _Blocks) -> dict[str, str] | None:
         text = bytearray()
@@ -281,6 +288,10 @@ class Progress(msgspec.Struct):
     left_out: list[LeftOutTopic] = []
     claims: int = 0
     """The number of topics left out because of their publishers' claims."""
+    ahead: int = 0
+    """How far the machine's clock is ahead of the monotonic one."""
+    reached: int = 0
+    """The time up to which messages were read."""
 
 
 def load_progress(folder: Path) -> Progress:
@@ -317,12 +328,14 @@ class RecordingInProgress:
         progress = self.progress
         return OpenRecording(progress.id, progress.began, progress.ends, progress.triggers[0])
 
-    def step(self) -> None:
+    def step(self, now: int) -> None:
+        """Read messages up to `now`: a later one has a time of a clock that was just set forward."""
         progress = self.progress
         for number, reader in enumerate(self._readers):
-            for found in reader.read(progress.began, progress.ends):
+            for found in reader.read(progress.began, min(progress.ends, now + CLOCK_STEP)):
                 self._take(found, progress.following[number])
         progress.places = [reader.places for reader in self._readers]
+        progress.reached = max(progress.reached, min(progress.ends, now))
         new = self._folder / f"{PROGRESS}.new"
         new.write_bytes(msgspec.msgpack.encode(progress))
         new.replace(self._folder / PROGRESS)

@@ -36,6 +36,7 @@ class RecorderRings:
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
         since, sums = clock.wall_ns(), known_sums(rules.never)
+        ahead = since - clock.now_ns()
         self._rings: list[tuple[RingTerms, int, int]] = []  # with the writable and the read-only descriptor
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
@@ -43,7 +44,7 @@ class RecorderRings:
             os.posix_fallocate(writable, 0, size)
             fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
             readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)
-            given = RingTerms(index, since, rules.before, list(rules.topics), list(rules.never), sums)
+            given = RingTerms(index, since, rules.before, list(rules.topics), list(rules.never), sums, ahead)
             self._rings.append((given, writable, readable))
 
     def messages_for(self, role: str, index: int) -> Iterator[tuple[MemoryGiven, int]]:
