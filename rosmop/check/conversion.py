@@ -17,7 +17,7 @@ def convert(scope: FunctionScope, value: Value, target: Type, site: int | None =
     if isinstance(target, value_types.StringType) and isinstance(value.type, value_types.CharactersType):
         return nodes.Call(target, "c_terminated", (value.form,), where)
     if isinstance(target, value_types.CharactersType) and isinstance(value.type, value_types.StringType):
-        return nodes.Call(target, "t_zeroed", (value.form,))
+        return nodes.Call(target, "t_zeroed", (value.form,), where)
     if (
         isinstance(value.type, value_types.VectorType)
         and isinstance(target, value_types.VectorType)

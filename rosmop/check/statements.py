@@ -164,7 +164,7 @@ def _array(
             return value_types.CHARACTERS, zeros
         text = converted(scope, declarator.value, value_types.STRING)
         if size is None:
-            return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "t_zeroed", (text,))
+            return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "t_zeroed", (text,), site)
         if isinstance(declarator.value, tree.StringLiteral) and len(declarator.value.value) >= size:
             length = len(declarator.value.value)
             raise SpecificationError.at(

@@ -22,7 +22,7 @@ from typing import Any
 from rosmop.form import nodes
 from rosmop.form.sites import Site
 from rosmop.runtime import formatting, numbers, safe_messages, strings, times, vectors, wire
-from rosmop.runtime.action_context import MAX_CALLS, PART, ActionState, Context, FaultError
+from rosmop.runtime.action_context import MAX_CALLS, ActionState, Context, FaultError
 from rosmop.runtime.builtin_functions import CHARGING, FAULTING, FUNCTIONS
 from rosmop.runtime.values import BILLION, ValueCodec, struct_code, struct_size
 from rosmop.types import value_types
@@ -86,7 +86,7 @@ class Interpreter:
         self.turn = ActionState()
         self.variables: dict[str, Any] = {}
         self.failed = LastFailure()
-        self._values = ValueCodec(messages, partial(self.turn.check, PART))
+        self._values = ValueCodec(messages, self.turn.check)
         self._functions = functions
         self._made: dict[str, Callable[[Variables], Any]] = {}
         self._calls: list[Variables] = []
@@ -669,9 +669,9 @@ class _Maker:
         if not isinstance(kind, value_types.VectorType | value_types.RecordType):
             return self._both(compare, node.left, node.right)
         left, right, measure = self.value(node.left), self.value(node.right), self._values.measure(kind)
-        context, site = self._context, node.site
+        context, site, same = self._context, node.site, self._values.same(kind)
         equal = node.operator == "=="
-        return lambda v: vectors.same(vectors.weighed(context, left(v), measure, site), right(v)) is equal
+        return lambda v: same(vectors.weighed(context, left(v), measure, site), right(v)) is equal
 
     def _compare_texts(self, node: nodes.CompareTexts) -> _Value:
         compare, context, site = _CALCULATED[node.operator], self._context, node.site

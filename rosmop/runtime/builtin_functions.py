@@ -92,7 +92,7 @@ FUNCTIONS: Mapping[str, Function] = MappingProxyType(
         "o_charged": strings.charged,
         "t_byte": formatting.to_text_character,
         "t_last": lambda text: text[-1:],
-        "t_zeroed": lambda text: text + b"\0",
+        "t_zeroed": strings.zeroed,
         "t_member": strings.member,
         "t_substring": strings.substring,
         "t_find": strings.find,

@@ -11,6 +11,7 @@ NOT_FOUND = (1 << 64) - 1
 """`std::string::npos`."""
 
 _LONG = 64  # bytes; shorter strings are not charged
+_ALL = bytes(range(256))
 _INTEGERS = {
     2: re.compile(rb"\s*+([+-]?[01]++)"),
     8: re.compile(rb"\s*+([+-]?[0-7]++)"),
@@ -76,19 +77,38 @@ def substring(context: Context, text: bytes, start: int, count: int, site: int) 
 
 
 def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    context.spend(len(text) // 16, site)
-    found = text.find(wanted, start) if start <= len(text) else -1
+    context.spend((len(text) + len(wanted)) // 16, site)
+    found = _found(text, wanted, start) if start <= len(text) else -1
     return NOT_FOUND if found < 0 else found
 
 
 def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    context.spend(len(text) // 16, site)
-    found = text.rfind(wanted, 0, min(start, len(text)) + len(wanted))
+    context.spend((len(text) + len(wanted)) // 16, site)
+    head = text[: min(start, len(text)) + len(wanted)]
+    if len(wanted) <= _LONG:
+        found = head.rfind(wanted)
+    else:
+        found = _found(head[::-1], wanted[::-1], 0)
+        found = len(head) - found - len(wanted) if found >= 0 else -1
     return NOT_FOUND if found < 0 else found
 
 
+def _found(text: bytes, wanted: bytes, start: int) -> int:
+    """Return `text.find(wanted, start)`.
+
+    The times of `find` and `rfind` can grow with the product of the lengths, but not that of `find` in a text that is
+    long, and much longer than `wanted`: zeros after the text make it so.
+    """
+    if len(wanted) <= _LONG:
+        return text.find(wanted, start)
+    found = (text + bytes(30_000 + 4 * len(wanted))).find(wanted, start)
+    return found if found + len(wanted) <= len(text) else -1
+
+
 def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    context.spend(len(text), site)
+    context.spend(len(text) + len(wanted) // 16, site)
+    if len(wanted) > _LONG:
+        wanted = _ALL.translate(None, _ALL.translate(None, wanted))  # each character once
     for first in range(start, len(text), PART):
         context.turn.check()
         for index in range(first, min(first + PART, len(text))):
@@ -167,6 +187,10 @@ def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
     """A `char` buffer after `strcat(buffer, text)`."""
     _allocate(context, buffer, site)
     return filled(context, buffer, _cut(buffer) + _cut(text), site)
+
+
+def zeroed(context: Context, text: bytes, site: int) -> bytes:
+    return charged(context, text, site) + b"\0"
 
 
 def terminated(context: Context, buffer: bytes, site: int) -> bytes:

@@ -1,10 +1,11 @@
 """Operations on values by type: size, zeros, copies, and encoding in messages."""
 
+import operator
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeVar
 
 from rosmop.runtime import vectors, wire
 from rosmop.runtime.action_context import Context
@@ -24,6 +25,7 @@ _CODES = {
 }
 _MOMENTS: dict[Type, str] = {value_types.TIME: "II", value_types.DURATION: "ii"}
 BILLION = 1_000_000_000
+_Made = TypeVar("_Made")
 
 
 def struct_code(kind: Type) -> str | None:
@@ -44,18 +46,17 @@ def struct_size(codes: str) -> int:
 class ValueCodec:
     """Encodes, decodes, copies and measures values; functions are cached by type."""
 
-    def __init__(self, messages: MessageTypes, check: Callable[[], None] = lambda: None) -> None:
-        """`check` is called from time to time while many elements are decoded, and may raise."""
+    def __init__(self, messages: MessageTypes, check: Callable[[int], None] = lambda _: None) -> None:
+        """`check` is called while many elements are walked, with the number of the next ones, and may raise."""
         self._messages = messages
         self._check = check
-        self._made: dict[tuple[Callable[[ValueCodec, Any], Any], Type], Callable[..., Any]] = {}
+        self._made: dict[tuple[Callable[[ValueCodec, Any], Any], Type], Any] = {}
 
-    def _once(
-        self, make: Callable[["ValueCodec", Any], Callable[..., Any]], kind: Type
-    ) -> Callable[..., Any]:
+    def _once(self, make: Callable[["ValueCodec", Any], _Made], kind: Type) -> _Made:
         if (make, kind) not in self._made:
             self._made[make, kind] = make(self, kind)
-        return self._made[make, kind]
+        found: _Made = self._made[make, kind]
+        return found
 
     def fields(self, kind: value_types.RecordType) -> list[Type]:
         return [slot.type for slot in self._messages.slots(kind.name).values()]
@@ -106,8 +107,32 @@ class ValueCodec:
                 if not struct_code(field)
             ]
             own = self.width(kind)
+            if not large:
+                return lambda _: own
             return lambda record: own + sum(measure(record[index]) for index, measure in large)
         return lambda _: 8
+
+    # Comparisons
+
+    def same(self, kind: Type) -> Callable[[Any, Any], bool]:
+        """Return a function that compares two values as C++ does: NaN equals nothing, not even itself."""
+        numbers = self._once(ValueCodec._numbers, kind)
+        return operator.eq if numbers is None else lambda left, right: left == right and numbers(left)
+
+    def _numbers(self, kind: Type) -> Callable[[Any], bool] | None:
+        """Return a function that finds out that no number is NaN, or None if the type has no such numbers."""
+        if isinstance(kind, value_types.FloatingType):
+            return lambda value: value == value  # noqa: PLR0124  NaN
+        if isinstance(kind, value_types.RecordType):
+            found = [self._once(ValueCodec._numbers, field) for field in self.fields(kind)]
+            parts = [(index, test) for index, test in enumerate(found) if test is not None]
+            return (lambda record: all(test(record[index]) for index, test in parts)) if parts else None
+        if not isinstance(kind, value_types.VectorType):
+            return None
+        if isinstance(kind.element, value_types.FloatingType):
+            return lambda values: all(map(operator.eq, values, values))
+        element = self._once(ValueCodec._numbers, kind.element)
+        return element and (lambda values: all(map(element, vectors.in_parts(values, self._check))))
 
     # Zeros and copies
 
@@ -238,7 +263,7 @@ class ValueCodec:
             else:
                 vectors.fixed(values, length, -1)
             if encode is not None:
-                for value in values:
+                for value in vectors.in_parts(values, self._check):
                     encode(value, out)
             elif len(code) == 2:
                 wire.put_moments(values, code[0], out)

@@ -4,7 +4,8 @@
 """
 
 import math
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
@@ -53,13 +54,12 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
     return values
 
 
-def same(left: object, right: object) -> bool:
-    """Whether two values are equal as in C++, where NaN equals nothing, not even itself."""
-    return left == right and _numbers(left)
-
-
-def _numbers(value: object) -> bool:
-    return all(map(_numbers, value)) if isinstance(value, list) else value == value  # noqa: PLR0124  NaN
+def in_parts(values: list[_T], check: Callable[[int], None]) -> Iterator[_T]:
+    """Yield the elements, and call `check` with the number of those that follow, at most `PART`."""
+    for first in range(0, len(values), PART):
+        part = values[first : first + PART]
+        check(len(part))
+        yield from part
 
 
 def pop(values: Values, site: int) -> None:
@@ -77,7 +77,7 @@ def copied_deep(
     context: Context, values: Values, width: int, copy: Callable[[Context, Value, int], Value], site: int
 ) -> Values:
     context.allocate(len(values) * width, site)
-    return [copy(context, value, site) for value in values]
+    return [copy(context, value, site) for value in in_parts(values, context.turn.check)]
 
 
 def recast(
@@ -99,7 +99,7 @@ def signed(values: list[int]) -> list[int]:
 
 
 def unsigned(values: list[int]) -> list[int]:
-    return [value & 0xFF for value in values]
+    return list(struct.pack(f"{len(values)}b", *values))
 
 
 def truths(values: Values) -> list[bool]:

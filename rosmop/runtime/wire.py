@@ -81,27 +81,27 @@ def elements(
     start: int,
     number: int,
     decode: Callable[[Buffer, int], tuple[_T, int]],
-    check: Callable[[], None],
+    check: Callable[[int], None],
 ) -> tuple[list[_T], int]:
     _require_few(number)
     values = []
     for index in range(number):
         if not index % PART:
-            check()
+            check(PART)
         value, start = decode(buffer, start)
         values.append(value)
     return values, start
 
 
 def rows(
-    buffer: Buffer, start: int, number: int, width: int, check: Callable[[], None]
+    buffer: Buffer, start: int, number: int, width: int, check: Callable[[int], None]
 ) -> tuple[list[list[bytes]], int]:
     """Like `elements`, of records of `width` strings: a diagnostic array has thousands of them."""
     _require_few(number)
     found = []
     for index in range(number):
         if not index % PART:
-            check()
+            check(PART)
         row = []
         for _ in range(width):
             first = start + 4

@@ -1,9 +1,18 @@
+import gc
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from itertools import permutations
+from time import thread_time
+from typing import Any
 
 import pytest
 
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
+from rosmop.runtime.action_context import ActionState, Context, FaultError
+from rosmop.runtime.builtin_functions import CHARGING, FUNCTIONS
+from rosmop.runtime.strings import NOT_FOUND
 from rosmop.tests.acting import message
 from roswire.standard import standard_definitions
 
@@ -20,6 +29,102 @@ WALKS = {
     "a vector": ("std_msgs/String", "std::string s", "{data:s}", "std::vector<int> v(s.size() * 4, 1); n = v.size();",
                  TEXT),
 }  # fmt: skip
+
+
+CALLS: dict[str, Callable[[Any, Any, bytes, bytes], object]] = {
+    "a_character": lambda call, context, text, _: call(context, text, 0, 98, 0),
+    "c_terminated": lambda call, context, text, _: call(context, text, 0),
+    "e_fill": lambda call, context, text, _: call(context, len(text), 0.5, float, lambda _: 8, 0),
+    "e_filled": lambda call, context, text, other: call(context, text, other, 0),
+    "e_repeat": lambda call, context, text, _: call(context, len(text), 97, 0),
+    "h_extended": lambda call, context, text, other: call(context, text, other, 0),
+    "h_filled": lambda call, context, text, other: call(context, text, other, 0),
+    "h_filled_at_most": lambda call, context, text, other: call(context, text, other, len(text), 0),
+    "h_printed": lambda call, context, text, other: call(context, text, other, len(text), 0),
+    "k_erase": lambda call, context, text, _: call(context, [*text], 0, None, 0),
+    "k_insert": lambda call, context, text, _: call(context, [*text], 0, 1, 1, 0),
+    "k_reverse": lambda call, context, text, _: call(context, [*text], 0, len(text), 0),
+    "k_sort": lambda call, context, text, other: call(context, [text, other], 0, 2, 0),
+    "l_append": lambda call, context, text, _: call(context, [*text], 1, 1, 0),
+    "l_append_text": lambda call, context, text, other: call(context, [text], other, 32, 0),
+    "l_filled": lambda call, context, text, _: call(context, len(text), float, 8, 0),
+    "l_nearest": lambda call, context, text, _: call(context, [*text], 0, len(text), 0),
+    "l_resized": lambda call, context, text, other: call(context, [*text], len(other), float, 8, 0),
+    "o_charged": lambda call, context, text, _: call(context, text, 0),
+    "o_extend": lambda call, context, text, other: call(context, text, other, 0),
+    "o_join": lambda call, context, text, other: call(context, text, other, 0),
+    "t_erase": lambda call, context, text, _: call(context, text, 1, 1, 0),
+    "t_extend": lambda call, context, text, other: call(context, text, other, 0),
+    "t_find": lambda call, context, text, other: call(context, text, other, 0, 0),
+    "t_find_any": lambda call, context, text, other: call(context, text, other, 0, 0),
+    "t_find_last": lambda call, context, text, other: call(context, text, other, NOT_FOUND, 0),
+    "t_insert": lambda call, context, text, other: call(context, text, 1, other, 0),
+    "t_replace": lambda call, context, text, other: call(context, text, 1, 1, other, 0),
+    "t_resize": lambda call, context, text, other: call(context, text, len(other), 97, 0),
+    "t_shorten": lambda call, context, text, _: call(context, text, 0),
+    "t_substring": lambda call, context, text, _: call(context, text, 1, len(text), 0),
+    "t_zeroed": lambda call, context, text, _: call(context, text, 0),
+}
+
+IMAGE, SCAN, POLYGON = "sensor_msgs/Image", "sensor_msgs/LaserScan", "geometry_msgs/Polygon"
+PIXELS, RANGES = message(IMAGE, data=[0] * 1_000_000), message(SCAN, ranges=[0.5] * 200_000)
+POINTS = message(POLYGON, points=[{"x": 0.5, "y": 1.0, "z": 2.0}] * 50_000)
+LONG = message("std_msgs/String", data="x" * 1_000_000)
+
+NINE = "for (int i = 0; i < 9; i++)"
+IS = f"std::vector<uint8_t> q = p; {NINE} n += p =="
+WORK = {
+    "integers ==": (IMAGE, "std::vector<uint8_t> p", "{data:p}", f"{IS} q;", PIXELS),
+    "integers !=": (IMAGE, "std::vector<uint8_t> p", "{data:p}", f"{IS} q; n += p != q;", PIXELS),
+    "numbers ==": (SCAN, "float[] p", "{ranges:p}", f"std::vector<float> q = p; {NINE} n += p == q;", RANGES),
+    "messages ==": (POLYGON, "", "{}", "geometry_msgs::Polygon p = MESSAGE, q = p; n = p == q;", POINTS),
+    "copies": (POLYGON, "", "{}", f"geometry_msgs::Polygon p = MESSAGE; {NINE} {{ auto q = p; }}", POINTS),
+    "publishing": (POLYGON, "", "{}", "PUBLISH(/u, geometry_msgs/Polygon, MESSAGE);", POINTS),
+    "names ==": (JOINTS, "string[] p", "{name:p}", "std::vector<std::string> q = p; n = p == q;", NAMES),
+    "texts ==": ("std_msgs/String", "std::string s", "{data:s}", f'auto t = s + ""; {NINE} n += s == t;', LONG),
+    "texts <": ("std_msgs/String", "std::string s", "{data:s}", f'auto t = s + ""; {NINE} n += s < t;', LONG),
+    "characters": ("std_msgs/String", "std::string s", "{data:s}",
+                   "for (int i = 0; i < 999; i++) { char c[] = s; n += c[0]; }", LONG),
+    "signs": (IMAGE, "std::vector<int8_t> p", "{data:p}", "std::vector<uint8_t> q = p; n = q.size();", PIXELS),
+    "truths": (IMAGE, "bool[] p", "{data:p}", "n = p.size();", PIXELS),
+}  # fmt: skip
+
+
+def is_paid(context: Context, run: Callable[[], object]) -> bool:
+    """Whether the processor time is at most 5 ms, 1 µs for each instruction, and 2 µs for each counted element."""
+    for _ in range(3):  # the machine may be busy
+        context.turn.spent = 0
+        context.begin()
+        gc.disable()  # the relay freezes most objects
+        begun = thread_time()
+        with suppress(FaultError):
+            run()
+        taken = thread_time() - begun
+        gc.enable()
+        if taken <= 0.005 + (context.most - context.budget + 2 * context.turn.spent) * 1e-6:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("name", sorted(CHARGING))
+def test_a_call_is_charged_for_the_time_it_takes(name: str) -> None:
+    context = Context("a", ActionState(), {}, list)
+    context.most = 1 << 40
+    for length, other in permutations((49_000, 998_000, 1_000_000), 2):
+        for wanted in (b"b" * other, b"ab" + b"a" * (other - 2), b"a" * (other - 2) + b"ba"):
+            assert is_paid(context, partial(CALLS[name], FUNCTIONS[name], context, b"a" * length, wanted))
+
+
+@pytest.mark.parametrize("name", WORK)
+def test_a_comparison_or_copy_is_charged_for_the_time_it_takes(name: str) -> None:
+    kind, parameter, pattern, action, data = WORK[name]
+    text = f"a() {{ double n = 0; event e({parameter}) /t {kind} '{pattern}' {{ {action} }} }}"
+    monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
+    monitors.start(0)
+    [context] = monitors.interpreter.contexts.values()
+    context.most = 1 << 40
+    assert not monitors.process("/t", bytearray(data), 1).faults
+    assert is_paid(context, partial(monitors.process, "/t", bytearray(data), 2))
 
 
 def ticking(readings: list[None]) -> Callable[[], float]:
