@@ -23,10 +23,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosmop.logics.formula import Formula
-from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
+from rosmop.logics.interface import Categories, CompiledProperty, CostlyRun, Run, RunFaultError, Source
 from rosmop.logics.past_monitors import FOREVER, VERDICTS, PastInstruction, PastProgram, SinceWindow, fold
 
 MAX_OPEN = 10_000
+
+STEP_COST = 20
+"""The instructions that each waiting event counts at a step."""
 
 MAX_OPEN_IN_SLICE = 1_000
 """Less than `MAX_OPEN`, because a parametric specification may have many slices."""
@@ -550,7 +553,7 @@ _RunMark = tuple[int, list[Any], list[tuple[object, ...]]]
 """The number of the event, the values of the part about the past, and the state of each operator."""
 
 
-class BoundedRun:
+class BoundedRun(CostlyRun):
     """A run of a formula about the future."""
 
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
@@ -567,6 +570,7 @@ class BoundedRun:
         self.journal: Journal = {}
         self._told: dict[bool, int] = {}
         self._about: dict[bool, int] = {}
+        self.work = 0
 
     @property
     def deadline(self) -> int | None:
@@ -597,7 +601,9 @@ class BoundedRun:
             if deadline is not None and time_ns > deadline:
                 raise ValueError("the deadline has passed: expire the run first")
             self._now = time_ns
-        if self.waiting >= self._compiled.most:
+        waiting = self.waiting
+        self.work = STEP_COST * waiting
+        if waiting >= self._compiled.most:
             raise RunFaultError(f"more than {self._compiled.most} events wait for later events")
         self.place += 1
         self._places = self._compiled.folded.take(self._at_once, event, self._now)

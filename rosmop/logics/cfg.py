@@ -9,6 +9,7 @@ from rosmop.logics.ere import with_fail
 from rosmop.logics.interface import (
     Categories,
     CompiledProperty,
+    CostlyRun,
     FiniteProperty,
     Run,
     Source,
@@ -35,19 +36,23 @@ class GrammarProperty(CompiledProperty):
         return GrammarRun(self.recogniser)
 
 
-class GrammarRun(UntimedRun):
+class GrammarRun(UntimedRun, CostlyRun):
     """A run of a grammar; the frame is None after a failure."""
 
-    __slots__ = ("_step", "frame")
+    __slots__ = ("_recogniser", "frame")
 
     def __init__(self, recogniser: EarleyRecogniser) -> None:
-        self._step = recogniser.step
+        self._recogniser = recogniser
         self.frame: EarleySet | None = recogniser.initial
+
+    @property
+    def work(self) -> int:  # type: ignore[override]  # no step comes between this one and the question
+        return self._recogniser.work
 
     def step(self, event: int, _time_ns: int) -> Categories:
         if self.frame is None:
             return FAIL
-        after = self._step(self.frame, event)
+        after = self._recogniser.step(self.frame, event)
         if after is None:
             self.frame = None
             return FAIL

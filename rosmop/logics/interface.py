@@ -160,6 +160,14 @@ class UntimedRun:
         raise ValueError("this run has no deadline")
 
 
+class CostlyRun:
+    """A run whose steps take longer than a few instructions: `work` is the number for the last one."""
+
+    __slots__ = ()
+
+    work: int
+
+
 class FiniteRun(UntimedRun):
     """Walks the tables of an automaton."""
 

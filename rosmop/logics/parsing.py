@@ -24,7 +24,7 @@ from rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000
 """The most continuations of a frame; only ambiguous grammars come close to it."""
-MAX_STEP_WORK = 300_000
+MAX_STEP_WORK = 50_000
 MAX_DEPTH = 1_000_000
 KEPT_SHAPE_WIDTH = 8
 KEPT_SHAPE_ITEMS = 400
@@ -84,6 +84,7 @@ class EarleyRecogniser:
     """The tables of a prepared grammar, filled on demand and shared by all runs."""
 
     def __init__(self, grammar: Grammar) -> None:
+        self.work = 0  # the items of the last step
         self._terminals = grammar.terminals
         self._nullable = nullable_symbols(grammar)
         self._next: list[int] = []
@@ -104,6 +105,7 @@ class EarleyRecogniser:
 
     def step(self, frame: EarleySet, event: int) -> tuple[EarleySet, bool] | None:
         """Return the next frame and whether the trace is in the language, or None if no continuation can be in it."""
+        self.work = 0
         scanned = self._scan(frame.shape, event)
         if scanned is None:
             return None
@@ -142,7 +144,6 @@ class EarleyRecogniser:
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
         completed = set(waiting)
-        work = 0
         while waiting:
             cont = waiting.pop()
             if cont is None:
@@ -150,8 +151,8 @@ class EarleyRecogniser:
                 continue
             below, symbol = cont
             returned, references = self._return(below.shape, symbol)
-            work += len(returned.items) + len(references)
-            if work > MAX_STEP_WORK:
+            self.work += len(returned.items) + len(references)
+            if self.work > MAX_STEP_WORK:
                 raise RunFaultError("the trace can be read in too many ways by this grammar")
             others = below.resolve(references)
             items.update((item, others[reference]) for item, reference in returned.items)

@@ -3,14 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun
+from rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    CostlyRun,
+    Run,
+    RunFaultError,
+    Source,
+    UntimedRun,
+)
 from rosmop.logics.lexer import FormulaToken, TokenReader
 
 CATEGORIES: Categories = ("fail", "succeed")
 MAX_RULES = 1_000
 MAX_STRING = 100_000
-MAX_WORK = 200_000
-"""The most rules tried and symbols moved for one event. Sixteen compared symbols count as one moved symbol."""
+MAX_WORK = 50_000
+"""The most rules tried for one event. Sixteen compared symbols, and 64 moved ones, count as one more."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +50,19 @@ class RewritingProperty(CompiledProperty):
         return frozenset(rule.verdict for rule in self.rules if rule.verdict)
 
 
-class RewritingRun(UntimedRun):
+class RewritingRun(UntimedRun, CostlyRun):
     """A run: its string, or its final verdict. Between two events no rule applies."""
 
-    __slots__ = ("_property", "string", "verdict")
+    __slots__ = ("_property", "string", "verdict", "work")
 
     def __init__(self, compiled: RewritingProperty) -> None:
         self._property = compiled
         self.string: list[int] = []
         self.verdict: Categories = ()
+        self.work = 0
 
     def step(self, event: int, _time_ns: int) -> Categories:
+        self.work = 0
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
@@ -65,23 +75,23 @@ class RewritingRun(UntimedRun):
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
         """Return the rewritten string and its verdict. Invariant: no rule matches before `place`."""
-        longest, work = self._property.longest, MAX_WORK
+        longest = self._property.longest
         place = max(0, len(string) - longest)
         while place < len(string):
             if len(string) > MAX_STRING:
                 raise RunFaultError(f"the string has more than {MAX_STRING} symbols")
             rule, spent = _matching(self._property.by_first.get(string[place], ()), string, place)
-            work -= spent
+            self.work += spent
             if rule is None:
                 place += 1
             elif rule.verdict:
                 return [], (rule.verdict,)
             else:
                 end = place + len(rule.left)
-                work -= len(string) - place
+                self.work += (len(string) - place) // 64
                 string[place:end] = rule.right
                 place = max(0, min(place - longest + 1, len(string) - longest))
-            if work < 0:
+            if self.work > MAX_WORK:
                 raise RunFaultError(f"rewriting takes more than {MAX_WORK} steps for one event")
         return string, ()
 

@@ -17,8 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
-from rosmop.logics.bounded import BoundedRun
-from rosmop.logics.interface import Categories, RunFaultError
+from rosmop.logics.interface import Categories, CostlyRun, RunFaultError
 from rosmop.logics.pattern import TimedPattern
 from rosmop.run.explain import Bound, of_slice
 from rosmop.run.fast_path import FastLane
@@ -47,9 +46,6 @@ EXPLAINED = 3
 """The most explained verdicts of slices for one message, or one call with deadlines; each takes a millisecond."""
 
 SLICE_SECONDS = 50e-6
-
-STEP_COST = 20
-"""The elements (`ActionState.check`) that each waiting event of a formula about the future counts at a step."""
 
 TICK_BUDGET = 2_000
 
@@ -777,19 +773,23 @@ class MonitorExecution:
         if step.monitor.slices is not None:
             self._note(step.monitor)
         for running in step.monitor.properties:
+            run = running.run
             try:
+                if isinstance(run, CostlyRun):
+                    self._turn.check()
                 if step.monitor.slices is None:
-                    if running.code.property.suppresses and id(running.run) not in self._taking_back:
-                        self._taking_back[id(running.run)] = running.mark()
-                    categories = running.history.step(running.run, step.index, time_ns, self._sender)
+                    if running.code.property.suppresses and id(run) not in self._taking_back:
+                        self._taking_back[id(run)] = running.mark()
+                    categories = running.history.step(run, step.index, time_ns, self._sender)
                 else:
-                    if isinstance(running.run, BoundedRun):
-                        self._turn.check(STEP_COST * running.run.waiting)
-                    categories = running.run.step(step.index, time_ns)
+                    categories = run.step(step.index, time_ns)
             except (RunFaultError, OverBudgetError) as error:
                 self._fault(error, step.monitor, running.code.property.source.origin, outcome)
                 self._block(step.monitor, message, outcome)
                 continue
+            finally:
+                if isinstance(run, CostlyRun):
+                    self._turn.spent += run.work
             if categories:
                 self._tell(step.monitor, running, categories, message, outcome)
 

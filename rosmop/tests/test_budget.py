@@ -2,13 +2,15 @@ import gc
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from itertools import permutations
+from itertools import chain, permutations, repeat
 from time import thread_time
 from typing import Any
 
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import Position
+from rosmop.logics.catalogue import LOGICS, compile_property
 from rosmop.run.engine import MonitorSet
 from rosmop.runtime.action_context import ActionState, Context, FaultError
 from rosmop.runtime.builtin_functions import CHARGING, FUNCTIONS
@@ -125,6 +127,46 @@ def test_a_comparison_or_copy_is_charged_for_the_time_it_takes(name: str) -> Non
     context.most = 1 << 40
     assert not monitors.process("/t", bytearray(data), 1).faults
     assert is_paid(context, partial(monitors.process, "/t", bytearray(data), 2))
+
+
+COSTLY = {  # formula, and how often `a` happens before the measured `b`
+    "fsm": ("s [ a -> s, b -> t ] t [ a -> s, b -> t ]", 9),
+    "tfsm": ("s [ a -> s, b -> t ] t [ a -> s, b -> t, timeout 1s -> s ]", 9),
+    "ere": ("(a* b)* a", 9),
+    "ltl": ("[](a => o (!a U b))", 9),
+    "ptltl": ("[*](b => (*)(a S a))", 9),
+    "ptcaret": ("b => (*)a", 9),
+    "pattern": ("globally: a causes b within 1s", 9),
+    "mtl": ("historically (a => eventually[0,1000s] (b and eventually[0,1000s] b))", 900),
+    "cfg": ("S -> S S S | S S | a | b", 195),
+    "srs": (
+        f"{'z ' * 600} -> a . b -> c0 . "
+        + "".join(f"c{i} -> c{i + 1} . " for i in range(300))
+        + "c300 -> z .",
+        700,
+    ),
+}
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_the_steps_of_properties_are_within_the_budget(logic: str) -> None:
+    formula, before = COSTLY[logic]
+    handler = f"@{compile_property(logic, formula, ('a', 'b'), Position('', 1, 1)).categories[-1]} {{ n++; }}"
+    text = f"""m() {{ int n = 0; event a() /a std_msgs/Empty '{{}}' {{ }} event b() /b std_msgs/Empty '{{}}' {{ }}
+        {f"{logic}: {formula} {handler} " * 20} }}"""
+    monitors = MonitorSet.of(compiled_from({"m.rv": text}, standard_definitions(), lints=False))
+    monitors.start(0)
+    for number in range(before):
+        monitors.process("/a", bytearray(), number)
+    monitors.limit_time(chain([0.0], repeat(1.0)).__next__, 0.010)  # the time is over at once
+    gc.disable()
+    begun = thread_time()
+    outcome = monitors.process("/b", bytearray(), before)
+    taken = thread_time() - begun
+    gc.enable()
+    costly = logic in {"mtl", "cfg", "srs"}
+    assert any("10 ms of processor time" in fault.text for fault in outcome.faults) is costly
+    assert taken < (0.1 if costly else 0.01)
 
 
 def ticking(readings: list[None]) -> Callable[[], float]:
