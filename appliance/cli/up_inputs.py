@@ -121,7 +121,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
     )
 
     try:
-        check(read_folder(folder), site_keys, compiler=partial(contents, lints=False))
+        check(read_folder(folder), site_keys, compiler=partial(contents, at_start=True, lints=False))
         return ""
     except SpecificationsRefusedError as error:
         findings = error.findings

@@ -30,6 +30,9 @@ NO_TOPICS: Topics = MappingProxyType({})
 
 _ERROR = ": error: "  # a finding of this severity; the others are warnings
 _LONGEST = 32 << 20  # bytes: half of what a channel carries
+_START_INSTRUCTIONS = (
+    500_000  # some 0.1 s, in which a relay carries no message: ten times what a message always has
+)
 
 
 def contents(
@@ -37,14 +40,15 @@ def contents(
     texts: Mapping[str, str],
     *,
     load: bool = False,
+    at_start: bool = False,
     unbuilt: Mapping[str, str] = {},
     given_topics: Topics = NO_TOPICS,
     lints: bool = True,
 ) -> Contents:
     """Compile specifications. Raises `SpecificationsRefusedError` with all errors.
 
-    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing. Without `lints`, only
-    errors are found.
+    `load`: also build and load the module. `at_start`: they may have been in force, so `init` has no limit. The
+    monitors of the files in `unbuilt` do nothing. Without `lints`, only errors are found.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
@@ -54,6 +58,8 @@ def contents(
         certificates, data = certified(monitors.compiled)
         if load:
             require_loadable(data)
+        if not at_start:
+            _require_short_start(monitors)
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
@@ -106,6 +112,18 @@ def contents(
     )
 
 
+def _require_short_start(monitors: MonitorSet) -> None:
+    monitors.start(0)
+    spent = {name: context.most - context.budget for name, context in monitors.interpreter.contexts.items()}
+    if sum(spent.values()) > _START_INSTRUCTIONS:
+        longest = max(monitors.monitors, key=lambda monitor: spent[monitor.code.context])
+        text = (
+            f"the first values and `init` of all specifications take more than {_START_INSTRUCTIONS} instructions,"
+            f" in which no message passes; most are those of {longest.name}: do less there"
+        )
+        raise SpecificationError.at(longest.code.position, text)
+
+
 def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenState]:
     code = monitors.monitor(name).code
     for given in code.givens:
@@ -126,7 +144,7 @@ def contents_at_start(
 ) -> Contents:
     """Compile for a start: files with errors do nothing. Raises `SpecificationsRefusedError` beyond a limit."""
     try:
-        return contents(files, texts, load=True, given_topics=given_topics, lints=lints)
+        return contents(files, texts, load=True, at_start=True, given_topics=given_topics, lints=lints)
     except SpecificationsRefusedError as error:
         refusal = error
     good, errors = _good(files, texts, given_topics)
@@ -137,7 +155,13 @@ def contents_at_start(
     try:
         definitions = texts if rest else {}
         found = contents(
-            rest, definitions, load=True, unbuilt=unbuilt, given_topics=given_topics, lints=lints
+            rest,
+            definitions,
+            load=True,
+            at_start=True,
+            unbuilt=unbuilt,
+            given_topics=given_topics,
+            lints=lints,
         )
     except SpecificationsRefusedError:
         raise refusal from None
@@ -173,7 +197,7 @@ def check(
 
 def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
     try:
-        contents({file: text}, texts, unbuilt={file: ""}, lints=False)
+        contents({file: text}, texts, at_start=True, unbuilt={file: ""}, lints=False)
     except SpecificationsRefusedError:
         return False
     return True
@@ -187,7 +211,7 @@ def _good(
     def grown(good: set[str], more: Sequence[str]) -> set[str]:
         try:
             wanted = {file: files[file] for file in files if file in {*good, *more}}
-            contents(wanted, texts, load=True, given_topics=topics, lints=False)
+            contents(wanted, texts, load=True, at_start=True, given_topics=topics, lints=False)
         except SpecificationsRefusedError as error:
             if len(more) == 1:
                 errors[more[0]] = next((one for one in error.findings if _ERROR in one), error.findings[0])

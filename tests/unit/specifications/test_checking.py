@@ -33,6 +33,18 @@ def test_a_start_leaves_out_only_the_files_with_errors() -> None:
     assert found.topics["wrong"] == {"/cmd_vel"}
 
 
+def test_a_load_is_refused_that_would_hold_up_messages_with_init() -> None:
+    busy = "init() {{ for (int i = 0; i < {}; i++) n += i; }}"
+    first, second = (
+        {f"{name}.rv": f"{name}() {{ int n = 0; {busy.format(count)} {TWIST} {{ }} }}"}
+        for name, count in (("a", 90_000), ("b", 110_000))
+    )
+    assert contents(first, {}).monitors and contents(second, {}).monitors
+    with pytest.raises(SpecificationsRefusedError, match=r"^b\.rv:1:1: error: the first values and `init`"):
+        contents(first | second, {})
+    assert not contents_at_start(first | second, {}).unbuilt  # they may have been in force
+
+
 def test_a_file_is_left_out_with_the_file_whose_variables_it_uses() -> None:
     assert set(unbuilt(a=USER, b=GOOD.replace("last = v", "last = x"))) == {"good", "user"}
 
