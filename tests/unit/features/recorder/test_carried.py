@@ -137,7 +137,7 @@ def test_a_replay_has_the_messages_that_monitors_got(way: str, tmp_path: Path) -
     found = WAYS[way]()
     progress = Progress("id", 0, 0, 2 * NOW, [Trigger(NOW, "order", "id", "")])
     making = RecordingInProgress(tmp_path / "made", progress, [one.memory for one in found], largest=1 << 20)
-    making.step()
+    making.step(2 * NOW)
     recording = making.finish([], RevisionsStated(1, 1))
     bag = tmp_path / "made" / "recording.bag"
     (tmp_path / "a.mcap").write_bytes(b"".join(as_mcap(bag)))
