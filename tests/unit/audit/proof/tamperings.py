@@ -83,6 +83,7 @@ _statements("empty the details", "UPDATE record SET detail = x'7b7d' WHERE event
 _statements("replace an id", "UPDATE record SET id = 'ffffffffffffffffffff' WHERE sequence = 60")
 _statements("replace a hash", "UPDATE record SET hash = x'" + "00" * 32 + "' WHERE sequence = 60")
 _statements("make an empty field NULL", "UPDATE record SET resource = NULL WHERE sequence = 60")
+_statements("make a NULL an empty field", "UPDATE record SET host = '' WHERE sequence = 1 AND host IS NULL")
 _statements("delete a record", "DELETE FROM record WHERE sequence = 60")
 _statements("delete a range", "DELETE FROM record WHERE sequence BETWEEN 60 AND 79")
 _statements("delete the beginning", "DELETE FROM record WHERE sequence <= 20")
@@ -189,6 +190,10 @@ _statements(
 )
 _statements("move a checkpoint", "UPDATE checkpoint SET sequence = sequence - 1 WHERE number = 2")
 _statements("remove a checkpoint", "DELETE FROM checkpoint WHERE number = 2")
+_statements(
+    "remove the last checkpoint",
+    "DELETE FROM checkpoint WHERE number = (SELECT max(number) FROM checkpoint)",
+)
 _statements("remove all checkpoints", "DELETE FROM checkpoint")
 _statements(
     "swap two checkpoints",
@@ -304,6 +309,11 @@ def overwrite_a_page(state: Path, _before: Path) -> None:
 
 
 _statements("hide a host from searches: drop an index", "DROP INDEX record_host")
+_statements(
+    "hide denials from searches: empty an index",
+    "PRAGMA writable_schema = ON",
+    "UPDATE sqlite_schema SET sql = replace(sql, 'NOT NULL', 'NULL') WHERE name = 'record_decision'",
+)
 _statements(
     "let new records vanish: add a trigger",
     "CREATE TRIGGER t AFTER INSERT ON record BEGIN DELETE FROM record; END",

@@ -29,7 +29,6 @@ from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
 from tests.support.requirements import need_root
 from tests.unit.audit.conftest import MakeLog
-from tests.unit.transcripts import transcripts
 
 # ruff: noqa: S608  the attacker's statements are built from names of columns
 
@@ -125,19 +124,6 @@ def test_changed_bytes_of_the_file(log: Path) -> None:
         assert any(one.first == 77 or one.kind is FindingKind.STRUCTURE for one in result.findings)
 
 
-ATTACKS = transcripts(Path(__file__).with_name("attacks.txt"))
-
-
-@pytest.mark.parametrize("title", ATTACKS, ids=ATTACKS)
-def test_attack(log: Path, title: str) -> None:
-    """Each attack (SQL on the file) has exactly its listed findings. tests/unit/fleet/verdicts.txt has more attacks."""
-    statements = [line for line in ATTACKS[title] if not line.startswith(" ")]
-    columns = COLUMNS.split(", ", 1)[1]
-    attack(log, *(statement.replace("OTHER_COLUMNS", columns) for statement in statements))
-    findings = dict.fromkeys(f"    {kind.name} {first} {last}" for kind, first, last in found(log))
-    assert [*statements, *findings] == ATTACKS[title]
-
-
 def test_an_inserted_record_with_a_valid_hash_is_found(log: Path) -> None:
     with closing(sqlite3.connect(log)) as connection:
         connection.execute("UPDATE record SET sequence = -sequence WHERE sequence >= 60")
@@ -151,18 +137,6 @@ def test_an_inserted_record_with_a_valid_hash_is_found(log: Path) -> None:
     assert found(log) == [(FindingKind.INSERTED, 60, 60)]
 
 
-def test_a_removed_end_is_found(log: Path) -> None:
-    last = verify(log).last
-    attack(log, "DELETE FROM record WHERE sequence > 150")
-    kinds = found(log)
-    assert all(
-        kind in (FindingKind.TRUNCATED, FindingKind.CHECKPOINT_MISSING) for kind, _first, _last in kinds
-    )
-    truncated = [(first, end) for kind, first, end in kinds if kind is FindingKind.TRUNCATED]
-    assert truncated
-    assert all(first == 151 and end <= last for first, end in truncated)
-
-
 def rewrite(path: Path, start: int) -> None:
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE record SET decision = 'deny' WHERE sequence = ?", (start,))
@@ -172,13 +146,6 @@ def rewrite(path: Path, start: int) -> None:
             digest = record_hash(digest, row)
             connection.execute("UPDATE record SET hash = ? WHERE sequence = ?", (digest, row[0]))
         connection.commit()
-
-
-def test_rewritten_chain(log: Path) -> None:
-    rewrite(log, 60)
-    result = verify(log)
-    assert not result.ok
-    assert {finding.kind for finding in result.findings} == {FindingKind.CHECKPOINT_CHANGED}
 
 
 def test_rewritten_chain_and_checkpoints(log: Path) -> None:
@@ -195,26 +162,9 @@ def test_rewritten_chain_and_checkpoints(log: Path) -> None:
     assert FindingKind.SIGNATURE_WRONG in kinds
 
 
-def test_signatures_of_another_key_are_found(log: Path) -> None:
-    other = Ed25519PrivateKey.generate()
-    with closing(sqlite3.connect(log)) as connection:
-        for number, text in connection.execute("SELECT number, text FROM checkpoint").fetchall():
-            connection.execute(
-                "UPDATE checkpoint SET signature = ?, public_key = ? WHERE number = ?",
-                (other.sign(text), other.public_key().public_bytes_raw(), number),
-            )
-        connection.commit()
-    assert {kind for kind, _first, _last in found(log)} == {FindingKind.WRONG_KEY}
-
-
 def test_the_reviewers_key_counts(log: Path) -> None:
     other = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
     assert {kind for kind, _first, _last in found(log, public_key=other)} == {FindingKind.WRONG_KEY}
-
-
-def test_signatures_without_a_key_are_a_finding(log: Path) -> None:
-    log.with_name("audit.pub").unlink()
-    assert FindingKind.NO_KEY in {kind for kind, _first, _last in found(log)}
 
 
 def signer_memory(log: Path, directory: Path) -> None:
@@ -224,24 +174,6 @@ def signer_memory(log: Path, directory: Path) -> None:
         hashes = b"".join(hashlib.sha256(text).digest() for (text,) in texts)
     directory.mkdir()
     (directory / f"{log_id}.signed").write_bytes((1).to_bytes(8, "big") + hashes)
-
-
-@pytest.mark.parametrize(
-    ("statements", "kind"),
-    [
-        (("DELETE FROM record WHERE sequence > 90", "DELETE FROM checkpoint WHERE sequence > 90"),
-         FindingKind.CHECKPOINT_MISSING),
-        (("UPDATE checkpoint SET signature = NULL, public_key = NULL WHERE number = 2",),
-         FindingKind.SIGNATURE_MISSING),
-    ],
-)  # fmt: skip
-def test_the_signers_memory_finds_a_removed_end(
-    log: Path, tmp_path: Path, statements: tuple[str, ...], kind: FindingKind
-) -> None:
-    signer_memory(log, tmp_path / "signer")
-    assert found(log, signer=tmp_path / "signer") == []
-    attack(log, *statements)
-    assert kind in {one for one, _first, _last in found(log, signer=tmp_path / "signer")}
 
 
 def test_root_of_a_container_reads_the_signers_memory(log: Path) -> None:
@@ -271,28 +203,6 @@ def test_the_result_says_whether_the_signers_memory_was_compared(log: Path, tmp_
     assert verify(log, signer=tmp_path / "signer").remembered == 0
     assert verify(log, signer=tmp_path / "none").remembered is None
     assert verify(log).remembered is None
-
-
-@pytest.mark.parametrize("sequence", [3, 100, 190])
-def test_overwritten_page(log: Path, sequence: int) -> None:
-    with closing(sqlite3.connect(log)) as connection:
-        (target,) = connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,)).fetchone()
-    with log.open("r+b") as file:
-        file.seek(log.read_bytes().index(target) // 4096 * 4096)
-        file.write(b"\xa5" * 600)
-    try:
-        assert not verify(log).ok
-    except LogUnreadableError as error:
-        assert str(log) in str(error)
-
-
-def test_a_truncated_file_is_found(log: Path) -> None:
-    data = log.read_bytes()
-    log.write_bytes(data[: len(data) // 2 // 4096 * 4096])
-    try:
-        assert not verify(log).ok
-    except LogUnreadableError as error:
-        assert str(log) in str(error)
 
 
 def test_a_schema_that_is_not_text_is_an_error(log: Path) -> None:
