@@ -11,6 +11,7 @@ Orders (`Dialogue.say`): `b` is the file b.rv with the text `b` of `TEXTS`, `c.r
     revisions                                       list the kept revisions
     eve load b shadow confirm_within=1e-9           an operator's order, with fields of its request
     revision 3                                      the time limit of a change ends; its rollback is this revision
+    given LINE                                      another order, whose effects are not listed
 
 Effects follow: the answer (or refusal), the statements to the relay, the records, and the monitors if they have
 changed.
@@ -234,6 +235,9 @@ class Dialogue:
         self._last = ""
 
     async def say(self, line: str) -> list[str]:
+        if line.startswith("given "):
+            await self.say(line.removeprefix("given "))
+            return []
         self.desk.sent.clear()
         self.desk.trail.heard.clear()
         effects = await self._done(shlex.split(line))
