@@ -16,6 +16,7 @@ Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a fie
     hears ConnectionRefused caller_id=/late reason~no   a report to control
     client has-nothing                                  the peer has been sent nothing since
     quiet UpstreamWanted                                no report of this kind has come
+    carried /chatter 2 14                               messages and bytes of a topic or service, in all reports
     waiting 2 | arriving 0 | clients 0 | connected 0 | held 0
                                                         peers without a grant, those with a header to come, clients of
                                                         services, connections, bytes of messages
@@ -172,6 +173,14 @@ class Dialogue:
 
     def _quiet(self, kind: str) -> None:
         assert not [one for one in self.world.told if type(one).__name__ == kind]
+
+    def _carried(self, resource: str, *expected: str) -> None:
+        def reported() -> list[int]:
+            told = (one for one in self.world.told if isinstance(one, messages.TrafficReported))
+            rows = [row for one in told for row in one.rows if row.resource == resource]
+            return [sum(row.messages for row in rows), sum(row.bytes for row in rows)]
+
+        self.world.until(lambda: reported() == [*map(int, expected)])
 
     def _waiting(self, many: str) -> None:
         by_key = self.world.engine.waiting

@@ -79,23 +79,6 @@ def world(request: pytest.FixtureRequest) -> Iterator[World]:
     world.close()
 
 
-def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> None:
-    publisher, subscriber = world.subscribed()
-    opened = world.hears(ConnectionOpened)
-    assert opened == ConnectionOpened(opened.number, "k", "/chatter", "topic", LOOPBACK, "/listener")
-    publisher.send(encode_frame(b"one") + encode_frame(b"two"))
-    world.gets(subscriber, encode_frame(b"one") + encode_frame(b"two"))
-    reports = (world.hears(TrafficReported).rows for _ in range(100))
-    rows = next(
-        rows for rows in reports if any(row.messages for row in rows)
-    )  # a report that is not older than the messages
-    assert [(row.resource, row.messages, row.bytes, row.subscribers) for row in rows] == [
-        ("/chatter", 2, 14, 1)
-    ]
-    subscriber.sock.close()
-    world.hears(ConnectionClosed, number=opened.number, reason="")
-
-
 def test_control_gets_confirmations_of_its_orders(world: World) -> None:
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one"))
@@ -722,16 +705,28 @@ def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
     world.close()
 
 
-@pytest.mark.parametrize("reply", [b"\x05abcd", encode_service_reply(b"1") * 2, b"\x01\xff\xff\xff\xff"])
-def test_a_service_that_breaks_the_protocol_loses_its_client(world: World, reply: bytes) -> None:
+TOO_LONG = struct.pack("<I", LIMITS.message_bytes + 1)
+
+
+@pytest.mark.parametrize(
+    ("who", "data"),
+    [
+        ("client", TOO_LONG),
+        ("service", b"\x01" + TOO_LONG),
+        ("service", b"\x05abcd"),
+        ("service", encode_service_reply(b"1") * 2),
+    ],
+)
+def test_a_call_ends_with_the_one_who_breaks_the_protocol(world: World, who: str, data: bytes) -> None:
     client = world.connect(encode_header(CALL | {"persistent": "1"}))
     service = world.accept(world.service)
     world.gets_header(service)
     service.send(encode_header({"md5sum": "m"}))
     world.gets_header(client)
-    client.send(encode_frame(b""))
-    world.gets(service, encode_frame(b""))
-    service.send(reply)
+    if who == "service":
+        client.send(encode_frame(b""))
+        world.gets(service, encode_frame(b""))
+    {"client": client, "service": service}[who].send(data)
     world.ends(service)
     world.ends(client)
     assert world.hears(ConnectionClosed).reason

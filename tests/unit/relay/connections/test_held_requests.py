@@ -89,7 +89,10 @@ def test_a_client_that_asks_no_longer_is_not_held() -> None:
     relay.asks = False
     relay.request(b"\x01")
     assert relay.service == encode_frame(b"\x01")
+    reads = [relay.exchange.may_read]
     relay.exchange.from_service(encode_service_reply(b"done"))
+    reads.append(relay.exchange.may_read)
+    assert (reads, relay.exchange.unfinished) == ([False, True], 0)
     relay.asks = True
     relay.request(b"\x01")
     assert relay.service == encode_frame(b"\x01") and len(relay.asked) == 1

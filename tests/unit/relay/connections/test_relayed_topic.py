@@ -260,17 +260,6 @@ def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_nam
     assert member.header == HEADER | {"callerid": "/talker", "topic": "/chatter"}
 
 
-def test_all_subscribers_get_every_message_in_order() -> None:
-    story = Story()
-    first = story.join()
-    story.topic.upstream_opened(HEADER)
-    story.receive(batch(b"1"))
-    second = story.join()
-    story.receive(batch(b"2", b"3"))
-    assert first.received == bytes(batch(b"1", b"2", b"3").view)
-    assert second.received == bytes(batch(b"2", b"3").view)
-
-
 def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
     story, judged = Story(), []
     member = story.join()
@@ -363,16 +352,6 @@ def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
     assert "spare" not in story.upstream.asked
     story.topic.leave(second)
     assert story.upstream.asked[-1] == "spare"
-
-
-def test_a_latched_message_is_given_once_to_each() -> None:
-    story = Story()
-    first = story.join()
-    story.topic.upstream_opened(HEADER | {"latching": "1"})
-    story.receive(batch(b"old", b"new"))
-    second = story.join()
-    assert first.received == bytes(batch(b"old", b"new").view)
-    assert second.received == bytes(batch(b"new").view)
 
 
 @pytest.mark.parametrize("ends", [*itertools.product((False, True), repeat=3)])
@@ -557,14 +536,6 @@ def test_a_command_that_was_not_kept_is_not_asked_for(topic: str) -> None:
     story.share.add(-100)
     story.join()
     assert ("greet" in story.upstream.asked) == (topic == "/map")
-
-
-def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER)
-    story.receive(batch(b"1"))
-    assert story.join().received == b""
 
 
 def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
@@ -849,27 +820,6 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
     assert story.share.used == 0
 
 
-def test_subscribers_survive_the_loss_of_the_publisher() -> None:
-    story = Story()
-    member = story.join()
-    story.topic.upstream_opened(HEADER)
-    story.topic.upstream_closed()
-    assert member.was_cut == ""
-    story.topic.upstream_opened(HEADER)
-    story.receive(batch(b"1"))
-    assert member.received == bytes(batch(b"1").view)
-
-
-def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -> None:
-    """Subscribers must read the new header before they read a message of the new type."""
-    story = Story()
-    member = story.join()
-    story.topic.upstream_opened(HEADER)
-    story.topic.upstream_closed()
-    story.topic.upstream_opened(HEADER | {"md5sum": "other"})
-    assert "different type" in member.was_cut
-
-
 def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
     story = Story()
     first = story.join()
@@ -936,18 +886,6 @@ def test_delays_of_a_later_turn_are_reported_without_new_messages() -> None:
     story.topic.traffic()
     story.topic.go_on(batch(b"3"), story.now)
     assert story.topic.traffic() == TopicTraffic("k", "/chatter", 0, 0, 0, 1, [1] + [0] * 10, 0.0, "m")
-
-
-def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
-    story = Story()
-    served = story.join()
-    story.topic.upstream_opened(HEADER)
-    story.topic.cut_all("gone")
-    assert served.was_cut == "gone"
-    other = Story()
-    waiting = other.join()
-    other.topic.cut_all("gone")
-    assert waiting.was_cut == "gone"
 
 
 class LeavingMember(RecordedMember):
