@@ -4,6 +4,11 @@ A cell names the tests that turn red when the rule is taken out of this entrance
 rule does not apply, which begins with `-`. `tests/unit/test_entrances.py` derives the entrances from the code.
 """
 
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
 RULES = {
     "block": "a blocked host is refused, and what it has open ends",
     "end of a right": "what is open ends with the right, token, ticket or certificate that opened it",
@@ -299,3 +304,21 @@ HOOKS = {
     "relay.hold": "RVMaster, relay",
 }
 """The services of a feature by which others come in; all other services are listed in the test."""
+
+
+class TakenOut(NamedTuple):
+    """A change of the code by which an entrance has a rule no more."""
+
+    entrance: str
+    rule: str
+    file: str
+    old: str
+    new: str
+
+
+def taken_out() -> Iterator[TakenOut]:
+    table = tomllib.loads(Path(__file__).with_name("entrance_mutants.toml").read_text(encoding="utf-8"))
+    for entrance, rules in table.items():
+        for rule, change in rules.items():
+            for one in (entrance, *change.get("also", ())):
+                yield TakenOut(one, rule, change["file"], change["old"], change["new"])
