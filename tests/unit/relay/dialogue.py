@@ -10,6 +10,7 @@ Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a fie
     x sends-header callerid=/x | talker sends-half one  a header of these fields alone, the first half of a frame
     listener gets one two | listener gets-header latching=1 | listener gets-fields callerid=/talker (and no others)
     listener is-served latching=1 | client is-answered  the peer is sent the header of the publisher or of the service
+    listener is-served-by talker latching=1             the same after `listener asks` and `talker publishes latching=1`
     listener closes | listener resets | service closes  the peer ends its connection, the service listens no more
     listener ends [reply:hex:01] | listener stays       the relay has closed the connection (after this), or has not
     state GrantInstalled k /chatter 127.0.0.1 /late     a message of control
@@ -132,6 +133,11 @@ class Dialogue:
 
     def _peer_is_served(self, who: str, *words: str) -> None:
         assert self.world.gets_header(self.peers[who]) == self.published | _given(words)
+
+    def _peer_is_served_by(self, who: str, publisher: str, *words: str) -> None:
+        self._peer_asks(who)
+        self._peer_publishes(publisher, *words)
+        self._peer_is_served(who, *words)
 
     def _peer_is_answered(self, who: str) -> None:
         assert self.world.gets_header(self.peers[who])["md5sum"] == self.served["md5sum"]

@@ -1,4 +1,5 @@
 import gc
+import socket
 import struct
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -9,6 +10,7 @@ import msgspec
 import pytest
 
 from appliance.channel.messages import (
+    UNLIMITED,
     ConnectionClosed,
     FactWithdrawn,
     FlowLimit,
@@ -90,6 +92,8 @@ def passes_by(relayed: RelayedTopic) -> bool:
     return simple is not None and simple[1] is None
 
 
+SAFE = 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
+STOPPING = GUARD.strip().replace("int seen", SAFE)
 TWIST = """a() { event e(double x) /cmd_vel geometry_msgs/Twist '{linear:{x:x}}' { } }"""
 
 
@@ -225,12 +229,8 @@ def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> 
     interceptor.time_budgets.of(one).cut(1, 10)
     assert [interceptor.time_budgets.of(place).part(2, 10) for place in (one, other, robot)] == [0.1, 0.1, 1]
     interceptor.time_budgets.of(robot).cut(1, 10)
-    assert [
-        interceptor.time_budgets.of(place).part(2, 10) for place in (robot, robot._replace(resource="/u"))
-    ] == [
-        0.1,
-        1,
-    ]
+    places = (robot, robot._replace(resource="/u"))
+    assert [interceptor.time_budgets.of(place).part(2, 10) for place in places] == [0.1, 1]
 
 
 def test_waiting_messages_survive_new_specifications_in_order(world: Monitored) -> None:
@@ -282,6 +282,15 @@ def test_a_large_message_goes_through_a_monitor(world: Monitored) -> None:
             world.gets(subscriber, string(back))
 
 
+def own_publication(world: Monitored, topic: str, limit: FlowLimit = UNLIMITED) -> socket.socket:
+    """Let the appliance publish a topic; return where a subscriber connects."""
+    port = world.listen()
+    world.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), port)
+    world.state(PublicationPlaced("own", topic, "std_msgs/String"))
+    world.state(GrantInstalled("own", topic, LOOPBACK, "/listener", limit))
+    return port
+
+
 ALARM = """
 alarm() {
     std_msgs::String text;
@@ -296,18 +305,12 @@ alarm() {
 def test_publications_of_monitors_are_served_and_not_monitored(world: Monitored) -> None:
     hearer = GUARD.replace("/chatter", "/alarm")
     world.load(ALARM, hearer)
-    port = world.listen()
-    world.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), port)
-    world.state(PublicationPlaced("own", "/alarm", "std_msgs/String"))
-    world.state(GrantInstalled("own", "/alarm", LOOPBACK, "/listener", FlowLimit(messages=0.001)))
+    port = own_publication(world, "/alarm", FlowLimit(messages=0.001))
     world.port = port
     subscriber = world.connect(encode_header(WANTED | {"topic": "/alarm"}))
     header = world.gets_header(subscriber)
-    assert (header["callerid"], header["md5sum"], header["type"]) == (
-        "/rosrv",
-        STRING_MD5,
-        "std_msgs/String",
-    )
+    named = header["callerid"], header["md5sum"], header["type"]
+    assert named == ("/rosrv", STRING_MD5, "std_msgs/String")
     assert header["message_definition"].startswith("string data")
     world.until(lambda: len(data_of(subscriber)) >= 2 * len(string("tick")))
     assert subscriber.data.startswith(string("tick") * 2)
@@ -383,10 +386,7 @@ def _publishes(world: Monitored) -> tuple[Peer, Peer, bytes]:
             PUBLISH(/alarm, std_msgs/String, text);
         }
     }""")
-    own = world.listen()
-    world.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), own)
-    world.state(PublicationPlaced("own", "/alarm", "std_msgs/String"))
-    world.state(GrantInstalled("own", "/alarm", LOOPBACK, "/listener"))
+    own = own_publication(world, "/alarm")
     publisher, _subscriber = world.typed()
     world.port = own
     alarmed = world.connect(encode_header(WANTED | {"topic": "/alarm"}))
@@ -590,9 +590,7 @@ def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: 
 
 
 def test_a_guard_sends_its_safe_message_when_it_is_ordered_and_not_when_it_is_asked(world: Monitored) -> None:
-    world.load(
-        GUARD.strip().replace("int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen')
-    )
+    world.load(STOPPING)
     publisher, subscriber = world.typed()
     publisher.send(string("one"))
     world.gets(subscriber, string("two"))
@@ -616,9 +614,7 @@ def test_a_guard_sends_its_safe_message_when_it_is_ordered_and_not_when_it_is_as
 
 
 def test_a_base_that_reconnects_after_a_stop_does_not_get_the_latched_motion(world: Monitored) -> None:
-    world.load(
-        GUARD.strip().replace("int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen')
-    )
+    world.load(STOPPING)
     publisher = world.upstream(header := TYPED | {"latching": "1"})
     publisher.send(string("one"))
     late = world.connect(encode_header(WANTED))
@@ -668,7 +664,6 @@ def shadowed(world: Monitored, text: str) -> None:
     world.until(lambda: world.taken(SpecificationsTaken, 2))
 
 
-SAFE = 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
 OFF: dict[str, Callable[[Monitored, str], object]] = {
     "disabled": lambda world, _text: world.state(MonitorSwitched("guard", False)),
     "removed": lambda world, _text: world.load(revision=2),
@@ -779,13 +774,10 @@ def test_a_publisher_that_returns_with_another_type_is_refused_while_a_guard_is_
 
 def test_a_policys_limit_keeps_back_motions_and_no_stop(world: Monitored) -> None:
     """The base connects to its commander and to the appliance."""
-    world.load(GUARD.strip().replace("int seen", SAFE.replace("1s", "10ms")))
+    world.load(STOPPING.replace("1s", "10ms"))
     limit = FlowLimit(messages=0.001)
-    port = world.listen()
-    world.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), port)
-    world.state(PublicationPlaced("own", "/chatter", "std_msgs/String"))
-    for key in ("k", "own"):
-        world.state(GrantInstalled(key, "/chatter", LOOPBACK, "/listener", limit))
+    port = own_publication(world, "/chatter", limit)
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/listener", limit))
     publisher, driven = world.typed()
     world.port = port
     stopped = world.connect(encode_header(WANTED))
@@ -813,14 +805,11 @@ def test_a_server_that_connects_again_does_not_get_a_cancelled_goal(world: Monit
 
 
 def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
-    guard = GUARD.strip().replace(
-        "int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
-    )
-    world.load(guard)
+    world.load(STOPPING)
     publisher, subscriber = world.typed()
     publisher.send(string("one"))
     world.gets(subscriber, string("two"))
-    taken = world.load(guard.replace("longer", "wider"), revision=2)
+    taken = world.load(STOPPING.replace("longer", "wider"), revision=2)
     assert taken.held == ["guard"]
     publisher.send(string("one") + string("stop"))
     world.until(lambda: len(data_of(subscriber)) >= len(string("stop")) * 2)
