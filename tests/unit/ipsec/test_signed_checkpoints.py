@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base.clock import wall_ns
-from appliance.ipsec.signed_checkpoints import MAX_LOGS, CheckpointMemory, CheckpointRefusedError
+from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError
 
 _NONE = "0" * 64
 _BLOCK = 4096
@@ -65,14 +65,6 @@ def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
     with pytest.raises(CheckpointRefusedError, match=reason):
         signed.accept(text)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
-    signed = CheckpointMemory(tmp_path, wall_ns)
-    for number in range(MAX_LOGS):
-        signed.accept(checkpoint(1, log=f"{number:032x}"))
-    with pytest.raises(CheckpointRefusedError, match="rosrv audit acknowledge"):
-        signed.accept(checkpoint(1, log="f" * 32))
 
 
 def test_cut_by_a_crash(tmp_path: Path) -> None:

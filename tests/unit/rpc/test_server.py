@@ -43,13 +43,6 @@ async def test_large_bodies(size: int, server: Server, client: Client) -> None:
     assert [len(request.body) for request in server.requests] == [size] * 3
 
 
-async def test_pipelined_requests(server: Server, client: Client) -> None:
-    await client.send(b"".join(post(b"%d" % number) for number in range(500)))
-    for number in range(500):
-        assert (await client.response())[2] == b"answer to %d" % number
-    assert len(server.requests) == 500
-
-
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "in one piece"])
 async def test_requests_that_wait_and_others_are_answered_in_order(together: bool) -> None:
     async def sometimes_slow(request: HttpRequest) -> bytes:
@@ -59,7 +52,8 @@ async def test_requests_that_wait_and_others_are_answered_in_order(together: boo
 
     async with serving(sometimes_slow) as server:
         client = await server.connect()
-        bodies = [b"one", b"slow", b"two" + b"x" * 100_000, b"slow 2", b"three", *[b"four"] * 300]
+        bodies = [b"one", b"slow", b"two" + b"x" * 100_000, b"slow 2", b"three"]
+        bodies += [b"%d" % number for number in range(500)]
         if together:
             await client.send(b"".join(post(body) for body in bodies))
         for body in bodies:

@@ -72,13 +72,18 @@ def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
     database.close()
 
 
-@pytest.mark.nightly
-async def test_queued_statements_are_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
-    for size in range(500):
-        database.put("thing", "a", size)
-    await database.settled()
-    with sqlite3.connect(tmp_path / "state.db") as other:
-        assert other.execute("SELECT size FROM thing").fetchall() == [(499,)]
+@pytest.fixture
+def appended(monkeypatch: pytest.MonkeyPatch) -> list[Sequence[Encoded]]:
+    """Return the changes of each write to the file of statements on their way."""
+    appended: list[Sequence[Encoded]] = []
+    append = WriteAhead.append
+
+    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
+        appended.append(changes)
+        append(ahead, changes)
+
+    monkeypatch.setattr(WriteAhead, "append", observed)
+    return appended
 
 
 def test_closing_writes_what_is_left(tmp_path: Path) -> None:
@@ -289,22 +294,14 @@ def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tm
 
 
 def test_rows_of_one_table_are_one_statement(
-    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    database: Database, tmp_path: Path, appended: list[Sequence[Encoded]]
 ) -> None:
-    numbers: list[int] = []
-    append = WriteAhead.append
-
-    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
-        numbers.append(len(changes))
-        append(ahead, changes)
-
-    monkeypatch.setattr(WriteAhead, "append", observed)
     with database.together():
         for size in range(100):
             database.put("thing", f"row {size % 70}", size)
         database.delete("thing", name="row 1")
         database.put("thing", "row 2", 1)
-    assert numbers == [4]  # rows of one statement are limited: SQLite limits the number of values
+    assert list(map(len, appended)) == [4]  # SQLite limits the number of values in one statement
     asyncio.run(database.settled())
     with sqlite3.connect(tmp_path / "state.db") as other:
         rows = dict(other.execute("SELECT name, size FROM thing"))
@@ -315,29 +312,20 @@ def test_rows_of_one_table_are_one_statement(
 
 @pytest.mark.nightly
 def test_a_block_of_one_thread_is_whole_beside_that_of_another(
-    database: Database, monkeypatch: pytest.MonkeyPatch
+    database: Database, appended: list[Sequence[Encoded]]
 ) -> None:
-    numbers: list[int] = []
-    append = WriteAhead.append
-
-    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
-        numbers.append(len(changes))
-        append(ahead, changes)
-
-    monkeypatch.setattr(WriteAhead, "append", observed)
-
     def other() -> None:
         with database.together():
             database.delete("thing", name="c")
             database.put("thing", "d", 1)
-        assert numbers == [2], "both changes of this block, and none of the other"
+        assert list(map(len, appended)) == [2], "both changes of this block, and none of the other"
 
     with database.together():
         database.put("thing", "a", 1)
         with ThreadPoolExecutor(1) as pool:
             pool.submit(other).result()
         database.delete("thing", name="b")
-    assert numbers == [2, 2]
+    assert list(map(len, appended)) == [2, 2]
 
 
 def test_a_block_of_statements_is_one_transaction(
@@ -359,40 +347,26 @@ def test_a_block_of_statements_is_one_transaction(
 
 @pytest.mark.nightly
 def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
-    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    database: Database, appended: list[Sequence[Encoded]]
 ) -> None:
-    kept: list[list[str]] = []
-    append = WriteAhead.append
-
-    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
-        put = [msgspec.msgpack.decode(change.body, type=Put) for change in changes]
-        kept.append([row[0] for change in put for row in change.rows])
-        append(ahead, changes)
+    def kept() -> list[list[str]]:
+        written = [[msgspec.msgpack.decode(one.body, type=Put) for one in changes] for changes in appended]
+        return [[row[0] for put in puts for row in put.rows] for puts in written]
 
     def submit(name: str) -> None:
         database.put("thing", name, 1)
 
-    monkeypatch.setattr(WriteAhead, "append", observed)
     with pytest.raises(ValueError, match="amid it"), database.together():
         submit("first")
         other = threading.Thread(target=submit, args=("other",))
         other.start()
         other.join()
-        assert kept == [["other"]]
+        assert kept() == [["other"]]
         submit("second")
         raise ValueError("amid it")
     submit("third")
-    assert kept == [["other"], ["first", "second"], ["third"]]
+    assert kept() == [["other"], ["first", "second"], ["third"]]
     assert len(database.query("SELECT name FROM thing")) == 4
-
-
-async def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
-    database: Database, tmp_path: Path
-) -> None:
-    for number in range(100):
-        database.put("thing", str(number), 1)
-    await database.settled()
-    assert (tmp_path / "state.ahead").stat().st_size == 0
 
 
 def leave_behind(path: Path, *changes: Encoded) -> None:

@@ -32,24 +32,25 @@ class Lives:
         self.home = home
         self.log = open_log(home / "audit.db")
         self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
-        self.store: StateStore | None = None
+        self.store = self._opened()
 
     def records(self, event: str) -> list[dict[str, Any]]:
         found = search(self.home / "audit.db", Filter(event=event), newest_first=False)
         return [entry.record.detail for entry in found.entries]
 
     def next(self) -> TokenOrders:
-        if self.store is not None:
-            self.store.close()
-        self.store = StateStore(self.home, failed=pytest.fail, kind=InlineDatabase)
+        self.store.close()
+        self.store = self._opened()
         return TokenOrders(self.store, self.trail, ends_of(self.store, self.home), lambda: None)
+
+    def _opened(self) -> StateStore:
+        return StateStore(self.home, failed=pytest.fail, kind=InlineDatabase)
 
 
 @pytest.fixture
 def lives(tmp_path: Path) -> Iterator[Lives]:
     lives = Lives(tmp_path)
     yield lives
-    assert lives.store is not None
     lives.store.close()
     lives.log.close()
 
@@ -75,7 +76,6 @@ async def test_an_announced_token_stays(lives: Lives) -> None:
     tokens = lives.next()
     text = await tokens.first()
     tokens.first_token_shown()
-    assert lives.store is not None
     await lives.store.settled()
     later = lives.next()
     assert await later.first() is None
@@ -98,7 +98,6 @@ async def test_an_old_state_gets_no_first_token(lives: Lives) -> None:
 
 async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
     tokens = lives.next()
-    assert lives.store is not None
 
     async def full() -> None:
         raise StoreError("the disk is full")
@@ -204,7 +203,6 @@ async def test_a_rotation_that_cannot_be_stored_leaves_the_earlier_token(
 ) -> None:
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
-    assert lives.store is not None
 
     async def full() -> None:
         raise StoreError("the disk is full")
@@ -222,7 +220,6 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
 ) -> None:
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "viewer", 3600))
-    assert lives.store is not None
 
     async def revoked_meanwhile() -> None:
         monkeypatch.undo()
@@ -239,7 +236,6 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
 async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
-    assert lives.store is not None
     await lives.store.settled()
     assert lives.log.close() is None  # a thread in SQLite would leave its locks to the child
     child = os.fork()
@@ -309,7 +305,6 @@ async def test_uses_are_stored_at_most_once_in_half_a_minute(
 ) -> None:
     tokens = lives.next()
     alice = await tokens.add(TokenAdd("alice", "viewer", 600))
-    assert lives.store is not None
     stored: list[float] = []
     monkeypatch.setattr(lives.store, "save_token_use", lambda _token, used: stored.append(used))
     start, machine = float(int(wall())), VirtualClock()
@@ -327,7 +322,6 @@ async def test_a_full_disk_keeps_no_use_and_harms_no_request(
 ) -> None:
     tokens = lives.next()
     alice = await tokens.add(TokenAdd("alice", "viewer", 600))
-    assert lives.store is not None
 
     def full() -> None:
         raise StoreError("the disk is full")

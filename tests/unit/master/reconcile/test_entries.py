@@ -120,24 +120,3 @@ async def test_a_round_replaces_the_waiting_changes() -> None:
     await world.round()
     await world.settle()
     assert changes(world) == [("registerPublisher", "/kept"), ("registerPublisher", "/new")]
-
-
-async def test_the_ros_master_has_what_the_registry_has() -> None:
-    world = await started()
-    for name, number in (("/a", 1), ("/b", 2), ("/a", 3), ("/c", 4)):
-        await world.ask("registerPublisher", name, "/t", TYPE, uri(number))
-        await world.ask("registerSubscriber", name, f"/of_{number}", TYPE, uri(number))
-        await world.ask("registerService", name, "/s", f"rosrpc://10.0.0.5:{number}", uri(number))
-    lost = next(one for one in world.registry.live() if one.name == "/c")
-    world.graph.lost(lost, "away")
-    await world.ask("registerService", "/b", "/s", "rosrpc://10.0.0.5:2", uri(2))
-    world.graph.returned(lost)
-    await world.settle()
-    wanted = {(one.kind, one.resource, node.name) for node, one in world.registry.in_order()}
-    there = {
-        (kind, resource, name)
-        for kind, table in world.hidden.tables.items()
-        for resource, names in table.items()
-        for name in names
-    }
-    assert there == wanted
