@@ -2,13 +2,9 @@ import asyncio
 import dataclasses
 import ipaddress
 import socket
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from appliance.audit.search.query import Filter
-from appliance.audit.search.search import export
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.listener_limits import Answering, ListenerLimits, class_of
 from appliance.policy.model import Address, address_of
@@ -16,10 +12,8 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.server import HttpRequest, Peer, exceeds_limit
-from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
 from tests.support.core import FakeTrail
-from tests.support.engines import open_log
 from tests.support.virtual_clock import let_time_pass
 
 pytestmark = pytest.mark.anyio
@@ -30,13 +24,11 @@ CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("guarded", [True, False])
-async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
+async def test_an_idle_connection_is_closed_at_every_listener(*, guarded: bool) -> None:
     given = Settings()
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
-    log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False)
-    listener_limits = ListenerLimits(settings, trail, lambda: policy, lambda _host: QuotaClass.NAMED)
+    listener_limits = ListenerLimits(settings, FakeTrail(), lambda: policy, lambda _host: QuotaClass.NAMED)
 
     async def answer(_request: HttpRequest) -> bytes:
         return b"!"
@@ -52,7 +44,6 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
         writer.close()
         sweep.cancel()
         listener_limits.close()
-    log.close()
 
 
 async def test_calls_are_overdue_while_one_waits_and_none_is_answered() -> None:
@@ -93,18 +84,15 @@ def test_hosts_of_a_wildcard_share_processor_time() -> None:
     assert kind("10.1.0.1") == kind("10.1.255.9")
 
 
+EVERYBODYS = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
+
+
 @pytest.fixture
-def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
-    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
-    log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False)
-    yield ListenerLimits(
-        Settings(),
-        trail,
-        lambda: policy,
-        lambda host: {REGISTERED: QuotaClass.REGISTERED}.get(host, QuotaClass.NAMED),
+def everybodys() -> ListenerLimits:
+    registered = {REGISTERED: QuotaClass.REGISTERED}
+    return ListenerLimits(
+        Settings(), FakeTrail(), lambda: EVERYBODYS, lambda host: registered.get(host, QuotaClass.NAMED)
     )
-    log.close()
 
 
 def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLimits) -> None:
@@ -118,11 +106,8 @@ def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLim
     assert not arriving.take(REGISTERED)
 
 
-def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
-    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
-    log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False)
-    limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.REGISTERED)
+def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots() -> None:
+    limits = ListenerLimits(Settings(), FakeTrail(), lambda: EVERYBODYS, lambda _host: QuotaClass.REGISTERED)
     table = limits.connection_table
     for pool in (table.arriving, table.connected):
         for number in range(200):
@@ -130,7 +115,6 @@ def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path
                 pass
         assert pool.total == pool.bounds.whole - pool.bounds.kept
         assert [pool.take(ROBOT) for _ in range(pool.bounds.host)] == [""] * pool.bounds.host
-    log.close()
 
 
 class Opened:
@@ -169,21 +153,19 @@ ROBOT, REGISTERED = address_of("10.0.0.1"), address_of("10.9.0.7")
 @pytest.mark.parametrize(
     ("tell", "told"), [("rule", "10.0.0.1 is blocked by an operator ["), ("id", "denied [")]
 )
-def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, tell: str, told: str) -> None:
+def test_a_blocked_host_is_refused_before_its_request_is_read(tell: str, told: str) -> None:
     policy = compile_policy(
         f"[Options]\ntell = {tell}\naudit-only = all\n[Nodes]\ndefault = *\n", file="a.ini"
     )
     blocked = dataclasses.replace(policy, blocks={ROBOT: "blocked by ann: odd"})
-    log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False)
+    trail = FakeTrail()
     limits = ListenerLimits(Settings(), trail, lambda: blocked, lambda _host: QuotaClass.NAMED)
     refusal = limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.9"))
     assert refusal is not None
     assert told in str(refusal(build_call("getPid", ("/node",))))
     assert limits.refuse(Peer(address_of("10.0.0.2"), "10.0.0.2", "10.0.0.9")) is None
     assert limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.1")) is None
-    log.close()
-    [record] = [entry.record for entry in export(tmp_path / "audit.db", Filter(decision=("deny",)))]
+    [record] = [record for record in trail.records if record.decision == "deny"]
     assert (record.reason, record.host, record.resource) == (
         "10.0.0.1 is blocked by ann: odd",
         "10.0.0.1",

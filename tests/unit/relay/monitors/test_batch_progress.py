@@ -1,6 +1,6 @@
 import itertools
 import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -22,6 +22,7 @@ from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import MonitorExecution
 from rosmop.run.fast_path import BatchResult
 from rosmop.tests.acting import message
+from rosmop.tests.both_ways import frames, plain
 from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import (
     Messages,
@@ -38,6 +39,10 @@ from tests.unit.relay.monitors.quiet import QuietMonitors, Reports
 from tests.unit.transcripts import transcripts
 
 MONITORS = Path(__file__).parents[4] / "monitors"
+
+
+def traffic_of(topic: str, bodies: Sequence[bytes]) -> Traffic:
+    return Traffic(topic, frames(bodies), len(bodies))
 
 
 class Monitored:
@@ -210,8 +215,7 @@ def _shipped_traffic(seed: int) -> list[Traffic]:
     for _ in range(30):
         topic = random.choice(sorted(kinds))
         bodies = [kinds[topic]() for _ in range(random.choice((1, 3, 9)))]
-        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
-        found.append(Traffic(topic, frames, len(bodies)))
+        found.append(traffic_of(topic, bodies))
     return found
 
 
@@ -277,8 +281,7 @@ def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> No
         return process(*arguments, tried=tried)
 
     monkeypatch.setattr(monitored.set, "process", counted)
-    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
-    frame = struct.pack("<I", len(body)) + body
+    frame = encode_frame(plain(5))
     for _ in range(5):
         left = monitored.through(Traffic("/plain", frame * 1000, 1000))
         assert left == (1000, left[1], left[1][-len(frame) :])
@@ -300,8 +303,7 @@ def test_lines_describe_the_received_message() -> None:
         for seq, name in ((7, "a"), (8, "b"), (9, "a"))
     ]
     for one in (bodies, [b"abc", *bodies]):
-        frames = b"".join(struct.pack("<I", len(body)) + body for body in one)
-        agree({"x.rv": text}, definitions(), [Traffic(topic, frames, len(one)) for topic in ("/h", "/j")] * 5)
+        agree({"x.rv": text}, definitions(), [traffic_of(topic, one) for topic in ("/h", "/j")] * 5)
 
 
 @pytest.mark.parametrize("does", ["count = 3;", 'count = 3; } @fail { puts("never");', 'puts("came");'])
@@ -310,8 +312,7 @@ def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch:
     logic = f"fsm: one [ e -> other ] other [ e -> one ] {handler} }}" if handler else ""
     text = f"s() {{ event e(int count) /plain own/Plain '{{count:count}}' {{ {event} }} {logic} }}"
     monitored = Monitored({"x.rv": text}, definitions(), together=True)
-    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
-    batch = Traffic("/plain", (struct.pack("<I", len(body)) + body) * 50, 50)
+    batch = traffic_of("/plain", [plain(5)] * 50)
     for _ in range(2):  # the engine handles the first message, and the first change
         monitored.through(batch)
     asked = []
@@ -333,12 +334,9 @@ def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch:
 
 def test_a_change_by_several_monitors_counts_for_each() -> None:
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
-    quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
-    far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
-    frames = b"".join(struct.pack("<I", len(one)) + one for one in (far, body, body, quiet, far, quiet))
-    monitored = agree(
-        {"x.rv": HARD["who changes it differs"]}, definitions(), [Traffic("/plain", frames, 6)] * 50
-    )
+    quiet, far = plain(17, 2.0, 1), plain(5, 9.0, 2)
+    traffic = traffic_of("/plain", [far, body, body, quiet, far, quiet])
+    monitored = agree({"x.rv": HARD["who changes it differs"]}, definitions(), [traffic] * 50)
     assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
 
 
@@ -359,9 +357,7 @@ def test_a_defect_of_the_walk_is_reported_once_and_the_engine_goes_on(
     lane = monitored.set.lane("/plain")
     assert lane is not None
     monkeypatch.setattr(lane, "process_batch", defect)
-    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
-    frame = struct.pack("<I", len(body)) + body
-    changed = frame[:5] + struct.pack("<i", 3) + frame[9:]
+    frame, changed = encode_frame(plain(5)), encode_frame(plain(3))
     for _ in range(3):
         left = monitored.through(Traffic("/plain", frame * 6, 6))
         assert left == (6, changed * 6, changed)
@@ -410,8 +406,7 @@ def test_a_deadline_of_the_engine_is_over_before_the_next_message() -> None:
     monitored, passed = Monitored({"x.rv": text}, definitions(), together=True), []
     for milliseconds, count, messages in ((0, 5, 3), (1, 9, 1), (20, 5, 1)):
         monitored.time += milliseconds * 1_000_000
-        body = struct.pack("<BidfBII3qI", 1, count, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
-        passed.append(monitored.through(Traffic("/plain", encode_frame(body) * messages, messages))[0])
+        passed.append(monitored.through(traffic_of("/plain", [plain(count)] * messages))[0])
     assert passed == [3, 1, 0]
     monitored.close()
 

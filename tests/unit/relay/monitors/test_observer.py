@@ -1,4 +1,3 @@
-import struct
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,8 +7,8 @@ from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsRe
 from appliance.relay.monitors import observations
 from appliance.relay.monitors.observation_points import ObservationPoint
 from rosmop.tests.acting import message
-from rosmop.tests.random_specifications import Traffic, definitions
-from tests.unit.relay.monitors.test_batch_progress import Monitored
+from rosmop.tests.random_specifications import definitions
+from tests.unit.relay.monitors.test_batch_progress import Monitored, traffic_of
 
 COMMAND = "geometry_msgs/Twist"
 STOP = """stop() { std_msgs::String s; event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {
@@ -28,8 +27,7 @@ class Told:
 
     def send(self, *commands: tuple[float, float, float]) -> None:
         bodies = [message(COMMAND, linear__x=x, linear__y=y, angular__z=z) for x, y, z in commands]
-        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
-        self.monitored.through(Traffic("/cmd", frames, len(bodies)))
+        self.monitored.through(traffic_of("/cmd", bodies))
 
     def events(self, kind: str) -> list[MonitorEvent]:
         self.monitored.interceptor.tick()
@@ -119,8 +117,7 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
         message("geometry_msgs/PoseWithCovariance", covariance=[2.0 * (who >> bit & 1) for bit in range(36)])
         for who in range(256, 512)
     ]
-    frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
-    monitored.through(Traffic("/pose", frames, len(bodies)))
+    monitored.through(traffic_of("/pose", bodies))
     monitored.interceptor.tick()
     assert {row.name: row.changes for row in monitored.rows()} == dict.fromkeys(
         (f"m{bit}" for bit in range(8)), 128
@@ -156,8 +153,7 @@ def test_reports_name_publisher_and_message(together: bool, equal: bool) -> None
         frame = "m" * (3 if equal else seq)
         header |= {"header__seq": seq, "header__frame_id": frame}
         bodies.append(message("geometry_msgs/PoseStamped", **header))
-    frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
-    told.monitored.through(Traffic("/scan", frames, len(bodies)), first=101)
+    told.monitored.through(traffic_of("/scan", bodies), first=101)
     told.monitored.interceptor.tick()
     told.monitored.interceptor.observations.flush()
     found: list[Any] = [one for one in told.monitored.sent() if isinstance(one, MonitorEvent)]
