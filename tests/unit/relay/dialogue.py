@@ -29,6 +29,7 @@ A relay with monitors has more steps. Its specifications are in `SPECIFICATIONS`
     taken began=guard held= | refused ~text             the relay's answer
     event drop monitor=guard count=0 before=bad         an action of a monitor
     counts guard drops=1                                the counters of a monitor
+    appliance publishes /chatter stop                   a message of the appliance itself to a topic
     second held | second ends                           events are counted until the second ends
 """
 
@@ -39,13 +40,13 @@ from typing import Any, ClassVar
 from appliance.channel import messages
 from appliance.channel.messages import Message
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
-from tests.unit.relay.world import ASK, CALL, HEADER, LOOPBACK, Peer, World
+from tests.unit.relay.world import ASK, CALL, HEADER, LOOPBACK, SERVED, Peer, World
 
 
 class Dialogue:
     """Steps of control and peers in a world. `string` makes the frame of a word."""
 
-    served: ClassVar = {"callerid": "/talker", "type": "x/Y", "md5sum": "m"}
+    served: ClassVar = SERVED
     asked = ASK
     published = HEADER
 

@@ -121,11 +121,7 @@ def test_a_grant_costs_the_same_among_thousands() -> None:
 
 def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World) -> None:
     subscriber = world.connect(encode_header(ASK))
-    world.hears(UpstreamWanted)
-    world.state(UpstreamFound("k", "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
-    publisher = world.accept(world.publisher)
-    world.gets_header(publisher)
-    publisher.send(encode_header(HEADER) + encode_frame(b"one") + encode_frame(b"two")[:3])
+    publisher = world.upstream(behind=encode_frame(b"one") + encode_frame(b"two")[:3])
     publisher.send(encode_frame(b"two")[3:])
     world.gets_header(subscriber)
     world.gets(subscriber, encode_frame(b"one") + encode_frame(b"two"))
@@ -459,9 +455,7 @@ def test_memory_is_given_back(world: World) -> None:
 
 def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
     patient = World(replace(LIMITS, stall_seconds=1.0))
-    subscriber = patient.connect(encode_header(ASK))
-    publisher = patient.upstream()
-    patient.gets_header(subscriber)
+    publisher, subscriber = patient.subscribed()
     message = encode_frame(bytes(MIB))
     for start in range(0, MIB, MIB // 4):
         patient.push(publisher, message[start : start + MIB // 4])
@@ -473,11 +467,7 @@ def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
     lost = patient.hears(UpstreamLost)
     assert ("no data for 1 s" in lost.reason, lost.violation) == (True, "limit exceeded")
     assert patient.held == 0
-    client = patient.connect(encode_header(CALL))
-    service = patient.accept(patient.service)
-    patient.gets_header(service)
-    service.send(encode_header({"callerid": "/talker", "type": "x/Y", "md5sum": "m"}))
-    patient.gets_header(client)
+    client, _service = patient.call()
     patient.push(client, encode_frame(bytes(3 * MIB))[: 2 * MIB])
     patient.ends(client)
     assert "without progress" in patient.hears(ConnectionClosed).reason
@@ -535,9 +525,7 @@ def test_a_latched_message_that_waits_for_a_limit_counts_once(world: World) -> N
         return sum(row.messages for row in found)
 
     world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/slow", FlowLimit(messages=0.001)))
-    quick = world.connect(encode_header(ASK))
-    publisher = world.upstream(HEADER | {"latching": "1"})
-    world.gets_header(quick)
+    publisher, quick = world.subscribed(HEADER | {"latching": "1"})
     slow = world.connect(encode_header(ASK | {"callerid": "/slow"}))
     world.gets_header(slow)
     for text in (b"1", b"2", b"3", b"4"):
@@ -618,14 +606,8 @@ def test_a_flood_beyond_its_limit_delays_no_other_topic(world: World) -> None:
     world.state(NodePlaced("g", "/guest", "10.9.9.9"), listening)
     world.state(PublicationPlaced("g", "/flood", "*", FlowLimit(messages=10)))
     world.state(GrantInstalled("g", "/flood", LOOPBACK, "/listener"))
-    hearer = Peer(socket.create_connection(listening.getsockname()))
-    world.open.append(hearer.sock)
-    hearer.send(encode_header(ASK | {"topic": "/flood"}))
-    world.hears(UpstreamWanted, key="g")
-    world.state(UpstreamFound("g", "/flood", LOOPBACK, world.publisher.getsockname()[1]))
-    guest = world.accept(world.publisher)
-    world.gets_header(guest)
-    guest.send(encode_header(HEADER | {"topic": "/flood"}))
+    hearer = world.connect(encode_header(ASK | {"topic": "/flood"}), port=listening)
+    guest = world.upstream(HEADER | {"topic": "/flood"}, key="g")
     world.gets_header(hearer)
     began, flood, sent = world.loop.clock(), encode_frame(bytes(100)) * 10_000, 0
     for number in range(2000):
@@ -665,8 +647,7 @@ def test_a_service_that_is_busy_lets_its_client_wait_as_in_plain_ros(world: Worl
 @pytest.mark.parametrize("seed", range(20))
 def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
     world, order = World(), random.Random(seed)  # noqa: S311 - an order, no secret
-    peer = Peer(socket.create_connection(world.port.getsockname()))
-    world.open.append(peer.sock)
+    peer = world.connect()
     stated: list[Message] = []
 
     def state(message: Message) -> None:
@@ -718,11 +699,7 @@ TOO_LONG = struct.pack("<I", LIMITS.message_bytes + 1)
     ],
 )
 def test_a_call_ends_with_the_one_who_breaks_the_protocol(world: World, who: str, data: bytes) -> None:
-    client = world.connect(encode_header(CALL | {"persistent": "1"}))
-    service = world.accept(world.service)
-    world.gets_header(service)
-    service.send(encode_header({"md5sum": "m"}))
-    world.gets_header(client)
+    client, service = world.call({"md5sum": "m"}, persistent="1")
     if who == "service":
         client.send(encode_frame(b""))
         world.gets(service, encode_frame(b""))
@@ -839,9 +816,7 @@ def test_a_grant_is_compared_with_the_waiting_peers_of_its_host(
 
 def test_a_greeting_of_very_many_messages_ends_early(world: World) -> None:
     """The relay takes them one by one, in one turn."""
-    first = world.connect(encode_header(ASK))
-    publisher = world.upstream(HEADER | {"latching": "1"})
-    world.gets_header(first)
+    publisher, first = world.subscribed(HEADER | {"latching": "1"})
     publisher.send(encode_frame(b"a") + encode_frame(b"b"))
     world.gets(first, encode_frame(b"a") + encode_frame(b"b"))
     world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/second"))

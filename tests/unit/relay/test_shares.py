@@ -1,5 +1,4 @@
 import contextlib
-import socket
 from collections.abc import Iterator
 from dataclasses import replace
 from unittest.mock import Mock
@@ -13,9 +12,7 @@ from appliance.channel.messages import (
     LatchRefused,
     NodePlaced,
     PublicationPlaced,
-    UpstreamFound,
     UpstreamLost,
-    UpstreamWanted,
 )
 from appliance.relay.relay_limits import MIB
 from appliance.relay.transport.frames import FrameReceiver
@@ -53,14 +50,8 @@ def publish(world: World, number: int, host: str, header: dict[str, str] = HEADE
     world.state(NodePlaced(key, f"/guest{number}", host), listening)
     world.state(PublicationPlaced(key, "/chatter", "*"))
     world.state(GrantInstalled(key, "/chatter", LOOPBACK, "/listener"))
-    subscriber = Peer(socket.create_connection(listening.getsockname()))
-    world.open.append(subscriber.sock)
-    subscriber.send(encode_header(ASK))
-    world.hears(UpstreamWanted, key=key)
-    world.state(UpstreamFound(key, "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
-    publisher = world.accept(world.publisher)
-    world.gets_header(publisher)
-    publisher.send(encode_header(header))
+    subscriber = world.connect(encode_header(ASK), port=listening)
+    publisher = world.upstream(header, key=key)
     world.gets_header(subscriber)
     return publisher, subscriber
 
@@ -128,10 +119,7 @@ def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World)
     world.state(GrantInstalled("k", "/chatter", "127.0.0.2", "/stuck"))
     stuck = []
     for _ in range(40):
-        sock = socket.create_connection(world.port.getsockname(), source_address=("127.0.0.2", 0))
-        peer = Peer(sock)
-        world.open.append(sock)
-        peer.send(encode_header(ASK | {"callerid": "/stuck"}))
+        peer = world.connect(encode_header(ASK | {"callerid": "/stuck"}), host="127.0.0.2")
         world.gets_header(peer)
         stuck.append(peer)
     large = encode_frame(bytes(5 * MIB))
@@ -157,11 +145,7 @@ def test_a_service_call_may_be_as_large_as_a_message(world: World, part: str) ->
     large, small = bytes(14 * MIB), b"small"
     request, reply = (large, small) if part == "request" else (small, large)
     share = world.engine.memory.queues.of(LOOPBACK)
-    client = world.connect(encode_header(CALL | {"persistent": "1"}))
-    service = world.accept(world.service)
-    world.gets_header(service)
-    service.send(encode_header({"callerid": "/talker", "type": "x/Y", "md5sum": "m"}))
-    world.gets_header(client)
+    client, service = world.call(persistent="1")
     world.push(client, encode_frame(request))
     world.gets(service, encode_frame(request))
     world.push(service, encode_service_reply(reply))
@@ -180,10 +164,7 @@ def test_a_service_call_may_be_as_large_as_a_message(world: World, part: str) ->
 def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> None:
     unfinished = encode_header({"callerid": "/" + "x" * 30_000})[:-1]
     for number in range(100):
-        source = (f"127.0.1.{number + 1}", 0)
-        sock = socket.create_connection(world.port.getsockname(), source_address=source)
-        world.open.append(sock)
-        sock.send(unfinished)
+        world.connect(unfinished, host=f"127.0.1.{number + 1}")
         world.loop.turn(0.01)
     ours = world.connect(encode_header(ASK | {"filler": "x" * 30_000}))
     world.upstream()
@@ -224,8 +205,6 @@ def test_a_relay_without_memory_for_the_next_image_loses_its_publisher_alone(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FrameReceiver, "buffer", Mock(side_effect=LimitExceededError("no memory")))
-    subscriber = world.connect(encode_header(ASK))
-    publisher = world.upstream(LATCHED)  # the pump leaves it to Python
-    world.gets_header(subscriber)
+    publisher, _subscriber = world.subscribed(LATCHED)  # the pump leaves it to Python
     publisher.send(encode_frame(b"x"))
     assert world.hears(UpstreamLost).reason == "no memory"

@@ -5,8 +5,8 @@ import pytest
 
 from appliance.channel.messages import LookEnded, LookWanted, MessageSeen
 from appliance.relay.topic_taps import MAX_LOOKS, MAX_MESSAGES
-from roswire.tcpros import encode_frame, encode_header
-from tests.unit.relay.world import ASK, HEADER, Peer, World
+from roswire.tcpros import encode_frame
+from tests.unit.relay.world import HEADER, World
 
 pytestmark = pytest.mark.usefixtures("sockets")
 
@@ -33,15 +33,8 @@ def world() -> Iterator[World]:
     world.close()
 
 
-def subscribed(world: World) -> tuple[Peer, Peer]:
-    subscriber = world.connect(encode_header(ASK))
-    publisher = world.upstream(TOLD)
-    world.gets_header(subscriber)
-    return publisher, subscriber
-
-
 def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
-    publisher, subscriber = subscribed(world)
+    publisher, subscriber = world.subscribed(TOLD)
     world.state(LookWanted(1, "/chatter", 2, latched=True))
     frames = [encode_frame(text(word)) for word in ("one", "two", "three")]
     publisher.send(b"".join(frames))
@@ -64,9 +57,7 @@ def test_a_topic_without_subscribers_is_tapped(world: World) -> None:
 
 
 def test_the_latched_message_comes_first(world: World) -> None:
-    subscriber = world.connect(encode_header(ASK))
-    publisher = world.upstream(TOLD | {"latching": "1"})
-    world.gets_header(subscriber)
+    publisher, subscriber = world.subscribed(TOLD | {"latching": "1"})
     publisher.send(encode_frame(text("kept")))
     world.gets(subscriber, encode_frame(text("kept")))
     world.state(LookWanted(1, "/chatter", 1, latched=True))
@@ -79,7 +70,7 @@ def test_the_latched_message_comes_first(world: World) -> None:
 
 
 def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
-    publisher, _subscriber = subscribed(world)
+    publisher, _subscriber = world.subscribed(TOLD)
     world.state(LookWanted(1, "/chatter", 5, latched=True))
     publisher.send(encode_frame(text("one")))
     assert seen(world, "one").why == ""
@@ -93,9 +84,7 @@ def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
 
 @pytest.mark.parametrize("definition", ["", "no/such field", "string data\n" * 3, "std_msgs/String data\n"])
 def test_an_unreadable_definition_is_reported(world: World, definition: str) -> None:
-    subscriber = world.connect(encode_header(ASK))
-    publisher = world.upstream(HEADER | {"message_definition": definition})
-    world.gets_header(subscriber)
+    publisher, _subscriber = world.subscribed(HEADER | {"message_definition": definition})
     world.state(LookWanted(1, "/chatter", 1, latched=True))
     publisher.send(encode_frame(text("word")))
     shown = world.hears(MessageSeen)
@@ -104,14 +93,14 @@ def test_an_unreadable_definition_is_reported(world: World, definition: str) -> 
 
 
 def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None:
-    publisher, _subscriber = subscribed(world)
+    publisher, _subscriber = world.subscribed(TOLD)
     world.state(LookWanted(1, "/chatter", 1, latched=True))
     publisher.send(encode_frame(struct.pack("<I", 1 << 31) + b"x"))
     assert world.hears(MessageSeen).fields == {"data": "…"}
 
 
 def test_taps_are_few_and_end_with_control(world: World) -> None:
-    publisher, subscriber = subscribed(world)
+    publisher, subscriber = world.subscribed(TOLD)
     for number in range(MAX_LOOKS + 1):
         world.state(LookWanted(number, "/chatter", 1, latched=True))
     publisher.send(encode_frame(text("word")))

@@ -59,6 +59,7 @@ HEADER = {
 }
 ASK = {"callerid": "/listener", "topic": "/chatter", "type": "std_msgs/String", "md5sum": "m"}
 CALL = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
+SERVED = {"callerid": "/talker", "type": "x/Y", "md5sum": "m"}
 
 
 class Peer:
@@ -201,8 +202,8 @@ class World:
         self.told.remove(found)
         return found
 
-    def connect(self, *parts: bytes, host: str = LOOPBACK) -> Peer:
-        where = (LOOPBACK, self.port.getsockname()[1])
+    def connect(self, *parts: bytes, host: str = LOOPBACK, port: socket.socket | None = None) -> Peer:
+        where = (LOOPBACK, (port or self.port).getsockname()[1])
         peer = Peer(socket.create_connection(where, source_address=(host, 0)))
         self.open.append(peer.sock)
         for part in parts:
@@ -261,20 +262,34 @@ class World:
         self.until(ended)
         return bytes(peer.data)
 
-    def upstream(self, header: dict[str, str] = HEADER, md5sum: str = "*") -> Peer:
-        self.hears(UpstreamWanted, key="k", topic="/chatter")
-        self.state(UpstreamFound("k", "/chatter", LOOPBACK, self.publisher.getsockname()[1]))
+    def upstream(
+        self, header: dict[str, str] = HEADER, md5sum: str = "*", *, key: str = "k", behind: bytes = b""
+    ) -> Peer:
+        """Let the publisher of the topic answer the relay with `header`, and send what is `behind` it at once."""
+        topic = header.get("topic", "/chatter")
+        self.hears(UpstreamWanted, key=key, topic=topic)
+        self.state(UpstreamFound(key, topic, LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)
         asked = self.gets_header(peer)
-        assert (asked["topic"], asked["md5sum"], asked["callerid"]) == ("/chatter", md5sum, "/rosrv")
-        peer.send(encode_header(header))
+        assert (asked["topic"], asked["md5sum"], asked["callerid"]) == (topic, md5sum, "/rosrv")
+        peer.send(encode_header(header) + behind)
         return peer
 
-    def subscribed(self) -> tuple[Peer, Peer]:
+    def subscribed(self, header: dict[str, str] = HEADER) -> tuple[Peer, Peer]:
+        """Connect a subscriber and the publisher with `header`."""
         subscriber = self.connect(encode_header(ASK))
-        publisher = self.upstream()
-        assert self.gets_header(subscriber) == HEADER
+        publisher = self.upstream(header)
+        assert self.gets_header(subscriber) == header
         return publisher, subscriber
+
+    def call(self, header: dict[str, str] = SERVED, **fields: str) -> tuple[Peer, Peer]:
+        """Connect a client, with these `fields` beside those of `CALL`, and the service with `header`."""
+        client = self.connect(encode_header(CALL | fields))
+        service = self.accept(self.service)
+        self.gets_header(service)
+        service.send(encode_header(header))
+        assert self.gets_header(client)["md5sum"] == header["md5sum"]
+        return client, service
 
     def close(self) -> None:
         self.engine.close()

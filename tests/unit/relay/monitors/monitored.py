@@ -6,6 +6,7 @@ from appliance.channel.messages import (
     MonitorEvent,
     MonitorsCounted,
     MonitorsReported,
+    OwnPublished,
     SpecificationsRefused,
     SpecificationsTaken,
 )
@@ -34,6 +35,8 @@ guard() {
 """
 BEGINNING = GUARD.replace("guard()", "begin guard()")
 """Like `GUARD`, but it does not hold its topics when its state is lost."""
+SAFE = 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
+STOPPING = GUARD.strip().replace("int seen", SAFE)
 
 
 def string(text: str) -> bytes:
@@ -98,6 +101,7 @@ OTHER = "other() { event e() /elsewhere std_msgs/String '{}' { } }"
 SPECIFICATIONS = {
     "GUARD": GUARD.strip(),
     "BEGINNING": BEGINNING.strip(),
+    "STOPPING": STOPPING,
     "LATCH": LATCH,
     "OTHER": OTHER,
     "OTHER-HELD": "hold " + OTHER.replace("{ }", "{ return; }"),
@@ -120,6 +124,8 @@ SPECIFICATIONS = {
         pattern: globally: e causes done within 10ms enforced by warn @violation { } }""",
     "SERVICE": """s() { event ask(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } }
         event told(std::string m) service /mode std_srvs/SetBool response '{message:m}' { m = "changed"; } }""",
+    "BUTTON": """latch() { event press() /chatter std_msgs/String '{}' { }
+        fsm : start [ press -> pressed ] pressed [ press -> pressed ] @pressed { ROS_ERROR("pressed"); } }""",
     "nonsense": "nonsense",
 }
 
@@ -180,6 +186,9 @@ class MonitoredDialogue(Dialogue):
         row = next(row for row in reversed(counted) if row.name == name)
         assert agrees(row, words), row
 
+    def _appliance(self, _publishes: str, topic: str, word: str) -> None:
+        self.world.state(OwnPublished(topic, self.string(word)[4:]))
+
     def _second(self, word: str) -> None:
         interceptor = self.world.engine.interceptor
         if word == "held":
@@ -197,7 +206,8 @@ class MonitoredDialogue(Dialogue):
 
 def _text(word: str) -> str:
     """Return a specification. `NAME|old|new` replaces text, and the prefix `hold:` lets it hold its topics."""
-    name, *change = word.removeprefix("hold:").split("|")
+    name, *changes = word.removeprefix("hold:").split("|")
     text = SPECIFICATIONS.get(name, name)
-    text = text.replace(*change) if change else text  # type: ignore[arg-type]  # two texts
+    for old, new in zip(changes[::2], changes[1::2], strict=True):
+        text = text.replace(old, new)
     return f"hold {text}" if word.startswith("hold:") else text

@@ -2,7 +2,7 @@ import gc
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,6 @@ from appliance.channel.messages import (
     MessagesLimited,
     MonitorGiven,
     MonitorResumed,
-    MonitorsCounted,
-    MonitorsReported,
     MonitorSwitched,
     NodePlaced,
     OwnPublished,
@@ -31,10 +29,8 @@ from appliance.channel.messages import (
     SpecificationsRefused,
     SpecificationsTaken,
     StateGiven,
-    StopBegun,
     StopWanted,
     TrafficReported,
-    UpstreamFound,
     UpstreamWanted,
 )
 from appliance.relay.connections.relayed_topic import RelayedTopic
@@ -51,7 +47,8 @@ from tests.unit.relay.monitors.monitored import (
     COSTLY,
     GUARD,
     LATCH,
-    SET_BOOL_MD5,
+    SAFE,
+    STOPPING,
     STRING_MD5,
     TYPED,
     WANTED,
@@ -92,8 +89,6 @@ def passes_by(relayed: RelayedTopic) -> bool:
     return simple is not None and simple[1] is None
 
 
-SAFE = 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
-STOPPING = GUARD.strip().replace("int seen", SAFE)
 TWIST = """a() { event e(double x) /cmd_vel geometry_msgs/Twist '{linear:{x:x}}' { } }"""
 
 
@@ -270,18 +265,6 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
     world.gets(subscriber, string("b"))
 
 
-def test_a_large_message_goes_through_a_monitor(world: Monitored) -> None:
-    spec = GUARD.replace('text == "bad"', "text.size() == 300000").replace(
-        'text == "one"', "text.size() == 400000"
-    )
-    world.load(spec)
-    publisher, subscriber = world.typed()
-    for size, back in ((300_000, None), (400_000, "two"), (500_000, "x" * 500_000)):
-        world.push(publisher, string("x" * size))
-        if back is not None:
-            world.gets(subscriber, string(back))
-
-
 def own_publication(world: Monitored, topic: str, limit: FlowLimit = UNLIMITED) -> socket.socket:
     """Let the appliance publish a topic; return where a subscriber connects."""
     port = world.listen()
@@ -320,41 +303,8 @@ def test_publications_of_monitors_are_served_and_not_monitored(world: Monitored)
     assert world.event("publish", resource="/alarm").monitor == "alarm"
 
 
-BUTTON = """
-latch() {
-    event press() /mode std_msgs/String '{}' { }
-    fsm : start [ press -> pressed ] pressed [ press -> pressed ]
-    @pressed { ROS_ERROR("pressed"); }
-}
-"""
-
-
-def test_a_verdict_is_reported_with_its_property_logic_and_category(world: Monitored) -> None:
-    world.load(BUTTON.replace("/mode", "/chatter"))
-    publisher, subscriber = world.typed()
-    publisher.send(string("a") * 3)
-    world.gets(subscriber, string("a") * 3)
-    verdict = world.event("verdict", monitor="latch", count=0)
-    assert verdict.detail["logic"] == "fsm"
-    assert verdict.detail["category"] == "pressed"
-    again = world.event("verdict", count=2)
-    assert (again.monitor, again.text, again.detail["category"]) == ("latch", verdict.text, "pressed")
-
-    def counted() -> Any:
-        rows = [row for one in world.told if isinstance(one, MonitorsCounted) for row in one.rows]
-        return [row for row in rows if (row.events, row.verdicts) == (3, 3)]
-
-    world.until(counted)
-
-
-def _called(world: Monitored, persistent: bool = True) -> tuple[Peer, Peer]:
-    fields = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
-    client = world.connect(encode_header(fields | ({"persistent": "1"} if persistent else {})))
-    service = world.accept(world.service)
-    world.gets_header(service)
-    service.send(encode_header({"callerid": "/talker", "type": "std_srvs/SetBool", "md5sum": SET_BOOL_MD5}))
-    assert world.gets_header(client)["md5sum"] == SET_BOOL_MD5
-    return client, service
+def _called(world: Monitored) -> tuple[Peer, Peer]:
+    return world.call(MonitoredDialogue.served, persistent="1")
 
 
 class Killed(BaseException):
@@ -480,24 +430,6 @@ def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> N
     assert sorted(set(marks)) == sorted(["", "0", "1", "2", "3", "6"])
 
 
-def test_a_replaced_monitor_counts_from_zero(world: Monitored) -> None:
-    other = "other() { event e() /chatter std_msgs/String '{}' { } }"
-    world.load(other, GUARD)
-    publisher, subscriber = world.typed()
-    for text in ("one", "one", "bad"):
-        publisher.send(string(text))
-    world.until(lambda: data_of(subscriber).count(b"two") == 2)
-    world.load(other, BEGINNING.replace("a longer text", "another text"), revision=2)
-    publisher.send(string("one"))
-
-    def counted() -> dict[str, tuple[int, int, int]]:
-        found = [message.rows for message in world.told if isinstance(message, MonitorsCounted)]
-        return {row.name: (row.events, row.changes, row.drops) for row in found[-1]} if found else {}
-
-    world.until(lambda: counted().get("guard", (0, 0, 0))[0] == 1)
-    assert counted() == {"guard": (1, 1, 0), "other": (4, 0, 0)}
-
-
 def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_declared_so(
     world: Monitored,
 ) -> None:
@@ -589,30 +521,6 @@ def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: 
     world.gets(subscriber, string("6"))
 
 
-def test_a_guard_sends_its_safe_message_when_it_is_ordered_and_not_when_it_is_asked(world: Monitored) -> None:
-    world.load(STOPPING)
-    publisher, subscriber = world.typed()
-    publisher.send(string("one"))
-    world.gets(subscriber, string("two"))
-    world.state(StopWanted(1, "/chatter", begin=False))
-    world.state(StopWanted(2, "/other", begin=True))
-    publisher.send(string("one"))
-    world.gets(subscriber, string("two"))
-    answers = [one.monitors for one in world.told if isinstance(one, StopBegun)]
-    assert answers == [["guard"], []]
-    assert {one.kind for told in world.told if isinstance(told, MonitorsReported) for one in told.events} <= {
-        "change"
-    }
-    world.state(StopWanted(3, "/chatter", begin=True))
-    assert string("stop").endswith(world.event("publish", monitor="guard").after)
-    world.gets(subscriber, string("stop"))
-    publisher.send(string("a"))
-    world.gets(subscriber, string("a"))
-    world.state(OwnPublished("/chatter", string("no stop")[4:]))
-    publisher.send(string("b"))
-    world.gets(subscriber, string("b"))
-
-
 def test_a_base_that_reconnects_after_a_stop_does_not_get_the_latched_motion(world: Monitored) -> None:
     world.load(STOPPING)
     publisher = world.upstream(header := TYPED | {"latching": "1"})
@@ -634,23 +542,9 @@ def latching_client(world: Monitored, topic: str) -> tuple[Peer, Peer]:
     world.state(PublicationPlaced("k", topic, "*"))
     world.state(GrantInstalled("k", topic, LOOPBACK, "/listener"))
     server = world.connect(encode_header(WANTED | names))
-    world.hears(UpstreamWanted, key="k", topic=topic)
-    world.state(UpstreamFound("k", topic, LOOPBACK, world.publisher.getsockname()[1]))
-    publisher = world.accept(world.publisher)
-    world.gets_header(publisher)
-    publisher.send(encode_header(TYPED | names | {"latching": "1"}))
+    publisher = world.upstream(TYPED | names | {"latching": "1"})
     world.gets_header(server)
     return publisher, server
-
-
-def connected_again(world: Monitored, topic: str, header: Mapping[str, str], *frames: bytes) -> Peer:
-    """Let the publisher of `topic` connect again, and send these frames at once."""
-    world.hears(UpstreamWanted, key="k", topic=topic)
-    world.state(UpstreamFound("k", topic, LOOPBACK, world.publisher.getsockname()[1]))
-    publisher = world.accept(world.publisher)
-    world.gets_header(publisher)
-    publisher.send(encode_header({**TYPED, "topic": topic, **header}) + b"".join(frames))
-    return publisher
 
 
 def quiet(world: Monitored) -> None:
@@ -702,7 +596,7 @@ def test_a_latched_command_is_new_only_on_the_first_connection(
     world.until(lambda: string("before") in data_of(base))
     base.data.clear()
     publisher.sock.close()
-    publisher = connected_again(world, topic, {"latching": "1"}, string(replayed))
+    publisher = world.upstream(TYPED | {"topic": topic, "latching": "1"}, behind=string(replayed))
     passes = replayed == "stop" and topic == "/chatter"
     if passes:
         world.gets(base, string("stop"))
@@ -735,7 +629,7 @@ def test_a_guard_that_was_removed_still_has_its_stop_in_force(world: Monitored, 
         publisher.send(string("back"))
         world.gets(late, string("back"))
     publisher.sock.close()
-    publisher = connected_again(world, "/chatter", {"latching": "1"}, string("back"))
+    publisher = world.upstream(TYPED | {"latching": "1"}, behind=string("back"))
     assert "send it again" in world.event("drop").text
     quiet(world)
     publisher.send(string("new"))
@@ -748,7 +642,7 @@ def test_without_a_guard_a_latched_command_is_sent_again(world: Monitored) -> No
     publisher.send(string("before"))
     world.gets(base, string("before"))
     publisher.sock.close()
-    connected_again(world, "/chatter", {"latching": "1"}, string("before"))
+    world.upstream(TYPED | {"latching": "1"}, behind=string("before"))
     world.gets(base, string("before"))
 
 
@@ -763,11 +657,11 @@ def test_a_publisher_that_returns_with_another_type_is_refused_while_a_guard_is_
     publisher.send(string("before"))
     world.until(lambda: data_of(base).endswith(string("before")))
     publisher.sock.close()
-    connected_again(world, "/chatter", other, string("other"))
+    world.upstream(TYPED | other, behind=string("other"))
     assert "std_msgs/Int32" in world.hears(PublicationRefused, key="k", resource="/chatter").reason
     assert string("other") not in data_of(base)
     OFF[off](world, text)
-    connected_again(world, "/chatter", other)
+    world.upstream(TYPED | other)
     cut = world.hears(ConnectionClosed)  # the base has to read the new header
     assert cut.reason == "the publisher returned with a different type"
 
@@ -802,18 +696,6 @@ def test_a_server_that_connects_again_does_not_get_a_cancelled_goal(world: Monit
     world.gets_header(late)
     publisher.send(string("two"))
     world.gets(late, string("two"))
-
-
-def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
-    world.load(STOPPING)
-    publisher, subscriber = world.typed()
-    publisher.send(string("one"))
-    world.gets(subscriber, string("two"))
-    taken = world.load(STOPPING.replace("longer", "wider"), revision=2)
-    assert taken.held == ["guard"]
-    publisher.send(string("one") + string("stop"))
-    world.until(lambda: len(data_of(subscriber)) >= len(string("stop")) * 2)
-    assert not subscriber.data.replace(string("stop"), b"")
 
 
 LONG = "n" * 30_000
