@@ -1,6 +1,7 @@
 import itertools
 import struct
 from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -147,6 +148,14 @@ class Story:
         return member
 
 
+def connected(topic: str = "/chatter", *, latching: str = "0", **given: Any) -> tuple[Story, RecordedMember]:
+    """Return a topic whose publisher came after this first subscriber."""
+    story = Story(topic, **given)
+    member = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": latching})
+    return story, member
+
+
 def greeting(story: Story) -> bool:
     """Let two seconds pass; return whether the publisher was asked to greet."""
     story.upstream.asked.clear()
@@ -179,9 +188,7 @@ def test_a_publisher_greets_later_subscribers_alone() -> None:
 
 
 def test_a_publisher_that_does_not_greet_is_asked_once_a_minute() -> None:
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER)
+    story, _member = connected()
     asked = 0
     for _second in range(200):  # a subscriber that joins and leaves
         story.upstream.asked.clear()
@@ -196,9 +203,7 @@ def test_a_publisher_that_does_not_greet_is_asked_once_a_minute() -> None:
 
 
 def test_a_subscriber_that_got_no_greeting_has_a_part_in_the_next_one() -> None:
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER)
+    story, _member = connected()
     late, left = story.join("/late"), story.join("/left")
     assert greeting(story)
     story.upstream.greeted(b"")
@@ -211,9 +216,7 @@ def test_a_subscriber_that_got_no_greeting_has_a_part_in_the_next_one() -> None:
 
 def test_subscribers_of_a_publisher_that_does_not_greet_are_asked_for_twice() -> None:
     """Each request is a connection of two seconds."""
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER)
+    story, _member = connected()
     story.join("/late")
     asked = 0
     for _second in range(600):
@@ -281,9 +284,7 @@ def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
 
 
 def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later() -> None:
-    story = Story()
-    member = story.join()
-    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story, member = connected(latching="1")
     story.receive(batch(b"1"))
     story.topic.tidy()
     assert member.received == bytes(batch(b"1").view)
@@ -389,9 +390,7 @@ def test_a_latched_message_is_asked_for_again_if_the_last_one_was_held_back(
 
 
 def test_messages_of_monitors_are_counted() -> None:
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER)
+    story, _member = connected()
     story.topic.traffic()
     story.topic.published(batch(b"stop"))
     row = story.topic.traffic()
@@ -509,9 +508,7 @@ def test_a_stop_that_a_subscribers_limit_kept_from_it_comes_later() -> None:
 
 
 def test_a_stop_for_which_there_is_no_memory_is_sent_and_not_repeated() -> None:
-    story = Story(memory=100)
-    base = story.join()
-    story.topic.upstream_opened(HEADER)
+    story, base = connected(memory=100)
     story.share.add(100)
     story.receive(batch(b"forward"))
     story.topic.supersede(b"stop")
@@ -604,9 +601,7 @@ def test_first_messages_without_subscribers_are_dropped_soon() -> None:
 
 
 def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
-    story = Story(memory=100)
-    early = story.join()
-    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story, early = connected(memory=100, latching="1")
     story.share.add(50)
     for _ in range(2):
         story.receive(batch(bytes(60)))
@@ -786,9 +781,7 @@ def test_only_stops_among_latched_commands_pass_on_a_later_connection(
 
 def test_a_stream_of_commands_passes_a_second_after_its_connection() -> None:
     """Its publisher latches, and is never quiet."""
-    story = Story("/arm/goal", fresh=False, replayed=lambda _topic, _body: False)
-    base = story.join()
-    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story, base = connected("/arm/goal", fresh=False, replayed=lambda _topic, _body: False, latching="1")
     for number in range(60):
         story.receive(batch(b"%d" % number))
         story.now += 0.02
@@ -809,9 +802,7 @@ def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscr
 
 
 def test_a_latched_message_is_forgotten_with_the_connection() -> None:
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story, _member = connected(latching="1")
     story.receive(batch(b"1"))
     story.receive(batch(b"12"))
     assert story.share.used == len(batch(b"12").view)
@@ -821,9 +812,7 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
 
 
 def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
-    story = Story()
-    first = story.join()
-    story.topic.upstream_opened(HEADER)
+    story, first = connected()
     story.topic.upstream_closed()
     story.topic.leave(first)
     late = story.join()
@@ -856,9 +845,7 @@ def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
 
 
 def test_a_stuck_subscriber_is_not_waited_for() -> None:
-    story = Story()
-    member = story.join()
-    story.topic.upstream_opened(HEADER)
+    story, member = connected()
     story.topic.traffic()
     member.behind_since, story.now = 99.95, 100.0  # its grace has just ended
     story.receive(batch(b"1"))
@@ -879,9 +866,7 @@ def test_traffic_is_reported_once() -> None:
 
 
 def test_delays_of_a_later_turn_are_reported_without_new_messages() -> None:
-    story = Story()
-    story.join()
-    story.topic.upstream_opened(HEADER)
+    story, _member = connected()
     story.receive(batch(b"1"))
     story.topic.traffic()
     story.topic.go_on(batch(b"3"), story.now)
