@@ -19,10 +19,16 @@ from tests.support.virtual_clock import ShiftedClock
 pytestmark = pytest.mark.anyio
 
 
-async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
+async def with_a_node() -> tuple[ControlParts, Incarnation]:
+    """Return a world with a node `/n`, which publishes /a."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
+    return world, node
+
+
+async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
+    world, node = await with_a_node()
     world.nodes.silent = {"/n"}
     await world.look(node)
     with using(ShiftedClock(365 * 86_400)):
@@ -34,9 +40,7 @@ async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
 
 async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(liveness, "RECENTLY_LOST_SECONDS", 0.0)
-    world = await ControlParts.begun()
-    node = world.node("/n")
-    await world.register(node, Kind.PUBLICATION, "/a")
+    world, node = await with_a_node()
     world.nodes.silent = {"/n"}
     await world.look(node)
     assert world.lives == [Life.SHADOW]
@@ -110,9 +114,7 @@ async def test_a_node_that_returns_during_its_removal_is_registered_again() -> N
 
 
 async def test_a_node_that_returns_to_a_new_master_is_restored_by_the_rebuild() -> None:
-    world = await ControlParts.begun()
-    node = world.node("/n")
-    await world.register(node, Kind.PUBLICATION, "/a")
+    world, node = await with_a_node()
     world.nodes.silent = {"/n"}
     await world.look(node)
     world.rosmaster.shut()
@@ -289,9 +291,7 @@ def _replies(status: str, body: bytes) -> bytes:
     ids=["process", "failure", "nothing", "fault", "501", "html", "silence"],
 )
 async def test_only_silence_refusal_and_another_program_lose_a_node(reply: bytes | None, stays: bool) -> None:
-    world = await ControlParts.begun()
-    node = world.node("/n")
-    await world.register(node, Kind.PUBLICATION, "/a")
+    world, node = await with_a_node()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"</methodCall>")
@@ -322,9 +322,7 @@ async def test_a_node_that_may_live_is_registered_again_for_a_day(
 ) -> None:
     """A laptop is suspended over lunch, or a robot drives out of reach: their nodes never register again."""
     monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
-    world = await ControlParts.begun()
-    node = world.node("/n")
-    await world.register(node, Kind.PUBLICATION, "/a")
+    world, node = await with_a_node()
     await world.look(node)
     answers, world.nodes.answer = world.nodes.answer, answer
     await world.look(node)
