@@ -6,16 +6,18 @@
 The programs in `rospy_nodes/` and `roscpp_nodes/` print the same events.
 """
 
+import contextlib
 import fcntl
 import functools
+import json
 import os
 import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from tests.support import forks
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
@@ -34,6 +36,24 @@ _IN_ITS_OWN_WAY = re.compile(
     r"Current thread.*in signal_shutdown.*in _ros_signal.*(in (publish|_ros_atexit)|/logging/__init__\.py)",
     re.DOTALL,
 )
+
+
+@contextlib.contextmanager
+def answering(*arguments: str) -> Iterator[Callable[[Any], Any]]:
+    """Run a program of ROS's Python that answers each line of JSON with one."""
+    command = [PYTHON, *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        to_program, from_program = process.stdin, process.stdout
+
+        def ask(question: Any) -> Any:
+            to_program.write(json.dumps(question) + "\n")
+            to_program.flush()
+            return json.loads(from_program.readline())
+
+        yield ask
+        to_program.close()
 
 
 class RosSession:

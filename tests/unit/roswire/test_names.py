@@ -1,5 +1,3 @@
-import json
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,9 +8,10 @@ from hypothesis import strategies as st
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError
 from tests.support.examples import examples
+from tests.support.nodes import answering
 from tests.unit.roswire.tables import rows
 
-Oracle = Callable[[str, str], tuple[str, str | None]]
+Oracle = Callable[[str, str], list[str | None]]
 
 NODE_IDS = st.sampled_from(["", "/talker", "/ns/talker", "/a/b/c", "/_x/1y"])
 CALLER_IDS = st.one_of(NODE_IDS, st.just("/rosparam-4711"))
@@ -21,22 +20,8 @@ NAME_LIKE = st.text(alphabet="aZ0_/~.- :\n\u00e9\u0430", max_size=12)
 
 @pytest.fixture(scope="module")
 def rosmaster() -> Iterator[Oracle]:
-    script = Path(__file__).with_name("rosgraph_names.py")
-    with subprocess.Popen(
-        ["/usr/bin/python3", str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        to_oracle, from_oracle = process.stdin, process.stdout
-
-        def resolve(name: str, caller_id: str) -> tuple[str, str | None]:
-            to_oracle.write(json.dumps([name, caller_id]) + "\n")
-            to_oracle.flush()
-            resolved, topic = json.loads(from_oracle.readline())
-            return resolved, topic
-
-        yield resolve
-        to_oracle.close()
+    with answering(str(Path(__file__).with_name("rosgraph_names.py"))) as ask:
+        yield lambda name, caller_id: ask([name, caller_id])
 
 
 @pytest.mark.nightly
@@ -47,7 +32,7 @@ def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: 
         resolved = names.resolve(name, caller_id)
     except InvalidNameError:
         return
-    assert rosmaster(name, caller_id) == (resolved, resolved)
+    assert rosmaster(name, caller_id) == [resolved, resolved]
     assert names.is_global_name(resolved)
     assert names.resolve(resolved, "/other/node") == resolved
 

@@ -5,6 +5,7 @@ import copy
 import ipaddress
 import json
 import subprocess
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -25,7 +26,7 @@ from tests.support import autojump
 from tests.support.control_parts import OPEN, ControlParts
 from tests.support.core import FakeTrail
 from tests.support.examples import examples
-from tests.support.nodes import PYTHON
+from tests.support.nodes import PYTHON, answering
 from tests.support.parameters import mirror, put
 
 pytestmark = pytest.mark.anyio
@@ -63,28 +64,22 @@ STEP = st.one_of(st.tuples(st.just("set"), KEY, VALUE), st.tuples(st.just("delet
 
 
 @pytest.fixture(scope="module")
-def oracle() -> Any:
-    with subprocess.Popen(
-        [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
+def oracle() -> Iterator[Callable[[Any], Any]]:
+    with answering("-c", ORACLE) as ask:
+        yield ask
 
 
 @pytest.mark.nightly
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEP, max_size=12))
-def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) -> None:
-    oracle.stdin.write(json.dumps(steps) + "\n")
-    oracle.stdin.flush()
+def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Callable[[Any], Any], steps: list[Any]) -> None:
     there = mirror()
     for do, key, value in json.loads(json.dumps(steps)):
         if do == "set":
             put(there, key, value, HOST)
         else:
             there.delete(key)
-    assert there.tree == json.loads(oracle.stdout.readline())
+    assert there.tree == oracle(steps)
     assert there.weight == measure(there.tree)[0]
 
 

@@ -1,7 +1,7 @@
 import asyncio
 import copy
 import json
-import subprocess
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -13,7 +13,7 @@ from appliance.master.reconcile.subscribers import settled, updates_of
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, ControlParts
 from tests.support.examples import examples
-from tests.support.nodes import PYTHON
+from tests.support.nodes import answering
 
 ORACLE = """
 import json, sys
@@ -39,13 +39,9 @@ SUBSCRIBED = st.lists(st.tuples(CALLER, KEY), max_size=8, unique=True)
 
 
 @pytest.fixture(scope="module")
-def oracle() -> Any:
-    with subprocess.Popen(
-        [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
+def oracle() -> Iterator[Callable[[Any], Any]]:
+    with answering("-c", ORACLE) as ask:
+        yield ask
 
 
 def in_order(told: list[Any]) -> list[str]:
@@ -61,11 +57,9 @@ def in_order(told: list[Any]) -> list[str]:
     st.one_of(CALLER, st.none()),
 )
 def test_updates_equal_those_of_a_plain_master(
-    oracle: Any, subscribed: list[tuple[str, str]], key: str, value: Any, caller: str | None
+    oracle: Callable[[Any], Any], subscribed: list[tuple[str, str]], key: str, value: Any, caller: str | None
 ) -> None:
     value = {} if caller is None else value  # deleted
-    oracle.stdin.write(json.dumps([subscribed, key, value, caller]) + "\n")
-    oracle.stdin.flush()
     below = sorted({one for _, one in subscribed if one != key and one.startswith(key.rstrip("/") + "/")})
     told = [
         [name, f"{update.key.rstrip('/')}/", update.value]
@@ -73,7 +67,7 @@ def test_updates_equal_those_of_a_plain_master(
         for name, one in subscribed
         if one == update.subscribed and not (update.key == key and name == caller)
     ]
-    assert in_order(told) == in_order(json.loads(oracle.stdout.readline()))
+    assert in_order(told) == in_order(oracle([subscribed, key, value, caller]))
 
 
 @given(
