@@ -23,6 +23,9 @@ from appliance.network.firewall.firewall_rules import (
     inner_port,
 )
 
+OWN_NODE = OwnNodeAccess(
+    uid=61018, relay_uid=61013, address="127.87.79.1", ports=PortRange(900, 963), master_port=5555
+)
 FULL = FirewallSettings(
     control_uid=61011,
     rosmaster_uid=61012,
@@ -32,12 +35,10 @@ FULL = FirewallSettings(
     api_port=8443,
     api_networks=("10.0.0.0/8", "fd00::/8"),
     tunnel_only=("10.9.9.1", "fd77::1"),
-    own_node=OwnNodeAccess(
-        uid=61018, relay_uid=61013, address="127.87.79.1", ports=PortRange(900, 963), master_port=5555
-    ),
+    own_node=OWN_NODE,
 )
-
-
+BARE = FirewallSettings(control_uid=1, rosmaster_uid=2, new_connections=None)
+DROPPED = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
 DOORS = OwnNetworkAccess("198.19.240.0/20", relay_uid=61013)
 
 
@@ -109,8 +110,7 @@ def test_the_owner_passes_before_all_others_are_refused() -> None:
 
 
 def test_unknown_ports_and_empty_lists_make_no_rule() -> None:
-    bare = FirewallSettings(control_uid=1, rosmaster_uid=2, new_connections=None)
-    assert appliance_rules(bare) == ()
+    assert appliance_rules(BARE) == ()
 
 
 def test_an_address_of_the_machine_is_for_its_own_packets() -> None:
@@ -125,10 +125,7 @@ def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
     first, second = appliance_rules(FULL)[:2]
     assert (first.source, first.clear_text, first.verdict) == ("10.9.9.1", True, PacketVerdict.DROP)
     assert (second.destination, second.clear_text, second.chain) == ("10.9.9.1", True, Chain.OUT)
-    on_interface = FirewallSettings(
-        control_uid=1, rosmaster_uid=2, tunnel_only=("10.9.9.1",), tunnel_interface="ipsec0"
-    )
-    first, second = appliance_rules(on_interface)[:2]
+    first, second = appliance_rules(replace(BARE, tunnel_only=("10.9.9.1",), tunnel_interface="ipsec0"))
     assert (first.arrives_on, first.clear_text) == (Interface("ipsec0", other=True), False)
     assert (second.leaves_on, second.clear_text) == (Interface("ipsec0", other=True), False)
 
@@ -151,10 +148,8 @@ def test_purposes_tell_rules_of_a_chain_apart() -> None:
 
 
 def test_families_follow_the_addresses() -> None:
-    assert PacketRule(
-        chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP, source="fd00::/8"
-    ).families() == (6,)
-    assert PacketRule(chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP).families() == (4, 6)
+    assert replace(DROPPED, source="fd00::/8").families() == (6,)
+    assert DROPPED.families() == (4, 6)
     assert family_of("10.0.0.0/8") == 4
 
 
@@ -165,33 +160,15 @@ def test_families_follow_the_addresses() -> None:
         (lambda: PortRange(9, 5), "9-5 is not a range"),
         (lambda: PortRange(1, 65536), "1-65536 is not a range"),
         (lambda: RateLimit(0, 5), "1 to 100000"),
-        (lambda: FirewallSettings(control_uid=-1, rosmaster_uid=2), "control_uid -1"),
-        (lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=70000), "70000"),
-        (
-            lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, api_networks=("ten",)),
-            "'ten' is not an address",
-        ),
-        (
-            lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, tunnel_only=("10.0.0.1/8",)),
-            "'10.0.0.1/8' is not an address",
-        ),
-        (
-            lambda: OwnNodeAccess(uid=-1, relay_uid=1, address="127.0.0.9", ports=PortRange.one(9)),
-            "own node: -1",
-        ),
-        (
-            lambda: OwnNodeAccess(uid=1, relay_uid=1, address="here", ports=PortRange.one(9)),
-            "'here' is not an address",
-        ),
-        (
-            lambda: PacketRule(chain=Chain.IN, purpose="x", verdict=PacketVerdict.RESET),
-            "only TCP can be reset",
-        ),
-        (lambda: PacketRule(chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP, uid=5), "has an owner"),
-        (
-            lambda: PacketRule(chain=Chain.NAT, purpose="x", verdict=PacketVerdict.DNAT),
-            "DNAT and its address",
-        ),
+        (lambda: replace(BARE, control_uid=-1), "control_uid -1"),
+        (lambda: replace(BARE, rosmaster_port=70000), "70000"),
+        (lambda: replace(BARE, api_networks=("ten",)), "'ten' is not an address"),
+        (lambda: replace(BARE, tunnel_only=("10.0.0.1/8",)), "'10.0.0.1/8' is not an address"),
+        (lambda: replace(OWN_NODE, uid=-1), "own node: -1"),
+        (lambda: replace(OWN_NODE, address="here"), "'here' is not an address"),
+        (lambda: replace(DROPPED, verdict=PacketVerdict.RESET), "only TCP can be reset"),
+        (lambda: replace(DROPPED, uid=5), "has an owner"),
+        (lambda: replace(DROPPED, chain=Chain.NAT, verdict=PacketVerdict.DNAT), "DNAT and its address"),
     ],
 )
 def test_wrong_values_are_named(make: object, words: str) -> None:
@@ -201,19 +178,17 @@ def test_wrong_values_are_named(make: object, words: str) -> None:
 
 
 def test_a_rule_is_in_force_only_with_all_its_families() -> None:
-    rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
     six = RuleCounter("ROSRV-IN", 6, "p", 1, 100)
-    (status,) = statuses((rule,), (four, six))
+    (status,) = statuses((DROPPED,), (four, six))
     assert (status.packets, status.octets, status.in_force) == (4, 400, True)
-    assert not statuses((rule,), (four,))[0].in_force
-    assert statuses((rule,), (RuleCounter("ROSRV-IN", None, "p", 0, 0),))[0].in_force
-    assert not statuses((rule,), (RuleCounter("ROSRV-OUT", None, "p", 0, 0),))[0].in_force
+    assert not statuses((DROPPED,), (four,))[0].in_force
+    assert statuses((DROPPED,), (RuleCounter("ROSRV-IN", None, "p", 0, 0),))[0].in_force
+    assert not statuses((DROPPED,), (RuleCounter("ROSRV-OUT", None, "p", 0, 0),))[0].in_force
 
 
 def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
-    both = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
-    six = PacketRule(chain=Chain.IN, purpose="six", verdict=PacketVerdict.DROP, source="fd00::/8")
+    both, six = DROPPED, replace(DROPPED, purpose="six", source="fd00::/8")
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
     assert [status.in_force for status in statuses((both, six), (four,), families=(4,))] == [True, True]
     assert [status.in_force for status in statuses((both, six), (), families=(4,))] == [False, True]
@@ -226,9 +201,7 @@ def test_a_rule_describes_itself() -> None:
 
 
 def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
-    bare = FirewallSettings(
-        control_uid=1, rosmaster_uid=2, new_connections=None, client_ports=PortRange(32768, 60999)
-    )
+    bare = replace(BARE, client_ports=PortRange(32768, 60999))
     [closed] = appliance_rules(bare)
     assert (closed.chain, closed.verdict, closed.tcp_ports) == (
         Chain.IN,
@@ -282,22 +255,14 @@ def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
 
 def test_a_rule_is_for_tcp_or_for_udp() -> None:
     with pytest.raises(ValueError, match="TCP or UDP"):
-        PacketRule(
-            chain=Chain.IN,
-            purpose="both",
-            verdict=PacketVerdict.DROP,
-            tcp_ports=PortRange.one(500),
-            udp_ports=PortRange.one(500),
-        )
-    rule = PacketRule(chain=Chain.IN, purpose="one", verdict=PacketVerdict.DROP, udp_ports=PortRange.one(500))
-    assert rule.describe() == "udp 500 -> DROP"
+        replace(DROPPED, tcp_ports=PortRange.one(500), udp_ports=PortRange.one(500))
+    assert replace(DROPPED, udp_ports=PortRange.one(500)).describe() == "udp 500 -> DROP"
 
 
 def test_the_forwarder_reaches_its_receiver_only() -> None:
     for datagrams in (False, True):
         to = ForwarderAccess(61017, "10.0.0.9", 6514, "log", datagrams=datagrams)
-        settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarders=(to,), new_connections=None)
-        receiver, others = appliance_rules(settings)
+        receiver, others = appliance_rules(replace(BARE, forwarders=(to,)))
         assert (receiver.chain, receiver.uid, receiver.destination) == (Chain.OUT, 61017, "10.0.0.9")
         assert receiver.verdict is PacketVerdict.RETURN
         assert receiver.udp_ports == (PortRange.one(6514) if datagrams else None)
@@ -330,10 +295,7 @@ CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
 
 
 def test_replication_and_lease_are_for_the_other_appliance() -> None:
-    access = PeerAccess("10.0.0.3", 7412)
-    rules = appliance_rules(
-        FirewallSettings(control_uid=1, rosmaster_uid=2, peer=access, new_connections=None)
-    )
+    rules = appliance_rules(replace(BARE, peer=PeerAccess("10.0.0.3", 7412)))
     ours = [
         rule
         for rule in rules
