@@ -1,5 +1,6 @@
 """The attacker is root on one appliance, with its signing key and signer's memory: each forged log is valid alone."""
 
+import re
 import shutil
 import sqlite3
 from contextlib import closing
@@ -71,10 +72,8 @@ def verified(a: Path, b: Path) -> PairVerification:
 def found(pair: Pair) -> list[tuple[Kind, int]]:
     result = verified(pair.a, pair.b)
     assert [log.findings for log in result.logs] == [[], []]
-    turned = verified(pair.b, pair.a)
-    assert sorted(turned.findings, key=str) == sorted(
-        result.findings, key=str
-    )  # the order of the logs does not matter
+    turned = verified(pair.b, pair.a)  # the order of the logs does not matter
+    assert sorted(turned.findings, key=str) == sorted(result.findings, key=str)
     return [(finding.kind, finding.epoch) for finding in result.findings]
 
 
@@ -99,6 +98,12 @@ def setting(field: str, value: str, epoch: int, event: str = "took over") -> str
 
 def removing(epoch: int) -> str:
     return f"DELETE FROM record WHERE event = 'took over' AND CAST(detail AS TEXT) LIKE '%\"epoch\":{epoch}%'"
+
+
+def loosening(table: str) -> tuple[str, ...]:
+    """Return the statements that leave a table without its constraints."""
+    copy = f"CREATE TABLE loose AS SELECT * FROM {table}"
+    return copy, f"DROP TABLE {table}", f"ALTER TABLE loose RENAME TO {table}"
 
 
 # --- an honest pair -----------------------------------------------------------------------------------------------
@@ -268,6 +273,39 @@ def test_a_forged_log(pair: Pair, change: str, findings: list[Any]) -> None:
     assert found(pair) == findings
 
 
+@pytest.mark.parametrize(
+    ("change", "finding", "message"),
+    [
+        (removing(2), (Kind.TAKEOVER_MISSING, 2), ""),
+        (setting("other", "'c'", 5), (Kind.WRONG_NAME, 5), ""),
+        (setting("appliance", "'a'", 5), (Kind.WRONG_NAME, 5), ""),
+        (setting("epoch", "-1", 5), (Kind.UNREADABLE, 0), ""),
+        (setting("epoch", "'five'", 5), (Kind.UNREADABLE, 0), ""),
+        (setting("epoch", "9223372036854775808.5", 5), (Kind.UNREADABLE, 0), ""),
+        (setting("epoch", "2", 5), (Kind.EPOCH_ORDER, 2), "^epoch 2: record .* comes after epoch 2"),
+        (setting("epoch", "3", 5), (Kind.EPOCH_ORDER, 3), "seals the takeover of epoch 4"),
+        (setting("epoch", "1", 2, "handed over"), (Kind.EPOCH_ORDER, 1), "hands it over to"),
+        (setting("to", "'c'", 2, "handed over"), (Kind.EPOCH_ORDER, 2), "hands it over to"),
+    ],
+)
+def test_a_forged_takeover(pair: Pair, change: str, finding: tuple[Kind, int], message: str) -> None:
+    pair.forge_b(change)
+    assert finding in found(pair)
+    assert any(re.search(message, one.message) for one in verified(pair.a, pair.b).findings)
+
+
+@pytest.mark.parametrize(
+    ("epoch", "message"),
+    [
+        ("1", "^epoch 1: record .* comes after epoch 2"),
+        ("4", "^epoch 4: both logs have a takeover of epoch 4$"),
+    ],
+)
+def test_a_takeover_with_an_epoch_of_another_one(pair: Pair, epoch: str, message: str) -> None:
+    pair.forge_b(setting("epoch", epoch, 5))
+    assert any(re.search(message, one.message) for one in verified(pair.a, pair.b).findings)
+
+
 def test_a_removed_decision(pair: Pair) -> None:
     pair.forge_a("DELETE FROM record WHERE sequence = 6")
     assert found(pair) == [(Kind.REWRITTEN, 2), (Kind.REWRITTEN, 5)]
@@ -288,11 +326,6 @@ def test_a_missing_log(pair: Pair) -> None:
     pair.b.unlink()
     with pytest.raises(LogUnreadableError, match=str(pair.b)):
         verify_takeovers(VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, result))
-
-
-def test_a_removed_takeover(pair: Pair) -> None:
-    pair.forge_b(removing(2))
-    assert (Kind.TAKEOVER_MISSING, 2) in found(pair)
 
 
 def test_a_log_of_another_pair(pair: Pair, tmp_path: Path) -> None:
@@ -329,48 +362,6 @@ def test_a_different_checkpoint_with_the_same_hash(pair: Pair) -> None:
     assert findings == [(Kind.CHECKPOINT_CHANGED, 5)]
 
 
-def test_a_takeover_with_an_earlier_epoch(pair: Pair) -> None:
-    pair.forge_b(setting("epoch", "3", 5))
-    assert (Kind.EPOCH_ORDER, 3) in found(pair)
-    names = [finding.message for finding in verified(pair.a, pair.b).findings]
-    assert any("seals the takeover of epoch 4" in message for message in names), names
-
-
-def test_an_epoch_in_both_logs(pair: Pair) -> None:
-    pair.forge_b(setting("epoch", "4", 5))
-    assert "epoch 4: both logs have a takeover of epoch 4" in [
-        finding.message for finding in verified(pair.a, pair.b).findings
-    ]
-
-
-@pytest.mark.parametrize("epoch", [1, 2])
-def test_epochs_that_do_not_increase_in_a_log(pair: Pair, epoch: int) -> None:
-    pair.forge_b(setting("epoch", str(epoch), 5))
-    message = next(
-        one.message for one in verified(pair.a, pair.b).findings if "comes after epoch 2" in one.message
-    )
-    assert message.startswith(f"epoch {epoch}: record ")
-
-
-@pytest.mark.parametrize(("field", "name"), [("other", "c"), ("appliance", "a")])
-def test_a_wrong_name(pair: Pair, field: str, name: str) -> None:
-    pair.forge_b(setting(field, f"'{name}'", 5))
-    assert (Kind.WRONG_NAME, 5) in found(pair)
-
-
-@pytest.mark.parametrize("value", ["-1", "'five'", "9223372036854775808.5"])
-def test_an_unreadable_takeover(pair: Pair, value: str) -> None:
-    pair.forge_b(setting("epoch", value, 5))
-    assert (Kind.UNREADABLE, 0) in found(pair)
-
-
-@pytest.mark.parametrize(("field", "value"), [("epoch", "1"), ("to", "'c'")])
-def test_a_hand_over_that_does_not_fit(pair: Pair, field: str, value: str) -> None:
-    pair.forge_b(setting(field, value, 2, "handed over"))
-    assert Kind.EPOCH_ORDER in {kind for kind, _epoch in found(pair)}
-    assert any("hands it over to" in finding.message for finding in verified(pair.a, pair.b).findings)
-
-
 @pytest.mark.parametrize(
     "statement",
     [
@@ -383,16 +374,7 @@ def test_a_hand_over_that_does_not_fit(pair: Pair, field: str, value: str) -> No
     ],
 )
 def test_a_replaced_table(pair: Pair, statement: str) -> None:
-    execute(
-        pair.a,
-        "CREATE TABLE loose AS SELECT * FROM record",
-        "DROP TABLE record",
-        "ALTER TABLE loose RENAME TO record",
-        "CREATE TABLE loose AS SELECT * FROM checkpoint",
-        "DROP TABLE checkpoint",
-        "ALTER TABLE loose RENAME TO checkpoint",
-        statement,
-    )
+    execute(pair.a, *loosening("record"), *loosening("checkpoint"), statement)
     result = verified(pair.a, pair.b)
     assert not result.ok
     assert not result.logs[0].ok
@@ -400,13 +382,7 @@ def test_a_replaced_table(pair: Pair, statement: str) -> None:
 
 def test_a_log_that_changes_after_its_verification(pair: Pair) -> None:
     results = VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, verify(pair.b))
-    execute(
-        pair.a,
-        "CREATE TABLE loose AS SELECT * FROM record",
-        "DROP TABLE record",
-        "ALTER TABLE loose RENAME TO record",
-        "UPDATE record SET hash = 7",
-    )
+    execute(pair.a, *loosening("record"), "UPDATE record SET hash = 7")
     found_now = verify_takeovers(*results).findings
     assert [(one.kind, one.epoch) for one in found_now] == [(Kind.REWRITTEN, 2), (Kind.REWRITTEN, 5)]
 
