@@ -30,9 +30,9 @@ def answer_of(**changes: object) -> WitnessAnswer:
 
 
 class Lease:
-    def __init__(self, epoch: int = 1) -> None:
+    def __init__(self, epoch: int = 1, name: str = "a", other: str = "b") -> None:
         self.now = 50.0
-        self.lease = ApplianceLease("a", "b", "session", epoch, self.now)
+        self.lease = ApplianceLease(name, other, "session", epoch, self.now)
 
     def later(self, seconds: float) -> "Lease":
         self.now += seconds
@@ -41,18 +41,21 @@ class Lease:
     def tick(self, *, waiting_since: float | None = None, caught_up: bool = False) -> Outgoing:
         return self.lease.tick(self.now, waiting_since=waiting_since, caught_up=caught_up)
 
-    def operations(self, *, waiting_since: float | None = None, caught_up: bool = False) -> list[str]:
-        due = self.tick(waiting_since=waiting_since, caught_up=caught_up)
-        return [one.operation for one in due if isinstance(one, WitnessRequest)]
+    def requests(self, **state: Any) -> list[WitnessRequest]:
+        return [one for one in self.tick(**state) if isinstance(one, WitnessRequest)]
+
+    def operations(self, **state: Any) -> list[str]:
+        return [one.operation for one in self.requests(**state)]
 
     def request(self, operation: str) -> WitnessRequest:
-        (found,) = [
-            one for one in self.tick() if isinstance(one, WitnessRequest) and one.operation == operation
-        ]
+        (found,) = [one for one in self.requests() if one.operation == operation]
         return found
 
     def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:
         return self.lease.answered(request, answer_of(**answer))
+
+    def promised(self, asked: PromiseRequest, **answer: Any) -> None:
+        self.lease.received(self.now, ClaimPromise(asked.epoch, asked.session, asked.number, **answer))
 
     def active(self) -> bool:
         return self.lease.is_active(self.now)
@@ -96,8 +99,7 @@ def test_a_promise_alone_keeps_it_active() -> None:
     lease = active_lease()
     for number in range(20):
         asked = asked_by(lease.later(0.3))
-        promise = ClaimPromise(asked.epoch, asked.session, asked.number, unheard=0.3 * number)
-        lease.lease.received(lease.now, promise)
+        lease.promised(asked, unheard=0.3 * number)
         assert lease.active()
     lease.lease.received(lease.later(0.5).now, ClaimPromise(asked.epoch, "other", asked.number))
     assert not lease.later(CONFIDENCE - 0.49).active()
@@ -109,7 +111,7 @@ def test_a_holder_that_only_the_standby_could_replace_gives_up() -> None:
         due = list(lease.later(0.3).tick())
         for asked in due:
             if isinstance(asked, PromiseRequest):
-                lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+                lease.promised(asked)
     assert not due
     assert EXPIRY < lease.now - 50.0 - EXPIRY < 1.5 * EXPIRY
     assert isinstance(lease.later(0.1).tick()[0], TakeOver)
@@ -121,7 +123,7 @@ def test_a_promise_ends_a_lapse_and_counts_from_its_request() -> None:
     lease = active_lease()
     asked = asked_by(lease.later(CONFIDENCE + 0.1))
     assert not lease.active()
-    lease.lease.received(lease.later(0.5).now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    lease.later(0.5).promised(asked)
     assert lease.later(CONFIDENCE - 0.51).active()
     assert not lease.later(0.02).active()
 
@@ -214,19 +216,19 @@ def test_a_grant_whose_answer_was_lost_is_claimed_again() -> None:
     assert lease.later(0.3).operations() == ["claim"]
 
 
-def test_a_smaller_epoch_is_ignored() -> None:
+@pytest.mark.parametrize("granted", [True, False])
+def test_a_smaller_epoch_of_the_witness_is_never_taken(granted: bool) -> None:
     lease = Lease(epoch=9).later(EXPIRY)
-    lease.answered(lease.request("claim"), epoch=2)
-    assert not lease.active()
+    for _ in range(3):
+        lease.answered(lease.later(0.3).request("claim"), ok=granted, holder="a" if granted else "", epoch=6)
+    assert not lease.active() and lease.lease.epoch == 9
 
 
 def test_it_answers_alone_only_after_the_removal() -> None:
     lease = active_lease()
     now = lease.later(0.3).now
     assert lease.operations(waiting_since=now) == ["renew"]
-    renewal, removal = (
-        one for one in lease.later(0.61).tick(waiting_since=now) if isinstance(one, WitnessRequest)
-    )
+    renewal, removal = lease.later(0.61).requests(waiting_since=now)
     assert removal.operation == "remove"
     lease.answered(renewal)
     assert lease.lease.is_active(lease.now) and not lease.lease.answers_alone
@@ -279,8 +281,7 @@ def test_it_waits_for_the_standby_before_it_is_added() -> None:
 
 def in_a_switchover() -> tuple[Lease, TakeOver]:
     lease = active_lease()
-    asked = asked_by(lease.later(0.3))
-    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    lease.promised(asked_by(lease.later(0.3)))
     (release,) = lease.lease.switch_over(lease.now)
     assert isinstance(release, WitnessRequest) and release.operation == "release"
     assert not lease.active()
@@ -299,26 +300,13 @@ def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
     assert isinstance(claim, WitnessRequest) and claim.operation == "claim"
 
 
-def test_a_smaller_epoch_of_the_witness_is_never_taken() -> None:
-    lease = Lease(epoch=8).later(EXPIRY)
-    for _ in range(3):
-        lease.answered(lease.later(0.3).request("claim"), ok=False, holder="", epoch=6)
-    assert lease.lease.epoch == 8
-
-
-def test_a_late_order_does_not_end_a_later_promise() -> None:
+@pytest.mark.parametrize("requests", [[1], [1, 0]])
+def test_a_late_order_ends_no_later_promise_whatever_request_comes_late(requests: list[int]) -> None:
     _, order = in_a_switchover()
     standby = Lease().later(EXPIRY)
-    standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number + 1))
-    assert list(standby.lease.received(standby.now, order)) == []
-    assert standby.later(0.3).operations() == ["look"]
-
-
-def test_a_late_request_does_not_make_a_late_order_valid() -> None:
-    _, order = in_a_switchover()
-    standby = Lease().later(EXPIRY)
-    for number in (order.number + 1, order.number):
-        standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, number))
+    for later in requests:
+        request = PromiseRequest(order.epoch, order.session, order.number + later)
+        standby.lease.received(standby.now, request)
     assert list(standby.lease.received(standby.now, order)) == []
     assert standby.later(0.3).operations() == ["look"]
 
@@ -385,8 +373,7 @@ def test_a_witness_with_an_older_lease_makes_no_switchover_possible() -> None:
     """It admits neither appliance, so an appliance that gave its lease up could not get it back."""
     lease = active_lease()
     lease.answered(lease.later(0.3).request("renew"))
-    asked = asked_by(lease.later(0.3))
-    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    lease.promised(asked_by(lease.later(0.3)))
     assert lease.lease.handover_obstacle(lease.now) == ""
     seen = lease.lease.seen
     lease.answered(lease.later(0.3).request("renew"), **OLDER)
@@ -406,23 +393,15 @@ def test_a_witness_with_an_older_lease_makes_no_switchover_possible() -> None:
         ({"ok": False, "holder": "a"}, 0.3, ""),
         (OLDER, 0.3, "the witness on the robot refuses this appliance: the witness knows only epoch 1"),
         ({"ok": False, "holder": "a", "in_sync": ALONE}, 0.3, "b lacks changes that a has acknowledged"),
-        (
-            {"ok": False, "holder": "a", "trouble": "full"},
-            0.3,
-            "the witness on the robot could not grant the takeover: full",
-        ),
-        (
-            {"ok": False, "holder": "a"},
-            EXPIRY + 0.1,
-            "the witness on the robot does not answer this appliance",
-        ),
+        ({"ok": False, "holder": "a", "trouble": "full"}, 0.3,
+         "the witness on the robot could not grant the takeover: full"),
+        ({"ok": False, "holder": "a"}, EXPIRY + 0.1, "the witness on the robot does not answer this appliance"),
     ],
-)
+)  # fmt: skip
 def test_a_standby_knows_why_it_could_not_claim(
     answer: dict[str, object], silence: float, obstacle: str
 ) -> None:
-    standby = Lease(epoch=2)
-    standby.lease = ApplianceLease("b", "a", "session", 2, standby.now)
+    standby = Lease(epoch=2, name="b", other="a")
     assert "does not answer" in standby.lease.takeover_obstacle(standby.now)
     standby.answered(standby.later(EXPIRY).request("claim"), **answer)
     found = standby.lease.takeover_obstacle(standby.later(silence).now)
@@ -439,8 +418,7 @@ def test_a_standby_knows_why_it_could_not_claim(
 )
 def test_a_claim_that_came_too_early_is_not_a_refusal(answer: dict[str, Any], reported: bool) -> None:
     """A standby claims again and again while it does not hear the active appliance."""
-    standby = Lease(epoch=2)
-    standby.lease = ApplianceLease("b", "a", "session", 2, standby.now)
+    standby = Lease(epoch=2, name="b", other="a")
     claim = standby.later(EXPIRY).request("claim")
     standby.answered(claim, **({"ok": False, "holder": "a"} | answer))
     assert standby.lease.refusal == (answer["reason"] if reported else "")
@@ -449,8 +427,7 @@ def test_a_claim_that_came_too_early_is_not_a_refusal(answer: dict[str, Any], re
 def test_a_standby_that_the_witness_refuses_does_not_count_as_answered() -> None:
     standby = Lease(epoch=2)
     for _ in range(6):
-        due = standby.later(0.3).tick()
-        standby.answered(next(one for one in due if isinstance(one, WitnessRequest)), **OLDER)
+        standby.answered(standby.later(0.3).requests()[0], **OLDER)
     (promise,) = standby.lease.received(standby.now, PromiseRequest(2, "other", 1))
     assert isinstance(promise, ClaimPromise) and promise.unheard > EXPIRY
 

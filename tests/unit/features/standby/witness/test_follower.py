@@ -61,15 +61,9 @@ class Robot:
 
     def start_follower(self, epoch: int = 0, session: str = "first") -> None:
         self.follower = WitnessFollower(
-            name="arm",
-            key=KEY,
-            appliances=BOTH,
-            session=session,
-            epoch=epoch,
-            save=self._save,
-            admit=self._admit,
-            clock=lambda: self.now,
-        )
+            name="arm", key=KEY, appliances=BOTH, session=session, epoch=epoch, save=self._save,
+            admit=self._admit, clock=lambda: self.now,
+        )  # fmt: skip
 
     def _save(self, epoch: int) -> None:
         if self.broken:
@@ -88,11 +82,19 @@ class Robot:
     def answer(self, datagram: bytes | None = None, address: str = "10.0.0.20") -> bytes | None:
         return self.gate.answer(datagram or self.follower.request(), address)
 
-    def look(self) -> str:
-        answer = self.answer()
+    def answered(self, request: bytes | None = None) -> bytes:
+        answer = self.answer(request)
         assert answer is not None
-        self.receive(answer)
+        return answer
+
+    def look(self) -> str:
+        self.receive(self.answered())
         return self.follower_admits[-1]
+
+    def expire(self) -> None:
+        """Let an expiry pass without an answer."""
+        self.now += EXPIRY
+        self.follower.tick()
 
     def told(self) -> dict[str, object]:
         """Return what the answers to the appliances say of followers."""
@@ -136,8 +138,7 @@ def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
     robot = following()
     request = robot.follower.request()
     robot.now += 0.1
-    answer = robot.answer(request)
-    assert answer is not None
+    answer = robot.answered(request)
     robot.now += 0.8
     robot.receive(answer)
     assert robot.follower_admits[-1] == "a"
@@ -149,8 +150,7 @@ def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
 
 def test_without_answers_both_are_shut_out_after_one_expiry() -> None:
     robot = following()
-    robot.now += EXPIRY
-    robot.follower.tick()
+    robot.expire()
     assert robot.follower_admits == ["", "a", ""]
     assert robot.witness.handle("a", "renew", 2, "b") == ""
     assert robot.look() == "a"
@@ -167,8 +167,7 @@ def test_after_a_reboot_of_the_robot_the_follower_waits_as_the_robot_does() -> N
 
 def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
     robot = following()
-    first, second = robot.answer(), robot.answer()
-    assert first is not None and second is not None
+    first, second = robot.answered(), robot.answered()
     robot.claim("b")
     assert robot.look() == "b"
     for old in (first, second):
@@ -176,27 +175,24 @@ def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
         assert robot.follower_admits[-1] == "b"
     request = robot.follower.request()
     robot.start_follower(session="second")
-    answer = robot.answer(request)
-    assert answer is not None
-    robot.receive(answer)
+    robot.receive(robot.answered(request))
     assert robot.follower_admits[-1] == ""
 
 
 def test_an_older_answer_does_not_replace_a_newer_one() -> None:
     robot = following()
-    first = robot.answer()
+    first = robot.answered()
     robot.start_witness(robot.witness.record, boot="two")
     for _ in range(2):
         robot.look()
-    assert robot.follower_admits[-1] == "" and first is not None
+    assert robot.follower_admits[-1] == ""
     robot.receive(first)
     assert robot.follower_admits[-1] == ""
 
 
 def test_an_answer_that_was_delayed_for_an_expiry_admits_no_appliance() -> None:
     robot = following()
-    answer = robot.answer()
-    assert answer is not None
+    answer = robot.answered()
     robot.now += EXPIRY
     robot.receive(answer)
     assert robot.follower_admits[-1] == ""
@@ -216,8 +212,7 @@ def test_a_smaller_epoch_is_never_accepted() -> None:
     robot.start_witness(LeaseRecord(2, "b", BOTH, "one"))
     for _ in range(2):
         robot.look()
-    robot.now += EXPIRY
-    robot.follower.tick()
+    robot.expire()
     assert robot.follower_admits[-1] == "" and "b" not in robot.follower_admits
 
 
@@ -235,8 +230,7 @@ def test_an_epoch_that_cannot_be_saved_admits_no_appliance() -> None:
     robot = following()
     robot.claim("b")
     robot.broken = True
-    answer = robot.answer()
-    assert answer is not None
+    answer = robot.answered()
     with pytest.raises(WitnessError, match="disk is full"):
         robot.receive(answer)
     robot.broken = False
@@ -309,8 +303,7 @@ def test_an_answer_that_is_not_authentic_is_ignored(datagram: bytes) -> None:
     assert robot.follower_admits == [""]
     robot.receive(seal(ANSWER, "arm", KEY, ANSWERED | {"left": HIGHEST}))
     assert robot.follower_admits == ["", "a"]
-    robot.now += EXPIRY
-    robot.follower.tick()
+    robot.expire()
     assert robot.follower_admits[-1] == "", "an answer counts for one expiry at most"
 
 
@@ -377,15 +370,10 @@ class RandomHistory:
     def start_follower(self) -> None:
         self.follower: Any = None  # it writes its first rules before it asks
         self.follower = self.product.WitnessFollower(
-            name="arm",
-            key=KEY,
-            appliances=BOTH,
-            session=f"{self.random.random()}",
-            epoch=self.saved,
-            save=lambda epoch: setattr(self, "saved", epoch),
-            admit=self.write,
+            name="arm", key=KEY, appliances=BOTH, session=f"{self.random.random()}", epoch=self.saved,
+            save=lambda epoch: setattr(self, "saved", epoch), admit=self.write,
             clock=lambda: self.seconds * self.speeds[1],
-        )
+        )  # fmt: skip
 
     def write(self, name: str, left: Left) -> None:
         end = self.seconds + self.slow * self.random.uniform(0.8, 1.2)
@@ -503,8 +491,7 @@ def test_a_history_finds_a_wrong_rule_of_the_follower(mutant: str) -> None:
 def test_both_appliances_learn_that_a_follower_interrupts_topics_again_and_again() -> None:
     robot = following()
     for _ in range(3):
-        robot.now += EXPIRY
-        robot.follower.tick()
+        robot.expire()
         assert robot.witness.handle("a", "renew", 2, "b") == ""
         assert robot.look() == "a"
     robot.follower.note("")
@@ -521,8 +508,7 @@ def test_both_appliances_learn_that_a_follower_interrupts_topics_again_and_again
 def test_takeovers_are_not_reported_as_interruptions() -> None:
     robot = following()
     for holder in "baba":
-        robot.now += EXPIRY
-        robot.follower.tick()
+        robot.expire()
         assert robot.follower_admits[-1] == ""
         assert robot.witness.handle(holder, "claim", 0, "") == ""
         robot.look()
