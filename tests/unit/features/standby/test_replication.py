@@ -68,6 +68,22 @@ SECONDS = 2 * LIMIT
 OF_LAST_RELEASE = ROOT / "tests" / "integration" / "state-0.4.1.sql"
 
 
+@contextlib.asynccontextmanager
+async def active_side(directory: Path, **options: Any) -> AsyncIterator[ActiveSide]:
+    """Have an active appliance whose standby is the test."""
+    active = ActiveSide(directory / "active.db", certificates(directory)[0], **options)
+    async with asyncio.timeout(SECONDS):
+        yield active
+    await active.close()
+
+
+@contextlib.asynccontextmanager
+async def standby_side(directory: Path, active: ActiveSide) -> AsyncIterator[StandbySide]:
+    standby = StandbySide(directory / "standby.db", certificates(directory)[1], lambda: active.port)
+    yield standby
+    await standby.close()
+
+
 async def require_equal(directory: Path, active: ActiveSide) -> None:
     """Check the tables. The standby may have rows before the active appliance has them on its disk."""
     await active.database.settled()
@@ -168,34 +184,27 @@ async def test_nothing_is_lost_however_often_the_link_is_cut(tmp_path: Path, see
 
 
 async def test_a_standby_that_was_away_for_long_gets_a_snapshot(tmp_path: Path) -> None:
-    server, client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server, room=10_000)
     chosen = random.Random(2)  # noqa: S311  draws examples
-    for number in range(3000):
-        active.database.put("thing", f"away {number}", number, "x" * 1000)
-    lag = active.sender.lag()
-    assert (lag.connected, lag.changes, lag.caught_up) == (False, 3000, False)
-    assert 0 < lag.bytes <= 10_000
-    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
-    async with asyncio.timeout(SECONDS):
-        await until(lambda: active.sender.lag().connected)
-        while standby.replica.position.number < 3000:
-            change_randomly(active.database, chosen)
-            await asyncio.sleep(0)
-        await active.sender.acknowledged(active.database.number)
-        await require_equal(tmp_path, active)
-    await standby.close()
-    await active.close()
+    async with active_side(tmp_path, room=10_000) as active:
+        for number in range(3000):
+            active.database.put("thing", f"away {number}", number, "x" * 1000)
+        lag = active.sender.lag()
+        assert (lag.connected, lag.changes, lag.caught_up) == (False, 3000, False)
+        assert 0 < lag.bytes <= 10_000
+        async with standby_side(tmp_path, active) as standby:
+            await until(lambda: active.sender.lag().connected)
+            while standby.replica.position.number < 3000:
+                change_randomly(active.database, chosen)
+                await asyncio.sleep(0)
+            await active.sender.acknowledged(active.database.number)
+            await require_equal(tmp_path, active)
 
 
 async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: Path) -> None:
-    server, client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
-    async with asyncio.timeout(SECONDS):
-        active.database.put("thing", "a", 1, None)
-        await active.sender.acknowledged(1)
-        await standby.close()
+    async with active_side(tmp_path) as active:
+        async with standby_side(tmp_path, active) as standby:
+            active.database.put("thing", "a", 1, None)
+            await active.sender.acknowledged(1)
         for number in range(500):
             active.database.put("thing", f"row {number}", number, "x" * 1000)
         async with connected(tmp_path, active) as link:
@@ -207,7 +216,6 @@ async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: P
                 assert message.first == 2 + received
                 received += len(message.changes)
                 await link.send(Stored(1, message.history, 1 + received))
-    await active.close()
 
 
 @contextlib.asynccontextmanager
@@ -221,6 +229,12 @@ async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[Replic
         await link.close()
 
 
+async def require_closed(link: ReplicationLink[FromActive]) -> None:
+    with pytest.raises(ReplicationError, match=r"closed the link|lost"):
+        while True:
+            await link.receive(10)
+
+
 async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
     begin = await link.receive(10)
     assert isinstance(begin, SnapshotBegin)
@@ -231,11 +245,9 @@ async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
 
 
 async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: Path) -> None:
-    server, _client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    active.database.put("thing", "a", 1, None)
-    history = active.database.history
-    async with asyncio.timeout(SECONDS):
+    async with active_side(tmp_path) as active:
+        active.database.put("thing", "a", 1, None)
+        history = active.database.history
         waiting = asyncio.create_task(active.sender.acknowledged(1))
         for lie in (Stored(1, history, 2), Stored(1, history, 1 << 61)):
             async with connected(tmp_path, active) as link:
@@ -243,32 +255,23 @@ async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: P
                 await take_snapshot(link)
                 assert not waiting.done()
                 await link.send(lie)
-                with pytest.raises(ReplicationError, match=r"closed the link|lost"):
-                    while True:
-                        await link.receive(10)
+                await require_closed(link)
             assert not waiting.done()
         active.database.put("thing", "b", 1, None)
-        async with connected(
-            tmp_path, active
-        ) as link:  # a position that was never sent is that of another state
-            await link.send(Stored(1, history, 2))
+        async with connected(tmp_path, active) as link:
+            await link.send(Stored(1, history, 2))  # what was never sent is of another state
             begin = await take_snapshot(link)
             assert begin.number == 2
             assert not waiting.done()
             await link.send(Stored(1, history, 2))
             await waiting
             await link.send(Stored(1, history, 0))
-            with pytest.raises(ReplicationError, match=r"closed the link|lost"):
-                while True:
-                    await link.receive(10)
-    await active.close()
+            await require_closed(link)
 
 
 async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_longer(tmp_path: Path) -> None:
-    server, _client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    history = active.database.history
-    async with asyncio.timeout(SECONDS):
+    async with active_side(tmp_path) as active:
+        history = active.database.history
         async with connected(tmp_path, active) as link:
             await link.send(Stored(0, "", 0))
             await take_snapshot(link)
@@ -286,7 +289,6 @@ async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_long
             await link.send(Stored(1, history, 1))
             await take_snapshot(link)
             assert active.sender.lag().changes == 3
-    await active.close()
 
 
 async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
@@ -307,52 +309,40 @@ async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
 
 
 async def test_a_new_link_ends_the_earlier_one(tmp_path: Path) -> None:
-    server, client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    async with asyncio.timeout(SECONDS):
-        async with connected(tmp_path, active) as silent:
-            await silent.send(Stored(0, "", 0))
-            await silent.receive(10)
-            standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+    async with active_side(tmp_path) as active, connected(tmp_path, active) as silent:
+        await silent.send(Stored(0, "", 0))
+        await silent.receive(10)
+        async with standby_side(tmp_path, active):
             active.database.put("thing", "a", 1, None)
             await active.sender.acknowledged(1)
             with pytest.raises(ReplicationError):
                 while True:
                     await silent.receive(10)
-    await standby.close()
-    await active.close()
 
 
 async def test_a_quiet_link_stays_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replication_sender, "_HEARTBEAT_SECONDS", 0.05)
-    server, _client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    async with asyncio.timeout(SECONDS), connected(tmp_path, active) as link:
+    async with active_side(tmp_path) as active, connected(tmp_path, active) as link:
         await link.send(Stored(0, "", 0))
         await take_snapshot(link)
         for _ in range(5):
             await link.send(Stored(1, active.database.history, 0))
             assert await link.receive(10) == Changes(1, active.database.history, 1, [])
-    await active.close()
 
 
 async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replication_sender, "_SILENCE_SECONDS", 0.5)
-    server, _client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    for number in range(20):
-        active.database.put("tree", 1, bytes(1 << 20), float(number))
-    async with asyncio.timeout(SECONDS), connected(tmp_path, active) as link:
-        await link.send(Stored(0, "", 0))
-        await until(lambda: active.sender.lag().connected)
-        await until(lambda: not active.sender.lag().connected)
-    await active.close()
+    async with active_side(tmp_path) as active:
+        for number in range(20):
+            active.database.put("tree", 1, bytes(1 << 20), float(number))
+        async with connected(tmp_path, active) as link:
+            await link.send(Stored(0, "", 0))
+            await until(lambda: active.sender.lag().connected)
+            await until(lambda: not active.sender.lag().connected)
 
 
 async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
-    server, _client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    async with asyncio.timeout(SECONDS):
+    async with active_side(tmp_path) as active:
         active.database.put("thing", "a", 1, None)
         waiting = asyncio.create_task(active.sender.acknowledged(1))
         await until(lambda: active.sender.lag().waiting_since is not None)
@@ -367,7 +357,6 @@ async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
         active.database.put("thing", "b", 1, None)
         assert active.sender.lag().bytes == size
         assert active.sender.lag().waiting_since is None
-    await active.close()
 
 
 @pytest.mark.parametrize("receiving", [True, False])
@@ -375,11 +364,8 @@ async def test_an_appliance_that_reads_nothing_does_not_hold_the_link(
     monkeypatch: pytest.MonkeyPatch, *, receiving: bool
 ) -> None:
     monkeypatch.setattr(replication_frames, "_WRITE_SECONDS", 0.1)
-    reader, other, writer = await pair_of_links()
-    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
-    with pytest.raises(
-        ReplicationError, match="sent nothing for 0.1 s" if receiving else "took nothing for 0.1 s"
-    ):
+    link, other = await a_link()
+    with pytest.raises(ReplicationError, match=f"{'sent' if receiving else 'took'} nothing for 0.1 s"):
         if receiving:
             await link.receive(0.1)
         else:
@@ -389,8 +375,7 @@ async def test_an_appliance_that_reads_nothing_does_not_hold_the_link(
 
 
 async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
-    server, client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
+    certificates(tmp_path)
     homes = {name: tmp_path / name for name in ("strange", "old", "mistrusting")}
     for home in homes.values():
         home.mkdir()
@@ -404,7 +389,7 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
     old = link_context(own, theirs, homes["old"], server=False)
     old.minimum_version, old.maximum_version = ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_2
     mistrusting = link_context(own, strange.certificate, homes["mistrusting"], server=False)
-    async with asyncio.timeout(SECONDS):
+    async with active_side(tmp_path) as active:
         for context in (other, none, old, mistrusting, None):
             with pytest.raises((ReplicationError, OSError)):
                 reader, writer = await asyncio.open_connection("127.0.0.1", active.port, ssl=context)
@@ -415,32 +400,26 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
                 finally:
                     await link.close()
             assert not active.sender.lag().connected
-        standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
-        await active.sender.acknowledged(0)
-        await until(lambda: active.sender.lag().caught_up)
-    await standby.close()
-    await active.close()
+        async with standby_side(tmp_path, active):
+            await active.sender.acknowledged(0)
+            await until(lambda: active.sender.lag().caught_up)
 
 
 async def test_connections_without_a_handshake_are_limited(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(replication, "_HANDSHAKE_SECONDS", 0.5)
-    server, client = certificates(tmp_path)
-    active = ActiveSide(tmp_path / "active.db", server)
-    idle = [socket.create_connection(("127.0.0.1", active.port)) for _ in range(40)]
-    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
-    async with asyncio.timeout(SECONDS):
-        loop = asyncio.get_running_loop()
-        for connection in idle[-20:]:
-            connection.setblocking(False)
-            assert await loop.sock_recv(connection, 1) == b""
-        assert not active.sender.lag().connected
-        await until(lambda: active.sender.lag().caught_up)
-    for connection in idle:
-        connection.close()
-    await standby.close()
-    await active.close()
+    async with active_side(tmp_path) as active:
+        idle = [socket.create_connection(("127.0.0.1", active.port)) for _ in range(40)]
+        async with standby_side(tmp_path, active):
+            loop = asyncio.get_running_loop()
+            for connection in idle[-20:]:
+                connection.setblocking(False)
+                assert await loop.sock_recv(connection, 1) == b""
+            assert not active.sender.lag().connected
+            await until(lambda: active.sender.lag().caught_up)
+            for connection in idle:
+                connection.close()
 
 
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -451,9 +430,10 @@ async def pair_of_streams() -> tuple[Streams, Streams]:
     return await asyncio.open_connection(sock=here), await asyncio.open_connection(sock=there)
 
 
-async def pair_of_links() -> tuple[asyncio.StreamReader, asyncio.StreamWriter, asyncio.StreamWriter]:
-    (reader, writer), (_, other) = await pair_of_streams()
-    return reader, other, writer
+async def a_link() -> tuple[ReplicationLink[FromActive], asyncio.StreamWriter]:
+    """Return a link, and the other end's writer."""
+    ends, (_, other) = await pair_of_streams()
+    return ReplicationLink(*ends, FromActive), other
 
 
 async def test_a_standby_follows_only_an_accepted_epoch(tmp_path: Path) -> None:
@@ -494,10 +474,15 @@ async def test_a_link_that_ends_in_a_snapshot_leaves_nothing_open(tmp_path: Path
     replica.close()
 
 
-async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
+def two_states(directory: Path) -> tuple[StateStore, Replica]:
     for name in ("active", "standby"):
-        (tmp_path / name).mkdir()
-    store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
+        (directory / name).mkdir()
+    store = StateStore(directory / "active", failed=pytest.fail, kind=InlineDatabase)
+    return store, Replica(directory / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
+
+
+async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
+    store, replica = two_states(tmp_path)
     node = IncarnationRow("k", "/n", "10.0.0.1", "http://r:1/", "10.0.0.2", 1, 2, True, "live", 1.5, (3, 4))
     token, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
 
@@ -520,7 +505,6 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
     save("1")
     store.save_parameters({"1": [1.5]})
     sender = ReplicationSender(store.database, lambda: 1)
-    replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
     ends, others = await pair_of_streams()
     tasks = [
         asyncio.create_task(sender.serve(*ends)),
@@ -549,11 +533,8 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
 
 
 async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_path: Path) -> None:
-    (tmp_path / "active").mkdir()
-    (tmp_path / "standby").mkdir()
-    store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
+    store, replica = two_states(tmp_path)
     sender = ReplicationSender(store.database, lambda: 1)
-    replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
     revisions: list[int] = []
     obstacles: list[str] = [""]
 
@@ -563,10 +544,7 @@ async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_
 
     ends, others = await pair_of_streams()
     receiver = ReplicationReceiver(
-        replica,
-        lambda _epoch: True,
-        obstacle=lambda: obstacles[-1],
-        revised=revised,
+        replica, lambda _epoch: True, obstacle=lambda: obstacles[-1], revised=revised
     )
     tasks = [asyncio.create_task(sender.serve(*ends)), asyncio.create_task(receiver.follow(*others))]
     changes: list[Callable[[], None]] = [
@@ -612,8 +590,7 @@ async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_
     ],
 )
 async def test_a_bad_frame_ends_the_link(data: bytes, reason: str) -> None:
-    reader, other, writer = await pair_of_links()
-    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+    link, other = await a_link()
     other.write(data)
     other.close()
     with pytest.raises(ReplicationError, match=reason):
@@ -636,8 +613,7 @@ async def test_a_bad_frame_ends_the_link(data: bytes, reason: str) -> None:
     ],
 )
 async def test_a_message_of_another_form_ends_the_link(message: Any) -> None:
-    reader, other, writer = await pair_of_links()
-    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+    link, other = await a_link()
     body = msgspec.msgpack.encode(message)
     other.write(len(body).to_bytes(4, "big") + body)
     with pytest.raises(ReplicationError, match="malformed"):
@@ -663,16 +639,14 @@ async def test_a_change_too_large_for_a_frame_is_an_error_with_a_remedy(
 
 
 async def test_the_standby_tells_why_it_refuses(tmp_path: Path) -> None:
-    server, client = certificates(tmp_path)
     more = SCHEMA + "CREATE TABLE IF NOT EXISTS newer (name TEXT PRIMARY KEY) WITHOUT ROWID;"
-    active = ActiveSide(tmp_path / "active.db", server, schema=more)
-    active.database.put("newer", "a")
-    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
-    async with asyncio.timeout(SECONDS):
-        await until(lambda: any("no table 'newer'" in end for end in standby.ends))
-        await until(lambda: "the standby refuses: a change does not fit: the" in active.sender.lag().reason)
-    await standby.close()
-    await active.close()
+    async with active_side(tmp_path, schema=more) as active:
+        active.database.put("newer", "a")
+        async with standby_side(tmp_path, active) as standby:
+            await until(lambda: any("no table 'newer'" in end for end in standby.ends))
+            await until(
+                lambda: "the standby refuses: a change does not fit: the" in active.sender.lag().reason
+            )
 
 
 INTRODUCTION = Introduction(b"request", "0" * 64, "10.0.0.3", "")
@@ -749,10 +723,7 @@ async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str 
 
 
 async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link(tmp_path: Path) -> None:
-    (tmp_path / "active").mkdir()
-    (tmp_path / "standby").mkdir()
-    store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
-    replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
+    store, replica = two_states(tmp_path)
     wanted = asyncio.Event()
     sender = ReplicationSender(store.database, lambda: 1, switchover_wanted=wanted.set)
     receiver = ReplicationReceiver(replica, lambda _epoch: True)
