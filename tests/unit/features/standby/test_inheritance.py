@@ -1,5 +1,5 @@
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -60,10 +60,13 @@ class Pairs:
     def present(self) -> Pair:
         return self.members["a"]._replace(epoch=self.epoch)
 
-    def copies(self, *contents: bytes | None, followed: bool = True) -> StateCopies:
-        made = StateCopies(self.present, self.store, Relays(*contents), lambda: followed)
-        asyncio.run(made.copy_once())
-        return made
+    def copied(self, followed: Callable[[], bool] = lambda: True) -> "tuple[Relays, StateCopies]":
+        """Let `a` be active, and copy the state of two relays."""
+        self.active("a")
+        relays = Relays(b"of relay 0", b"of relay 1")
+        copies = StateCopies(self.present, self.store, relays, followed)
+        asyncio.run(copies.copy_once())
+        return relays, copies
 
 
 class Relays:
@@ -119,10 +122,11 @@ def test_a_planned_switchover_passes_the_state_on_once(pairs: Pairs) -> None:
     assert "appliance b was active" in pairs.active("a")[0]
 
 
-def test_a_state_that_was_left_is_void_if_its_appliance_went_on(pairs: Pairs) -> None:
+@pytest.mark.parametrize("taken", [True, False])
+def test_a_state_that_was_left_is_void_if_its_appliance_went_on(pairs: Pairs, taken: bool) -> None:
     pairs.active("a")
     pairs.hand_over(b"left by a")
-    pairs.active("a")
+    pairs.active("a", taken=taken)
     lost, left = pairs.active("b")
     assert lost
     assert left == ()
@@ -136,8 +140,7 @@ def test_a_failed_switchover_makes_the_state_void(pairs: Pairs) -> None:
 
 
 def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
-    pairs.active("a")
-    pairs.copies(b"of relay 0", b"of relay 1")
+    pairs.copied()
     lost, left = pairs.active("b")
     assert "appliance b" not in lost and "appliance a was active" in lost
     assert left == (b"of relay 0", b"of relay 1")
@@ -146,10 +149,8 @@ def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
 
 @pytest.mark.parametrize("why", ["old", "none", "a relay is away", "no standby", "no state"])
 def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> None:
-    pairs.active("a")
-    relays, followed = Relays(b"of relay 0", b"of relay 1"), [True]
-    copies = StateCopies(pairs.present, pairs.store, relays, lambda: followed[0])
-    asyncio.run(copies.copy_once())
+    followed = [True]
+    relays, copies = pairs.copied(lambda: followed[0])
     pairs.copy_age = {"old": 6.0, "none": None}.get(why, 1.0)
     relays.contents = (b"of relay 0", None)  # the second has not changed
     asyncio.run(copies.copy_once())
@@ -163,10 +164,7 @@ def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> No
 
 
 def test_a_rehearsal_stores_as_much_as_the_switchover_while_messages_pass(pairs: Pairs) -> None:
-    pairs.active("a")
-    relays = Relays(b"of relay 0", b"of relay 1")
-    copies = StateCopies(pairs.present, pairs.store, relays, lambda: True)
-    asyncio.run(copies.copy_once())
+    relays, copies = pairs.copied()
     relays.contents = (b"later", b"of relay 1")
     asyncio.run(copies.rehearse())
     assert relays.fully == [True, True]
@@ -175,10 +173,7 @@ def test_a_rehearsal_stores_as_much_as_the_switchover_while_messages_pass(pairs:
 
 def test_a_rehearsal_that_fails_refuses_the_switchover_and_is_followed_by_a_whole_copy(pairs: Pairs) -> None:
     """A relay that did answer sends its last changes only once, so a copy of later changes would lack them."""
-    pairs.active("a")
-    relays = Relays(b"of relay 0", b"of relay 1")
-    copies = StateCopies(pairs.present, pairs.store, relays, lambda: True)
-    asyncio.run(copies.copy_once())
+    relays, copies = pairs.copied()
     relays.hangs = True
     with pytest.raises(HandOverError, match="a relay does not answer"):
         asyncio.run(copies.rehearse())
@@ -201,15 +196,6 @@ def test_the_age_of_copies_counts_from_a_new_note() -> None:
         let_time_pass(3.0)
         age.look("new")
         assert age.at(clock.now()) == 3.0
-
-
-def test_an_epoch_in_between_makes_the_state_void(pairs: Pairs) -> None:
-    pairs.active("a")
-    pairs.hand_over(b"left by a")
-    pairs.active("a", taken=False)
-    lost, left = pairs.active("b")
-    assert lost
-    assert left == ()
 
 
 def test_a_control_that_dies_before_its_relays_have_the_state_inherits_again(pairs: Pairs) -> None:
