@@ -38,10 +38,7 @@ SETTINGS = WitnessSettings(
     ("10.0.0.1", 7411),
     "10.0.0.100",
     ("11311",),
-    {
-        "a": AppliancePeer("10.0.0.2", KEYS["a"]),
-        "b": AppliancePeer("10.0.0.3", KEYS["b"]),
-    },
+    {"a": AppliancePeer("10.0.0.2", KEYS["a"]), "b": AppliancePeer("10.0.0.3", KEYS["b"])},
     "/lease",
     {},
     "",

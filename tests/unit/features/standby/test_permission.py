@@ -171,18 +171,9 @@ async def run(pair: Pair, steps: list[str]) -> None:
 # Control restarts after the order to add the standby: it must not learn an earlier permission again.
 @example(
     steps=[
-        "change",
-        "change",
-        "time",
-        "witness",
-        "back",
-        "settle",
-        "restart",
-        "change",
-        "answer",
-        "to control",
+        "change", "change", "time", "witness", "back", "settle", "restart", "change", "answer", "to control",
     ]
-)
+)  # fmt: skip
 @settings(max_examples=examples(600))
 @given(st.lists(st.sampled_from(STEPS), min_size=10, max_size=60))
 def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(

@@ -28,14 +28,10 @@ class Rebooted:
         self.lease.answered(
             request,
             WitnessAnswer(
-                ok=True,
-                reason="",
-                epoch=epoch,
-                holder=self.holder,
-                in_sync=frozenset(in_sync),
+                ok=True, reason="", epoch=epoch, holder=self.holder, in_sync=frozenset(in_sync),
                 expired=expired,
             ),
-        )
+        )  # fmt: skip
 
     def pass_time(self, seconds: float, *, expired: bool) -> None:
         for _ in range(round(seconds * 10)):
@@ -104,13 +100,7 @@ async def compared(own: Stored, other: Stored) -> StateComparison:
 
 @pytest.mark.parametrize(
     ("own", "other", "last", "may"),
-    [
-        (7, 5, "a", True),
-        (5, 7, "b", False),
-        (6, 6, "b", True),
-        (6, 6, "a", False),
-        (0, 0, "", True),
-    ],
+    [(7, 5, "a", True), (5, 7, "b", False), (6, 6, "b", True), (6, 6, "a", False), (0, 0, "", True)],
 )
 @pytest.mark.anyio
 @pytest.mark.usefixtures("local_sockets")

@@ -20,13 +20,9 @@ class Side:
 
     def _start(self) -> "subprocess.Popen[str]":
         return subprocess.Popen(
-            self._command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            pass_fds=[self._descriptor],
-        )
+            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            text=True, pass_fds=[self._descriptor],
+        )  # fmt: skip
 
     def kill(self) -> str:
         self.process.kill()

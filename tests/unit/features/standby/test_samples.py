@@ -23,20 +23,10 @@ def test_the_active_appliance_has_the_lag_of_the_standby() -> None:
         witness={"answered_seconds": 0.25, "holder": "b", "trouble": "full"},
     )  # fmt: skip
     assert {name.removeprefix("rosrv_standby_"): value for name, value in numbers(state).items()} == {
-        'role{role="active"}': 1,
-        'role{role="standby"}': 0,
-        "connected": 1,
-        "in_sync": 0,
-        "can_take_over": 1,
-        "obstacle": 1,
-        "behind_changes": 12,
-        "behind_bytes": 3400,
-        "witness_age_seconds": 0.25,
-        "other_witness_age_seconds": 7.5,
-        "witness_trouble": 1,
-        "both_active": 1,
-        "takeovers_total": 4,
-    }
+        'role{role="active"}': 1, 'role{role="standby"}': 0, "connected": 1, "in_sync": 0, "can_take_over": 1,
+        "obstacle": 1, "behind_changes": 12, "behind_bytes": 3400, "witness_age_seconds": 0.25,
+        "other_witness_age_seconds": 7.5, "witness_trouble": 1, "both_active": 1, "takeovers_total": 4,
+    }  # fmt: skip
 
 
 def test_a_standby_has_its_own_metrics() -> None:

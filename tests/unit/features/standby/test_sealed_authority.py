@@ -2,11 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.standby.first_join import (
-    SealedAuthority,
-    keep_sealed,
-    sealed_authority,
-)
+from appliance.features.standby.first_join import SealedAuthority, keep_sealed, sealed_authority
 from appliance.ipsec.brought_authority import FOLDER, open_authority
 from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
 

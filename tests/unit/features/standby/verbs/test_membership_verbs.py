@@ -16,12 +16,7 @@ from appliance.supervisor.state_directory import ADMIN_SOCKET, STORED, StateDire
 from tests.support.answers import example
 from tests.support.command import rosrv
 
-FIRST = (
-    "--address=192.0.2.2",
-    "--other=192.0.2.3",
-    "--witness=192.0.2.10",
-    "--fixed=192.0.2.100",
-)
+FIRST = ("--address=192.0.2.2", "--other=192.0.2.3", "--witness=192.0.2.10", "--fixed=192.0.2.100")
 
 
 @pytest.fixture(autouse=True)

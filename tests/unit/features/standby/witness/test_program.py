@@ -11,20 +11,13 @@ from tests.unit.features.standby.witness.robot import BOTH
 @pytest.fixture
 def settings(tmp_path: Path) -> Path:
     path = tmp_path / "witness.json"
-    path.write_text(
-        json.dumps(
-            {
-                "listen": "10.0.0.1:7411",
-                "fixed": "10.0.0.100",
-                "ports": ["11311", "20000-20999"],
-                "appliances": {
-                    "a": {"address": "10.0.0.2", "key": "aa" * 32},
-                    "b": {"address": "10.0.0.3", "key": "bb" * 32},
-                },
-                "state": str(tmp_path / "state/lease"),
-            }
-        )
-    )
+    appliances = {
+        "a": {"address": "10.0.0.2", "key": "aa" * 32},
+        "b": {"address": "10.0.0.3", "key": "bb" * 32},
+    }
+    given = {"listen": "10.0.0.1:7411", "fixed": "10.0.0.100", "ports": ["11311", "20000-20999"]}
+    state = str(tmp_path / "state/lease")
+    path.write_text(json.dumps({**given, "appliances": appliances, "state": state}))
     path.chmod(0o600)
     return path
 
