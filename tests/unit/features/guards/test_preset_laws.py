@@ -15,7 +15,7 @@ import pytest
 
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.features.guards.robot_graph import GOAL, VELOCITIES
-from rosmop.run.outcomes import MessageSender
+from rosmop.run.outcomes import MessageSender, Outcome
 from rosmop.tests.acting import fields, message
 from rosmop.text import tree
 from rosmop.text.parser import parse, roles
@@ -116,23 +116,13 @@ APART = {
 """Presets that no motion passes or not, each with the test that has its states."""
 
 REASONS: dict[tuple[str, str, str, str], str] = {
-    (
-        "*",
-        "*",
-        "*",
-        "another host",
-    ): "a node's name is unique at a master, so another host is another node: same cell",
+    ("*", "*", "*", "another host"): "a node's name is unique at a master, so another host is another node: same cell",
     ("deadman", "command", "*", "another node"): "`watchdog` of `oracles.py`",
     ("*", "command", "*", "another node"): "a command counts for what it says, whichever node sends it",
     ("deadman", "command", "*", "old"): "`watchdog` of `oracles.py`",
     ("*", "command", "*", "old"): "the age of commands is the law of `deadman`",
     ("*", "command", "*", "absent"): "without a command a base does not move",
-    (
-        "*",
-        "command",
-        "",
-        "unreadable",
-    ): "the base cannot read it either: the motion in force stays, with its evidence",
+    ("*", "command", "", "unreadable"): "the base cannot read it either: the motion in force stays, with its evidence",
     ("*", "*", "", "NaN"): "only the arrival of a message counts, whatever it says",
     ("*", "*", "", "out of range"): "only the arrival of a message counts, whatever it says",
     ("separation", "command", "rz", "NaN"): "a turn is judged by the way that it bends, and finite by `sane`",
@@ -143,20 +133,11 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ("fence", "command", "steer", "*"): "as its turn",
     ("separation", "by", "most", "out of range"): "a greater range is no danger: the readings are within it",
     ("sensor", "by", "high", "out of range"): "as `separation`",
-    (
-        "sensor",
-        "by",
-        "*",
-        "out of range",
-    ): "these types declare no range: a wrong value that changes is not noticed",
+    ("sensor", "by", "*", "out of range"): "these types declare no range: a wrong value that changes is not noticed",
     ("joints", "command", "*", "NaN"): "`test_a_trajectory_keeps_the_limits_of_its_joints`",
     ("joints", "command", "*", "out of range"): "`test_a_trajectory_keeps_the_limits_of_its_joints`",
-    (
-        "joints",
-        "state",
-        "names",
-        "*",
-    ): "a name is found or not: `test_a_trajectory_needs_the_present_position_of_each_joint`",
+    ("joints", "state", "names", "*"):
+        "a name is found or not: `test_a_trajectory_needs_the_present_position_of_each_joint`",
     ("*", "*", "pressed", "NaN"): "a truth value has no NaN",
     ("*", "*", "done", "NaN"): "a truth value has no NaN",
     ("*", "*", "held", "NaN"): "a truth value has no NaN",
@@ -164,18 +145,10 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ("hold_to_run", "by", "buttons", "NaN"): "a whole number has no NaN",
     ("hold_to_run", "by", "buttons", "out of range"): "`test_a_button_of_a_joystick_is_a_device`",
     ("zone", "by", "most", "out of range"): "as `separation`",
-    (
-        "zone",
-        "mute",
-        "*",
-        "*",
-    ): "muting is off by default: `test_muting_is_off_by_default_bounded_and_needs_a_signal_that_changes`",
-    (
-        "diagnostics",
-        "by",
-        "statuses",
-        "*",
-    ): "`test_an_entry_that_is_bad_silent_or_missing_stops_the_base_until_a_zero` has the levels and names",
+    ("zone", "mute", "*", "*"):
+        "muting is off by default: `test_muting_is_off_by_default_bounded_and_needs_a_signal_that_changes`",
+    ("diagnostics", "by", "statuses", "*"):
+        "`test_an_entry_that_is_bad_silent_or_missing_stops_the_base_until_a_zero` has the levels and names",
     ("*", "*", "status", "NaN"): "a whole number has no NaN",
     ("sensor", "by", "altitude", "NaN"): "an altitude is not known without a fix in three dimensions",
     ("*", "*", "fixed", "NaN"): "a whole number has no NaN",
@@ -185,17 +158,16 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ("estop", "reset", "*", "unreadable"): "what is no message resets nothing: the guard holds",
     ("estop", "reset", "*", "another node"): "`two_hands` of `oracles.py`",
     ("estop", "reset", "*", "after a reset"): "`stop_button` of `oracles.py`",
-}
+}  # fmt: skip
 """Why a cell is not judged here. `*` stands for any; the first key that fits counts."""
 
 
-def reason(preset: str, topic: str, name: str, state: str) -> str:
-    for key, why in REASONS.items():
-        if all(
-            wanted in {"*", given} for wanted, given in zip(key, (preset, topic, name, state), strict=True)
-        ):
-            return why
-    return ""
+def fits(key: Sequence[str], cell: Sequence[str]) -> bool:
+    return all(wanted in {"*", given} for wanted, given in zip(key, cell, strict=True))
+
+
+def reason(*cell: str) -> str:
+    return next((why for key, why in REASONS.items() if fits(key, cell)), "")
 
 
 @dataclass(frozen=True)
@@ -268,12 +240,8 @@ class Lab(Guarded):
         kind = self.kinds[given]
         if data is None:
             recipe = RECIPES[self.preset]
-            good = {
-                **EVIDENCE[kind](self.count),
-                **recipe.typed.get(kind, {}),
-                **recipe.evidence.get(given, {}),
-            }
-            data = message(kind, **{**good, **(change or {})})
+            differs = {**recipe.typed.get(kind, {}), **recipe.evidence.get(given, {}), **(change or {})}
+            data = message(kind, **{**EVIDENCE[kind](self.count), **differs})
         outcome = self.monitors.judge(
             self.topics[given], bytearray(data), BEGIN + self.at * MS, MessageSender(NODES.index(node))
         )
@@ -298,13 +266,14 @@ class Lab(Guarded):
             return any(_get(read, path) != 0 for name, path in PATHS[kind].items() if name in MOVING)
         return kind != TRAJECTORY or len(fields(kind, data).points) > 0
 
-    def passes(self, change: Values | None = None, *, moves: bool = True) -> bool:
-        outcome = self.monitors.judge(
-            self.topics["command"],
-            bytearray(self.command(change, moves=moves)),
-            BEGIN + self.at * MS,
-            MessageSender(1),
+    def judged(self, data: bytes) -> Outcome:
+        """Let `/a` send a command."""
+        return self.monitors.judge(
+            self.topics["command"], bytearray(data), BEGIN + self.at * MS, MessageSender(1)
         )
+
+    def passes(self, change: Values | None = None, *, moves: bool = True) -> bool:
+        outcome = self.judged(self.command(change, moves=moves))
         self.receive(outcome, self.at)
         return outcome.result != "dropped" and self.moved(bytes(outcome.buffer))
 
@@ -403,11 +372,8 @@ def _wrong_command(lab: Lab, place: Place, value: float) -> str:
     value = value if place.kind in DOUBLES or not abs(value) > 3e38 else 3e38
     change = {place.path.replace(".", "__"): value}
     how = RECIPES[place.preset].velocities
-    outcome = lab.monitors.judge(
-        lab.topics["command"], bytearray(lab.command(change)), BEGIN + lab.at * MS, MessageSender(1)
-    )
-    read = fields(place.kind, bytes(outcome.buffer))
-    got = _get(read, place.path)
+    outcome = lab.judged(lab.command(change))
+    got = _get(fields(place.kind, bytes(outcome.buffer)), place.path)
     is_finite = math.isfinite(_get(fields(place.kind, lab.command(change)), place.path))
     if how == "stopped":
         return "" if lab.moved(bytes(outcome.buffer)) == is_finite else "it is not stopped"
@@ -421,9 +387,7 @@ def _unreadable(lab: Lab, place: Place) -> str:
     lab.got.clear()
     if place.topic == "command":
         data = lab.command()[:3]
-        outcome = lab.monitors.judge(
-            lab.topics["command"], bytearray(data), BEGIN + lab.at * MS, MessageSender(1)
-        )
+        outcome = lab.judged(data)
         return "it passes" if outcome.result != "dropped" and bytes(outcome.buffer) == data else ""
     passed = lab.run(600, without=place.topic, bad=lambda: lab.send(place.topic, data=b""))
     return "a motion passes" if passed else ""
@@ -504,6 +468,4 @@ def test_each_reason_has_a_cell() -> None:
     places = [place for preset in RECIPES for place in places_of(preset)]
     for *cell, state in REASONS:
         there = ((place.preset, place.topic, place.name) for place in places)
-        assert state in {"*", *STATES} and any(
-            all(wanted in {"*", given} for wanted, given in zip(cell, one, strict=True)) for one in there
-        ), f"no cell has the reason {cell}"
+        assert state in {"*", *STATES} and any(fits(cell, one) for one in there), f"no cell has {cell}"
