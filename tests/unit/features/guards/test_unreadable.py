@@ -10,12 +10,7 @@ from rosmop.run.engine import MonitorSet
 from rosmop.run.origins import MAX, Origin
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import message
-from tests.support.features.guards.running_guard import (
-    DEFINITIONS,
-    interpreted,
-    on_its_module,
-    part_of,
-)
+from tests.support.features.guards.running_guard import DEFINITIONS, interpreted, on_its_module, part_of
 from tests.support.rows import require_rows
 
 SECOND = 10**9
@@ -65,11 +60,27 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def started(name: str, made: Callable[[SetPart], MonitorSet]) -> MonitorSet:
-    text = text_of(Guard(name, PRESETS[name], values=VALUES.get(name, {})))
+Made = Callable[[SetPart], MonitorSet]
+
+
+def started(name: str, made: Made, **values: str) -> MonitorSet:
+    text = text_of(Guard(name, PRESETS[name], values=values or VALUES.get(name, {})))
     monitors = made(part_of(text))
     monitors.start(0)
     return monitors
+
+
+def named(name: str, made: Made, **values: str) -> MonitorSet:
+    """Return monitors that know their senders' names."""
+    monitors = started(name, made, **values)
+    monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+    return monitors
+
+
+def restarted(monitors: MonitorSet, following: MonitorSet, now: int) -> MonitorSet:
+    groups = [(one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()]
+    following.recover(groups, {}, now, restarted=True)
+    return following
 
 
 @pytest.mark.complete
@@ -90,7 +101,7 @@ def test_the_table_has_each_topic_that_a_preset_observes() -> None:
     ("name", "damaged"), [(name, topic) for name, given in GOOD.items() for topic in given]
 )
 def test_a_moving_base_is_stopped_by_an_unreadable_observation(
-    name: str, damaged: str, damage: str, made: Callable[[SetPart], MonitorSet]
+    name: str, damaged: str, damage: str, made: Made
 ) -> None:
     monitors, topics, now = started(name, made), PRESETS[name].given_topics, SECOND
     for topic, data in BEFORE.get(name, {}).items():
@@ -140,23 +151,16 @@ def told(monitors: MonitorSet, name: str, now: int, nodes: Mapping[str, int], br
 @pytest.mark.parametrize("kept", [False, True], ids=["running", "restarted"])
 @pytest.mark.parametrize(("name", "damaged"), BEGIN)
 def test_no_other_node_takes_the_place_of_one_whose_bytes_are_unreadable(
-    name: str, damaged: str, kept: bool, made: Callable[[SetPart], MonitorSet]
+    name: str, damaged: str, kept: bool, made: Made
 ) -> None:
-    def named() -> MonitorSet:
-        monitors = started(name, made)
-        monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
-        return monitors
-
-    monitors, now = named(), SECOND
+    monitors, now = named(name, made), SECOND
     for topic, data in BEFORE.get(name, {}).items():
         monitors.judge(PRESETS[name].given_topics[topic], bytearray(data), now, MessageSender(1))
     results = [told(monitors, name, now := now + SECOND // 100, {"": 1}) for _ in range(8)]
     assert results[-1] == "passed"
     told(monitors, name, now := now + SECOND // 100, {"": 1}, damaged)
     if kept:
-        groups = [(one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()]
-        monitors = named()
-        monitors.recover(groups, {}, now, restarted=True)
+        monitors = restarted(monitors, named(name, made), now)
     for switched in (False, True):
         if switched:
             for enabled in (False, True):
@@ -211,18 +215,11 @@ def test_speakers_are_all_heard_and_all_awaited() -> None:
     ("name", "permits", "forbids"), [("hold_to_run", b"\1", b"\0"), ("mode", b"\0", b"\1")]
 )
 def test_the_word_of_a_node_is_not_forgotten_when_the_guard_begins_again(
-    name: str, permits: bytes, forbids: bytes, how: str, made: Callable[[SetPart], MonitorSet]
+    name: str, permits: bytes, forbids: bytes, how: str, made: Made
 ) -> None:
     """One of two nodes forbids the motion, and says nothing more; the guard must not go on with the other alone."""
-    text = text_of(Guard(name, PRESETS[name], values={"silent": "0"} if name == "mode" else {}))
-
-    def named() -> MonitorSet:
-        monitors = made(part_of(text))
-        monitors.start(0)
-        monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
-        return monitors
-
-    monitors, now, topic = named(), SECOND, PRESETS[name].given_topics["by"]
+    values = {"silent": "0"} if name == "mode" else {}
+    monitors, now, topic = named(name, made, **values), SECOND, PRESETS[name].given_topics["by"]
 
     def moves(node: int, said: bytes) -> bool:
         nonlocal now
@@ -241,9 +238,7 @@ def test_the_word_of_a_node_is_not_forgotten_when_the_guard_begins_again(
     else:
         monitors.judge(topic, bytearray(b"\0\0"), now, MessageSender(1))
     if how == "restarted":
-        groups = [(one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()]
-        monitors = named()
-        monitors.recover(groups, {}, now, restarted=True)
+        monitors = restarted(monitors, named(name, made, **values), now)
     assert not any(moves(1, said) for said in (b"\0", permits) * 10)
     assert monitors.monitor(name).awaits == f"/other on {topic}"
     monitors.resume(name)
@@ -251,11 +246,8 @@ def test_the_word_of_a_node_is_not_forgotten_when_the_guard_begins_again(
 
 
 @MADE
-def test_the_topic_is_withheld_until_each_known_switch_has_spoken(
-    made: Callable[[SetPart], MonitorSet],
-) -> None:
-    monitors = started("withhold", made)
-    monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+def test_the_topic_is_withheld_until_each_known_switch_has_spoken(made: Made) -> None:
+    monitors = named("withhold", made)
     for node in (1, 2):
         monitors.judge("/privacy", bytearray(b"\0"), node, MessageSender(node))
     assert monitors.withheld_from("/camera/image_raw") == ()
@@ -266,11 +258,8 @@ def test_the_topic_is_withheld_until_each_known_switch_has_spoken(
 
 
 @MADE
-def test_a_person_lets_a_guard_hear_a_sensor_with_another_name(
-    made: Callable[[SetPart], MonitorSet],
-) -> None:
-    monitors, now = started("sensor", made), SECOND
-    monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+def test_a_person_lets_a_guard_hear_a_sensor_with_another_name(made: Made) -> None:
+    monitors, now = named("sensor", made), SECOND
     for _ in range(4):
         result = told(monitors, "sensor", now := now + SECOND // 100, {"": 1})
     assert result == "passed"
@@ -302,7 +291,7 @@ def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
 
 
 @MADE
-def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[SetPart], MonitorSet]) -> None:
+def test_an_unreadable_joint_state_ends_the_trajectory(made: Made) -> None:
     monitors = started("joints", made)
     outcome = monitors.judge("/joint_states", bytearray(b"\1"), SECOND)
     assert [fault.malformed for fault in outcome.faults] == [True]
@@ -311,7 +300,7 @@ def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[SetPart],
 
 
 @MADE
-def test_the_topic_is_withheld_after_an_unreadable_switch(made: Callable[[SetPart], MonitorSet]) -> None:
+def test_the_topic_is_withheld_after_an_unreadable_switch(made: Made) -> None:
     monitors = started("withhold", made)
     monitors.judge("/privacy", bytearray(b"\0"), 1)
     assert monitors.withheld_from("/camera/image_raw") == ()
@@ -322,9 +311,7 @@ def test_the_topic_is_withheld_after_an_unreadable_switch(made: Callable[[SetPar
 @MADE
 @pytest.mark.parametrize("part", ["request", "response"])
 @pytest.mark.parametrize("damage", ["cut", "trailing"])
-def test_an_unreadable_observation_of_a_service(
-    part: str, damage: str, made: Callable[[SetPart], MonitorSet]
-) -> None:
+def test_an_unreadable_observation_of_a_service(part: str, damage: str, made: Made) -> None:
     field, data = ("data", b"\1") if part == "request" else ("success", b"\1\0\0\0\0")
     text = f"""guard() {{ safe geometry_msgs/Twist {{ }} on /cmd_vel every 100ms; bool off = false;
         event arm(bool on) service /arm std_srvs/SetBool {part} '{{{field}:on}}' {{ off = !on; }}
