@@ -4,22 +4,10 @@ import math
 
 import numpy as np
 
-from lab.closed_loop.messages import (
-    Legs,
-    battery,
-    boolean,
-    odometry,
-    scan,
-)
+from lab.closed_loop.messages import Legs, battery, boolean, odometry, scan
 from rosmop.tests.acting import message
 from tests.unit.features.guards.guarding import seeded
-from tests.unit.features.guards.tracing import (
-    Source,
-    Trace,
-    finite,
-    motion,
-    pause,
-)
+from tests.unit.features.guards.tracing import Source, Trace, finite, motion, pause
 
 
 def sensor(seed: int, events: int = 60) -> None:

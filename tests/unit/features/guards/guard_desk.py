@@ -16,10 +16,7 @@ from tests.unit.specifications.monitor_desk import Desk
 
 TYPES = {"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"}
 FENCE = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 1,0 1,1"})
-FILES = {
-    "fence.rv": text_of(FENCE),
-    "other.rv": "other() { event said() /chatter std_msgs/String '{}' { } }",
-}
+FILES = {"fence.rv": text_of(FENCE), "other.rv": "other() { event said() /chatter std_msgs/String '{}' { } }"}
 
 
 @cache

@@ -33,12 +33,7 @@ class Guarded:
     """A base behind a guard, and behind the monitors of the texts `before` it; `got` is what arrives there."""
 
     def __init__(
-        self,
-        preset: str,
-        types: dict[str, str] | None = None,
-        *,
-        before: Sequence[str] = (),
-        **values: Value,
+        self, preset: str, types: dict[str, str] | None = None, *, before: Sequence[str] = (), **values: Value
     ) -> None:
         part, given = part_with(preset, types or {}, values, before=before)
         monitors = on_its_module(part)

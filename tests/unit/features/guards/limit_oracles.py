@@ -4,22 +4,9 @@ import math
 
 import numpy as np
 
-from lab.closed_loop.messages import (
-    ACKERMANN,
-    STILL,
-    Legs,
-    moves,
-    steering,
-)
+from lab.closed_loop.messages import ACKERMANN, STILL, Legs, moves, steering
 from tests.unit.features.guards.guarding import seeded
-from tests.unit.features.guards.tracing import (
-    Trace,
-    finite,
-    motion,
-    near,
-    norm,
-    scaled,
-)
+from tests.unit.features.guards.tracing import Trace, finite, motion, near, norm, scaled
 
 HUGE = 1e150
 """A velocity whose square is infinite may become zero."""

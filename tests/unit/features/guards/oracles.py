@@ -183,13 +183,9 @@ def stop_button(seed: int, events: int = 60, *, two_hands: bool = False) -> None
     together = chance.choice((200, 500))
     zero_first = chance.random() < 0.7
     trace = Trace(
-        "estop",
-        seed,
-        silent=silent / 1000,
-        zeroFirst=zero_first,
-        twoHands=two_hands,
+        "estop", seed, silent=silent / 1000, zeroFirst=zero_first, twoHands=two_hands,
         together=together / 1000,
-    )
+    )  # fmt: skip
     buttons, zeros = Switches(silent), Zeros(100)
     presses = (3, 4) if chance.random() < 0.4 else (3,)
     hands = (5, 6)

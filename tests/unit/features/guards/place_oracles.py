@@ -4,20 +4,9 @@ import math
 
 import numpy as np
 
-from lab.closed_loop.messages import (
-    ODOMETRY,
-    Legs,
-    position,
-    scan,
-)
+from lab.closed_loop.messages import ODOMETRY, Legs, position, scan
 from tests.unit.features.guards.guarding import seeded
-from tests.unit.features.guards.tracing import (
-    Source,
-    Trace,
-    norm,
-    pause,
-    straight,
-)
+from tests.unit.features.guards.tracing import Source, Trace, norm, pause, straight
 
 
 def _approaches(place: tuple[float, float], velocity: tuple[float, float], size: float) -> bool:

@@ -155,9 +155,7 @@ CONSEQUENCES: list[Callable[[bool], bool]] = [
 
 
 @pytest.mark.parametrize("happens", CONSEQUENCES, ids=[one.__name__ for one in CONSEQUENCES])
-def test_the_wrong_order_has_its_consequence_and_phases_prevent_it(
-    happens: Callable[[bool], bool],
-) -> None:
+def test_the_wrong_order_has_its_consequence_and_phases_prevent_it(happens: Callable[[bool], bool]) -> None:
     assert happens(False)
     assert not happens(True)
 

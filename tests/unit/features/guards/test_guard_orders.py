@@ -199,11 +199,13 @@ async def test_a_guard_has_its_last_stop(monitors: SpecificationManager, orders:
     assert (await row(orders)).last_stop == msgspec.structs.replace(going_on, until=7)
 
 
-async def test_a_guard_is_withholding_while_its_relay_says_so(
+async def test_a_guard_is_withholding_and_names_the_nodes_that_it_awaits_as_its_relay_says(
     monitors: SpecificationManager, orders: GuardOrders
 ) -> None:
-    monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv", withholds=True)]))
-    assert (await row(orders)).state == "withholding"
+    counted = MonitorRow("fence", "fence.rv", withholds=True, awaits="/lidar on /scan")
+    monitors.received(MonitorsCounted([counted]))
+    found = await row(orders)
+    assert (found.state, found.awaits) == ("withholding", "/lidar on /scan")
 
 
 async def test_a_guard_has_the_digest_of_its_preset_text_and_values(
@@ -340,13 +342,6 @@ async def test_the_heartbeat_is_off_for_the_reason_of_a_relay(monitors: Specific
     assert events == ["heartbeat begun", "heartbeat ended", "heartbeat begun"]
     monitors.rollout.lost(0)
     assert orders.state().heartbeat == "a relay process ended"  # type: ignore[union-attr]  # a heartbeat is set
-
-
-async def test_a_guard_names_the_nodes_that_it_awaits(
-    monitors: SpecificationManager, orders: GuardOrders
-) -> None:
-    monitors.received(MonitorsCounted([MonitorRow("fence", "fence.rv", awaits="/lidar on /scan")]))
-    assert (await row(orders)).awaits == "/lidar on /scan"
 
 
 async def test_the_topic_that_cancels_goals_is_not_one_to_make_the_guard_with(

@@ -5,11 +5,7 @@ import pytest
 
 from rosmop.tests.acting import message
 from rosmop.tests.examples import sample
-from tests.unit.features.guards.guarding import (
-    Guarded,
-    legs_of,
-    twist,
-)
+from tests.unit.features.guards.guarding import Guarded, legs_of, twist
 
 STILL = twist()
 

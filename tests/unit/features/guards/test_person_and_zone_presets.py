@@ -22,13 +22,9 @@ def scan(
     ranges: list[float], start: float = -1.5, step: float = 0.1, far: float = 10.0, low: float = 0.1
 ) -> bytes:
     return message(
-        "sensor_msgs/LaserScan",
-        angle_min=start,
-        angle_increment=step,
-        range_min=low,
-        range_max=far,
+        "sensor_msgs/LaserScan", angle_min=start, angle_increment=step, range_min=low, range_max=far,
         ranges=ranges,
-    )
+    )  # fmt: skip
 
 
 def moves(guard: Guarded, data: bytes, at: int, node: str = "/a") -> bool:

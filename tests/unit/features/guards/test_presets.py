@@ -213,15 +213,9 @@ WRONG = [
     ("speed", "a b", {}, {}, {}, "not a name of a monitor"),
     ("speed", "base", {"command": "cmd"}, {}, {}, "not the name of a topic"),
     ("speed", "base", {"by": "/odom"}, {}, {}, "no topic 'by' is given to speed"),
-    (
-        "speed",
-        "base",
-        {"command": "/c"},
-        {"command": "std_msgs/Bool"},
-        {},
-        "/c has the type std_msgs/Bool; speed works",
-    ),
-]
+    ("speed", "base", {"command": "/c"}, {"command": "std_msgs/Bool"}, {},
+     "/c has the type std_msgs/Bool; speed works"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("preset", "name", "topics", "types", "values", "why"), WRONG)

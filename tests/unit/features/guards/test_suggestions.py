@@ -459,33 +459,16 @@ def test_a_topic_of_any_type_is_watched_by_its_silence_alone() -> None:
 
 
 PLANS = [
-    (
-        "fence",
-        {"command": "/cmd_vel", "by": "/scan"},
-        {},
-        "/scan has the type sensor_msgs/LaserScan; fence works with",
-    ),
+    ("fence", {"command": "/cmd_vel", "by": "/scan"}, {},
+     "/scan has the type sensor_msgs/LaserScan; fence works with"),
     ("speed", {"command": "/cmd_ve"}, {}, "no node has the topic /cmd_ve now; did you mean /cmd_vel?"),
     ("speed", {"command": "/scan"}, {}, "/scan has the type sensor_msgs/LaserScan"),
-    (
-        "speed",
-        {"command": "/cmd_vel"},
-        {"command": "geometry_msgs/TwistStamped"},
-        "has the type geometry_msgs/Twist on",
-    ),
-    (
-        "agree",
-        {"command": "/cmd_vel", "by": "/odom", "other": "/odom"},
-        {},
-        "agree needs two topics for by and other, and /odom is given for both",
-    ),
-    (
-        "agree",
-        {"command": "/cmd_vel"},
-        {},
-        "agree needs a topic for other: give --topic other=TOPIC; this robot has",
-    ),
-]
+    ("speed", {"command": "/cmd_vel"}, {"command": "geometry_msgs/TwistStamped"},
+     "has the type geometry_msgs/Twist on"),
+    ("agree", {"command": "/cmd_vel", "by": "/odom", "other": "/odom"}, {},
+     "agree needs two topics for by and other, and /odom is given for both"),
+    ("agree", {"command": "/cmd_vel"}, {}, "agree needs a topic for other: give --topic other=TOPIC; this robot has"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("preset", "topics", "kinds", "why"), PLANS)

@@ -69,12 +69,14 @@ LOADED = [
 class Robot:
     """An appliance with guards: its answers, and the orders that it got. `loaded` are the rows of its guards."""
 
-    as_json = False
     place: str | None = None
     off = False
     readout = MonitorReadout("fence", {}, {}, 0.0)
 
-    def __init__(self, folder: Path | None, *guards: Guard, shadow: bool = False) -> None:
+    def __init__(
+        self, folder: Path | None, *guards: Guard, shadow: bool = False, as_json: bool = False
+    ) -> None:
+        self.as_json = as_json
         self.orders: list[Any] = []
         self.refused = ["it would hold /c"]
         self.files = {f"{guard.name}.rv": text_of(guard) for guard in guards}
@@ -175,8 +177,7 @@ def test_a_guard_that_may_roll_back_is_not_written(tmp_path: Path) -> None:
 
 
 def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    robot = Robot(tmp_path, FENCE)
-    robot.as_json = True
+    robot = Robot(tmp_path, FENCE, as_json=True)
     run(verbs.new, robot, "speed", "/cmd_vel")
     assert (tmp_path / "speed.rv").exists()
     run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
@@ -189,8 +190,7 @@ def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("new", [True, False])
 def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new: bool) -> None:
-    robot, replayed = Robot(tmp_path, FENCE), list[str]()
-    robot.as_json = True
+    robot, replayed = Robot(tmp_path, FENCE, as_json=True), list[str]()
     monkeypatch.setattr(verbs, "_replay", lambda _robot, row, _text, _since: replayed.append(row.name))
     verb, options = (verbs.new, ("fence", "/cmd_vel")) if new else (verbs.set_values, ("fence",))
     with pytest.raises(typer.Exit) as ended:
@@ -242,8 +242,7 @@ def test_a_folder_that_cannot_be_changed_is_reported(
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(Path, "unlink", fails)
-    robot = Robot(tmp_path, FENCE)
-    robot.as_json = as_json
+    robot = Robot(tmp_path, FENCE, as_json=as_json)
     run(verbs.remove, robot, "fence")
     shown = capsys.readouterr()
     assert "not removed" not in shown.out + shown.err
@@ -319,9 +318,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
         "not protected:\n"
         "    no button stops /cmd_vel\n"
     )
-    robot = Robot(None)
-    robot.as_json = True
-    run(suggest_verb.suggest, robot)
+    run(suggest_verb.suggest, Robot(None, as_json=True))
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert lines[0] == {"loaded": "mine", "preset": "deadman", "topics": {"command": "/cmd_vel"}}
     assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})
@@ -349,9 +346,7 @@ def test_a_value_that_is_a_time_has_an_age(
 
 
 def test_each_guard_of_the_list_has_its_digest_in_json(capsys: pytest.CaptureFixture[str]) -> None:
-    robot = Robot(None)
-    robot.as_json = True
-    run(verbs.list_guards, robot)
+    run(verbs.list_guards, Robot(None, as_json=True))
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     digests = {line["guard"]: line["digest"] for line in lines if "guard" in line}
     assert digests == {name: f"digest of {name}" for name in ("fence", "old", "mine")}
