@@ -40,10 +40,7 @@ class Control:
     def _linked(self, _lifeline: Any, _messages: Any, *, said: Any, took: Any, **_more: Any) -> Any:
         self.say, self.give, self.ended = said, took, asyncio.Event()
         return SimpleNamespace(
-            attach=lambda _first: None,
-            tell=self._told,
-            ended=self.ended,
-            close=lambda: None,
+            attach=lambda _first: None, tell=self._told, ended=self.ended, close=lambda: None
         )
 
     def _told(self, report: Any) -> bool:

@@ -33,6 +33,16 @@ def string(text: str) -> bytes:
     return struct.pack("<I", len(text)) + text.encode()
 
 
+async def offers_late(node: RosNode, service: str, kind: str, seconds: float = 3600) -> None:
+    """Offer a service that answers after this time."""
+
+    async def answer(_body: bytes) -> bytes:
+        await asyncio.sleep(seconds)
+        return b""
+
+    await node.offer(service, ServiceType.defined(standard_definitions(), kind), answer)
+
+
 async def talks(node: RosNode, topic: str, *, latched: bool = False) -> Any:
     kind = MessageType.defined(standard_definitions(), "std_msgs/String")
     return await node.advertise(topic, kind, latched=latched, queue=100)
@@ -55,13 +65,7 @@ async def test_a_client_whose_right_ends_before_its_handshake_gets_nothing(
 async def test_wills_and_arguments_of_waiting_calls_are_bounded(world: DoorWorld) -> None:
     """Each is charged its own bytes, not those of its whole frame."""
     robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-    slow = ServiceType.defined(standard_definitions(), "roscpp/SetLoggerLevel")
-
-    async def answer(_body: bytes) -> bytes:
-        await asyncio.sleep(3600)
-        return b""
-
-    await robot.offer("/slow", slow, answer)
+    await offers_late(robot, "/slow", "roscpp/SetLoggerLevel")
     large, will = "x" * (1 << 18), {"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"}
     client.send(will | {"will": {"data": "x" * 5000}})
     assert "at most 4096" in (await client.next())["msg"]
@@ -461,14 +465,7 @@ async def test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_
 
 async def test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts(world: DoorWorld) -> None:
     """A call waits on for ten seconds although its client has left."""
-    robot = await world.robot("10.0.0.3", "/robot")
-
-    async def answer(_body: bytes) -> bytes:
-        await asyncio.sleep(3600)
-        return b""
-
-    kind = ServiceType.defined(standard_definitions(), "std_srvs/Empty")
-    await robot.offer("/hangs", kind, answer)
+    await offers_late(await world.robot("10.0.0.3", "/robot"), "/hangs", "std_srvs/Empty")
     words = []
     for _client in range(10):
         client = await world.client()
@@ -564,13 +561,7 @@ def _taken(*clients: WebSocketClient) -> list[Any]:
 async def test_a_call_ends_soon_after_its_client_and_a_long_one_as_late_as_it_wishes(
     world: DoorWorld,
 ) -> None:
-    robot = await world.robot("10.0.0.3", "/robot")
-
-    async def answer(_body: bytes) -> bytes:
-        await asyncio.sleep(600)
-        return b""
-
-    await robot.offer("/slow", ServiceType.defined(standard_definitions(), "std_srvs/Empty"), answer)
+    await offers_late(await world.robot("10.0.0.3", "/robot"), "/slow", "std_srvs/Empty", 600)
     stays, leaves = await world.client(), await world.client()
     for client, number in ((stays, 1), (leaves, 2)):
         client.send({"op": "call_service", "service": "/slow", "id": number, "timeout": 3600})

@@ -135,13 +135,9 @@ async def views_another_topic(world: DoorWorld, _client: WebSocketClient, robot:
 
 
 WAYS: tuple[Callable[[DoorWorld, WebSocketClient, RosNode], Awaitable[None]], ...] = (
-    calls_a_service_of_ros,
-    offers_a_service,
-    publishes_a_type_of_ros,
-    publishes_a_type_of_the_operator,
-    reads_details,
-    views_another_topic,
-)
+    calls_a_service_of_ros, offers_a_service, publishes_a_type_of_ros, publishes_a_type_of_the_operator,
+    reads_details, views_another_topic,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
