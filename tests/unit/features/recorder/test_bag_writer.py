@@ -12,13 +12,9 @@ from appliance.features.recorder.bag_writer import (
 )
 
 HEADER = {
-    "topic": "/chatter",
-    "type": "std_msgs/String",
-    "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1",
-    "message_definition": "string data\n",
-    "callerid": "/talker",
-    "host": "10.0.0.1",
-}
+    "topic": "/chatter", "type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1",
+    "message_definition": "string data\n", "callerid": "/talker", "host": "10.0.0.1",
+}  # fmt: skip
 SECOND = 1_000_000_000
 
 

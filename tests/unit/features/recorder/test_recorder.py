@@ -74,7 +74,7 @@ class Scene:
         self.stream.write(memoryview(frame(body)), 1, self.said)
 
     def happen(self, event: str = "message dropped", **fields: Any) -> str:
-        record = decision(self.log, event=event, decision=None, time=self.clock.now, **fields)
+        record = decision(self.log, **{"event": event, "decision": None, "time": self.clock.now} | fields)
         self.log.record(record)
         settle(self.log)
         return record.id
@@ -120,22 +120,13 @@ def test_before_and_after(scene: Scene) -> None:
     [trigger] = recording.triggers
     assert trigger.equal
     assert msgspec.structs.replace(trigger, equal="") == Trigger(
-        happened,
-        "drop",
-        dropped,
-        "message dropped: too fast",
-        monitor="limit",
-        resource="/chatter",
-        host="10.0.0.1",
-        caller_id="/voice",
+        happened, "drop", dropped, "message dropped: too fast", monitor="limit", **where
     )
     [topic] = recording.topics
     assert (topic.topic, topic.type, topic.messages, topic.missed) == ("/chatter", "std_msgs/String", 2, 0)
     found = scene.bag(recording)
-    assert [data for name, _time, data in found if name == "/chatter"] == [
-        TEXT.replace(b"hello", b"alarm"),
-        TEXT,
-    ]
+    alarm = TEXT.replace(b"hello", b"alarm")
+    assert [data for name, _time, data in found if name == "/chatter"] == [alarm, TEXT]
     [(_name, time, record)] = [row for row in found if row[0] == "/rosrv/records"]
     assert (time, json.loads(record[4:])["id"]) == (happened, dropped)
     assert [time for name, time, _data in found if name == "/rosrv/log"] == [happened]
@@ -229,9 +220,7 @@ def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
     scene.happen("monitor fault")
     assert len(scene.closed(scene.later(0.1) + scene.later(10))) == 1
     order = recorder_link.RecordingRequested(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
-    [begun] = [
-        answer for answer in scene.later(0, order) if isinstance(answer, recorder_link.RecordingStarted)
-    ]
+    [begun] = [one for one in scene.later(0, order) if isinstance(one, recorder_link.RecordingStarted)]
     assert (begun.number, begun.ends) == (7, scene.clock.now + 2 * SECOND)
     assert scene.closed(scene.later(3))[0].id == begun.id
     scene.log.close()
@@ -306,15 +295,7 @@ def test_a_record_names_a_recording_that_exists_or_is_reported(
         if arrival == "ended":  # the record is read late
             stopped = scene.clock.now
             told += scene.later(11)
-            record = decision(
-                scene.log,
-                event="stop begun",
-                decision=None,
-                time=stopped,
-                detail={"recording": x, "charged_to": "robot"},
-            )
-            scene.log.record(record)
-            settle(scene.log)
+            scene.happen("stop begun", time=stopped, detail={"recording": x, "charged_to": "robot"})
         else:
             scene.clock.now += {"order first": 0, "earlier plan": 3 * SECOND, "again": 2 * SECOND}[arrival]
             planned(scene, x, "robot")
@@ -429,11 +410,8 @@ def test_excluded_topics_are_listed_with_the_reason(scene: Scene) -> None:
     [recording] = scene.closed(scene.later(10))
     assert (recording.complete, "/front" in recording.why_not) == (False, True)
     assert {row.topic for row in recording.left_out} >= {"/front"}
-    assert {name for name, _time, _data in scene.bag(recording)} <= {
-        "/chatter",
-        "/rosrv/records",
-        "/rosrv/log",
-    }
+    own = {"/chatter", "/rosrv/records", "/rosrv/log"}
+    assert {name for name, _time, _data in scene.bag(recording)} <= own
 
 
 def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:

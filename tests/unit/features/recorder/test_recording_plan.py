@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from itertools import count
 from typing import Any
 
@@ -23,18 +22,12 @@ def made(**rules: object) -> RecordingPlan:
     ids = count(1)
     every: dict[str, Any] = {"enabled": True, "per_hour": 6, "before": 60, "after": 10} | rules
     return RecordingPlan(
-        RecorderRules(**every),
-        lambda host: NAMES.get(host, UNKNOWN),
-        lambda: str(next(ids)),
+        RecorderRules(**every), lambda host: NAMES.get(host, UNKNOWN), lambda: str(next(ids))
     )
 
 
-@pytest.fixture
-def dropped() -> Callable[..., dict[str, str]]:
-    def say(plan: RecordingPlan, host: str | None, now: int) -> dict[str, str]:
-        return plan.detail("message dropped", None, Severity.WARNING, host, now)
-
-    return say
+def dropped(plan: RecordingPlan, host: str | None, now: int) -> dict[str, str]:
+    return plan.detail("message dropped", None, Severity.WARNING, host, now)
 
 
 def test_each_host_has_its_own_hour_of_each_kind() -> None:
@@ -51,7 +44,7 @@ def test_each_host_has_its_own_hour_of_each_kind() -> None:
     assert not take(GUEST, "drop", SECOND + HOUR)
 
 
-def test_a_guests_flood_leaves_the_robot_its_recording(dropped: Callable[..., dict[str, str]]) -> None:
+def test_a_guests_flood_leaves_the_robot_its_recording() -> None:
     plan = made(longest=80)
     said = [dropped(plan, GUEST, NOW + number * 20 * SECOND) for number in range(100)]
     recordings = {row["recording"] for row in said if "recording" in row}
@@ -63,13 +56,13 @@ def test_a_guests_flood_leaves_the_robot_its_recording(dropped: Callable[..., di
     assert robot["charged_to"] == ROBOT
 
 
-def test_unknown_hosts_are_one(dropped: Callable[..., dict[str, str]]) -> None:
+def test_unknown_hosts_are_one() -> None:
     plan = made(longest=80)
     said = [dropped(plan, f"10.9.0.{number}", NOW + number * 15 * SECOND) for number in range(200)]
     assert len({row["recording"] for row in said if "recording" in row}) == 6
 
 
-def test_a_monitor_that_keeps_dropping_prolongs_one_recording(dropped: Callable[..., dict[str, str]]) -> None:
+def test_a_monitor_that_keeps_dropping_prolongs_one_recording() -> None:
     plan = made(longest=3600)
     said = [dropped(plan, GUEST, NOW + number * 30 * SECOND)["recording"] for number in range(30)]
     assert [said.count(name) for name in dict.fromkeys(said)] == [1, 29]
@@ -88,16 +81,14 @@ def test_recordings_of_a_host_do_not_overlap() -> None:
     )
 
 
-def test_a_recording_is_prolonged_to_the_maximum(dropped: Callable[..., dict[str, str]]) -> None:
+def test_a_recording_is_prolonged_to_the_maximum() -> None:
     plan = made(longest=100)
     said = [dropped(plan, GUEST, NOW + number * 5 * SECOND) for number in range(21)]
     assert said[0] == said[8] != said[9]
     assert [row["recording"] for row in said].count(said[9]["recording"]) > 9
 
 
-def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
-    dropped: Callable[..., dict[str, str]],
-) -> None:
+def test_hosts_together_have_two_open_recordings_and_the_robot_its_own() -> None:
     plan = made()
     assert "recording" in dropped(plan, GUEST, NOW)
     assert "recording" in dropped(plan, "10.0.0.8", NOW)
@@ -106,7 +97,7 @@ def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
     assert "recording" in dropped(plan, None, NOW)
 
 
-def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict[str, str]]) -> None:
+def test_a_record_without_a_recording_has_the_reason() -> None:
     assert "is off" in dropped(made(enabled=False), GUEST, NOW)["not_recorded"]
     plan = made()
     found = dropped(plan, GUEST, NOW)["recording"]
@@ -118,9 +109,7 @@ def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict
 
 
 @pytest.mark.parametrize("failed", [*NAMES, None, "10.9.0.1"])
-def test_a_failed_recording_hinders_only_its_owner(
-    failed: str | None, dropped: Callable[..., dict[str, str]]
-) -> None:
+def test_a_failed_recording_hinders_only_its_owner(failed: str | None) -> None:
     ours = {"127.0.0.1", None}
     for other in {*NAMES, None, "10.9.0.2"} - {failed}:
         plan = made()
@@ -132,9 +121,7 @@ def test_a_failed_recording_hinders_only_its_owner(
         assert "not_recorded" in dropped(plan, failed, NOW + 59 * SECOND)
 
 
-def test_a_report_about_a_recording_that_ended_hinders_no_host(
-    dropped: Callable[..., dict[str, str]],
-) -> None:
+def test_a_report_about_a_recording_that_ended_hinders_no_host() -> None:
     """A recording that is too large ends early; triggers until control's notice still have its id."""
     plan = made()
     ended, late = (dropped(plan, "127.0.0.1", NOW + number)["recording"] for number in range(2))
@@ -147,7 +134,7 @@ def test_a_report_about_a_recording_that_ended_hinders_no_host(
     assert dropped(plan, "127.0.0.1", NOW + 4 * SECOND)["recording"] == following
 
 
-def test_acts_prolong_the_recording_that_is_made_instead(dropped: Callable[..., dict[str, str]]) -> None:
+def test_acts_prolong_the_recording_that_is_made_instead() -> None:
     """A new control does not know yet what the recorder is making."""
     plan = made()
     unmade = dropped(plan, "127.0.0.1", NOW)["recording"]
@@ -160,16 +147,14 @@ def test_acts_prolong_the_recording_that_is_made_instead(dropped: Callable[..., 
     assert dropped(plan, "127.0.0.1", NOW + 31 * SECOND)["recording"] == following
 
 
-def test_a_clock_that_is_set_back_keeps_no_reason(dropped: Callable[..., dict[str, str]]) -> None:
+def test_a_clock_that_is_set_back_keeps_no_reason() -> None:
     plan = made()
     later = NOW + 24 * HOUR
     plan.missed(GUEST, dropped(plan, GUEST, later)["recording"], "the disk is nearly full", later)
     assert "recording" in dropped(plan, GUEST, NOW)
 
 
-def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
-    dropped: Callable[..., dict[str, str]],
-) -> None:
+def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not() -> None:
     plan = made()
     plan.opened(ROBOT, "asked", NOW - 60 * SECOND, NOW + 10 * SECOND)
     assert dropped(plan, "127.0.0.1", NOW)["recording"] == "asked"

@@ -24,19 +24,9 @@ def recording(
     time = number * SECOND
     trigger = Trigger(time, what, "record", "")
     return Recording(
-        f"{number:020x}",
-        time,
-        time,
-        [trigger],
-        [],
-        1,
-        1,
-        size=size,
-        sha256="",
-        complete=True,
-        why_not="",
-        charged_to=charged_to,
-    )
+        f"{number:020x}", time, time, [trigger], [], 1, 1,
+        size=size, sha256="", complete=True, why_not="", charged_to=charged_to,
+    )  # fmt: skip
 
 
 def put(store: RecordingStore, kept: Recording) -> Recording:
