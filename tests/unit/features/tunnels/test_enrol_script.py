@@ -170,10 +170,7 @@ def test_a_certified_kit_is_taken_after_an_interruption(host: Host, program: str
     """The token is used up by then: the next run must not need it."""
     host.run("aa", "first")
     real = shutil.which(program)
-    host.program(
-        program,
-        f'#!/bin/sh\ncase "$*" in *rosrv/rosrv-laptop) exit 1 ;; esac\nexec {real} "$@"\n',
-    )
+    host.program(program, f'#!/bin/sh\ncase "$*" in *rosrv/rosrv-laptop) exit 1 ;; esac\nexec {real} "$@"\n')
     assert host.run("bb", "second").returncode == 1
     host.program(program, f'#!/bin/sh\nexec {real} "$@"\n')
     assert "joined with the kit of second" in host.run("bb").stdout

@@ -12,20 +12,10 @@ from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.tunnel_answers import KitParts
 
 HOST = KitParts(
-    revision=1,
-    name="ocu-1",
-    address="10.113.11.2",
-    appliance="10.113.11.1",
-    master="http://10.113.11.1:11311",
-    rest_url="",
-    rest_trouble="REST is off",
-    pin="",
-    warning=None,
-    serial="1a",
-    expires=0.0,
-    certificate="CERTIFICATE\n",
-    authority="AUTHORITY\n",
-)
+    revision=1, name="ocu-1", address="10.113.11.2", appliance="10.113.11.1",
+    master="http://10.113.11.1:11311", rest_url="", rest_trouble="REST is off", pin="", warning=None,
+    serial="1a", expires=0.0, certificate="CERTIFICATE\n", authority="AUTHORITY\n",
+)  # fmt: skip
 KIT = kit_of(HOST, KitOptions("192.168.1.20"), "KEY\n")
 
 

@@ -7,10 +7,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from appliance.channel.admin import (
-    AdminAnswer,
-    AdminRequest,
-)
+from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.main import app
 from appliance.features.tunnels import protect_verb
@@ -98,15 +95,8 @@ def test_each_option_that_opens_something_is_in_what_protect_prints(
     monkeypatch.setattr(protect_verb, "addresses_by_interface", lambda _: {})
     monkeypatch.setattr(Namespace, "lacks_syn_cookies", lambda _own: False)
     words = [
-        "protect",
-        "--appliance",
-        "10.8.8.8",
-        "--ports",
-        "40000-40200",
-        "--apply",
-        *option.split(),
-        *form,
-    ]
+        "protect", "--appliance", "10.8.8.8", "--ports", "40000-40200", "--apply", *option.split(), *form,
+    ]  # fmt: skip
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     comment = "".join(line for line in files[0].splitlines() if line.startswith("# "))

@@ -28,6 +28,12 @@ pytestmark = pytest.mark.nightly
 SPELLINGS = {"before 3.2": "s/CN *= */CN = /; s/O *= */O = /", "3.2": "s/CN *= */CN=/; s/O *= */O=/"}
 
 
+def ran(*command: str, path: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, cwd=cwd, env={"PATH": path}, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
 class Machine:
     def __init__(self, folder: Path, spelling: str) -> None:
         self._folder, self._authority = folder, CertificateAuthority(folder)
@@ -54,15 +60,7 @@ class Machine:
         text = filled("join.sh", defaultdict(str, name="laptop"))
         begin, end = text.index("begin() {"), text.index("\n}\n", text.index("renewed() {")) + 3
         script = text[begin:end].replace("/etc/swanctl", str(self._etc)) + "renewed\n"
-        done = subprocess.run(
-            ["sh", "-eu", "-c", script],
-            cwd=self._kit.parent,
-            env={"PATH": self._path},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        done = ran("sh", "-eu", "-c", script, path=self._path, cwd=self._kit.parent)
         assert done.stderr == ""
         return done.returncode == 0
 
@@ -125,14 +123,8 @@ def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str
         f"*) echo '{sas}';;\nesac\n"
     )
     swanctl.chmod(0o755)
-    done = subprocess.run(
-        ["sh", "-eu", "-c", f"{functions}{text[begin:end]}"],
-        env={"PATH": f"{tmp_path}:{os.environ['PATH']}"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    done = ran("sh", "-eu", "-c", f"{functions}{text[begin:end]}", path=path)
     assert done.returncode == status
     assert done.stdout == "join.sh: waiting for the tunnel to 10.0.0.2\n"
     assert ("AUTHENTICATION_FAILED" in done.stderr) == ("rosrv audit search" in done.stderr) == bool(status)
@@ -195,14 +187,7 @@ def test_a_failed_run_leaves_a_joined_host_its_keeper(
     Path("join.sh").write_text(re.sub(r"(?<![\w/])/(?=(etc|run)/)", f"{tmp_path}/", script))
     with socket.socket(socket.AF_UNIX) as charon:
         charon.bind("socket")
-        done = subprocess.run(
-            ["dash", "join.sh"],
-            env={"PATH": f"{tmp_path}/bin:{os.environ['PATH']}"},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        done = ran("dash", "join.sh", path=f"{tmp_path}/bin:{os.environ['PATH']}")
     assert (done.returncode == 0) == (failure == "none"), done.stderr
     keeper = "systemctl restart rosrv-tunnel.service" if systemd else f"setsid {tmp_path}/etc/rosrv/keep.sh"
     times = int(joined or failure == "none")  # a container's keeper starts in the background
