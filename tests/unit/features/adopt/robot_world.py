@@ -213,12 +213,7 @@ class RobotWorld:
         master: Any = self.master
         world: Any = self
         self.graph = AdoptedGraph(
-            parts.registry,
-            parts.graph,
-            parts.subscribers,
-            records,
-            self._order,
-            parts.sinks.flush,
+            parts.registry, parts.graph, parts.subscribers, records, self._order, parts.sinks.flush
         )
         self.operation = AdoptOperation(
             self._machine, lambda _facts: master, self.graph, world,

@@ -82,22 +82,12 @@ def test_a_robot_without_a_master_or_with_another_program_stops() -> None:
     ("unit", "programs", "level", "text"),
     [
         ("roscore@pi.service", [], "warn", "not directly in system.slice"),  # in system-roscore.slice
-        (
-            "core.service",
-            ["/bin/bash /root/start.sh", "python3 /opt/ros/noetic/bin/roscore"],
-            "warn",
-            "by a script",
-        ),
-        (
-            "robot.service",
-            ["/bin/bash /root/start.sh", "python3 /opt/ros/noetic/bin/roslaunch a b"],
-            "ok",
-            "other",
-        ),
+        ("core.service", ["/bin/bash /root/start.sh", "python3 /opt/ros/noetic/bin/roscore"], "warn", "by a script"),
+        ("robot.service", ["/bin/bash /root/start.sh", "python3 /opt/ros/noetic/bin/roslaunch a b"], "ok", "other"),
         ("robot.service", ["roslaunch robot.launch", "rosmaster --core"], "ok", "and other programs"),
         ("session-3.scope", [], "ok", "and other programs"),
     ],
-)
+)  # fmt: skip
 def test_a_roscore_that_no_drop_in_can_help_must_not_restart(
     monkeypatch: pytest.MonkeyPatch, unit: str, programs: list[str], level: str, text: str
 ) -> None:
@@ -113,16 +103,11 @@ def test_a_roscore_that_no_drop_in_can_help_must_not_restart(
     [
         (SurveyedNode("/far", "http://nuc:4002/"), (), "hosts", "warn"),
         (SurveyedNode("/lo", "http://localhost:4002/", "127.0.0.1"), (socket(4002),), "nodes", "stop"),
-        (
-            SurveyedNode("/lo", "http://base:4002/", "127.0.1.1"),
-            (socket(4002, "127.0.0.1"),),
-            "nodes",
-            "stop",
-        ),
+        (SurveyedNode("/lo", "http://base:4002/", "127.0.1.1"), (socket(4002, "127.0.0.1"),), "nodes", "stop"),
         (SurveyedNode("/gone", "http://base:4002/", "192.168.50.1", problem="refuses"), (), "nodes", "warn"),
         (SurveyedNode("/other", "http://nuc:4002/", "192.168.50.2"), (), "hosts", "warn"),
     ],
-)
+)  # fmt: skip
 def test_a_node_that_cannot_be_moved_is_named(
     node: SurveyedNode, listeners: tuple[TcpSocket, ...], about: str, level: str
 ) -> None:
@@ -281,13 +266,9 @@ def test_a_release_without_the_appliance_gives_back_whatever_its_record_is(
     monkeypatch.setattr(release_verb, "master_of", lambda *_: MASTER)
     monkeypatch.setattr(release_verb, "end_hold", lambda: None)
     record = AdoptRecord(
-        wanted=True,
-        phase=Phase.TAKEN,
-        boot=boot_id(),
-        program=MASTER.program,
-        unit=MASTER.unit,
+        wanted=True, phase=Phase.TAKEN, boot=boot_id(), program=MASTER.program, unit=MASTER.unit,
         user=MASTER.user,
-    )
+    )  # fmt: skip
     save_record(tmp_path, record)
     (tmp_path / "control").mkdir()
     (tmp_path / "lock").touch()

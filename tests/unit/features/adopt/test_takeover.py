@@ -24,17 +24,8 @@ from tests.unit.features.adopt.robot_world import LINK, RobotWorld
 pytestmark = pytest.mark.anyio
 MANY = 10_000
 TAKE = (
-    "read",
-    "parameters",
-    "register",
-    "forward",
-    "connect",
-    "tell",
-    "cut",
-    "read again",
-    "hidden",
-    "taken",
-)
+    "read", "parameters", "register", "forward", "connect", "tell", "cut", "read again", "hidden", "taken",
+)  # fmt: skip
 GIVE = ("silence", "stand in", "give", "withdraw", "give again", "tell", "given", "forget", "released")
 
 
@@ -504,11 +495,7 @@ async def test_an_order_is_recorded_as_the_operators_and_a_start_as_the_applianc
         for record in world.parts.records.records
         if record.event in {"graph adopted", "graph released"}
     ]
-    assert seen == [
-        ("graph adopted", None),
-        ("graph released", "operator"),
-        ("graph adopted", "operator"),
-    ]
+    assert seen == [("graph adopted", None), ("graph released", "operator"), ("graph adopted", "operator")]
 
 
 def _keep_changing(world: RobotWorld) -> None:
@@ -705,11 +692,7 @@ async def test_connections_that_are_not_cut_are_reported_until_the_next_adoption
 async def test_no_port_of_the_machine_itself_is_cut_whatever_a_node_says(bare: RobotWorld) -> None:
     bare.resolved["nuc"] = ["192.168.50.2"]
     bare.add("/far", 4010, uri="http://nuc:4010/", publishes=("/scan",), services=("/a", "/b", "/c"))
-    bare.master.services |= {
-        "/a": "rosrpc://nuc:22",
-        "/b": "rosrpc://nuc:11311",
-        "/c": "rosrpc://nuc:5001",
-    }
+    bare.master.services |= {"/a": "rosrpc://nuc:22", "/b": "rosrpc://nuc:11311", "/c": "rosrpc://nuc:5001"}
     bare.apart = {"/a": 22, "/b": 11311, "/c": 5001}
     await bare.until_settled()
     assert bare.remote == [("192.168.50.2", 5001), ("192.168.50.2", 5010)]
@@ -763,11 +746,15 @@ async def _restart_under_the_rules(world: RobotWorld) -> None:
         await world.parts.ask("registerSubscriber", node.name, topic, "std_msgs/String", node.uri, host=LINK)
 
 
+@pytest.mark.parametrize("dead", [False, True], ids=["", "dead appliance"])
 async def test_a_node_that_was_restarted_under_the_rules_is_given_back_with_its_new_uri(
-    world: RobotWorld,
+    world: RobotWorld, dead: bool
 ) -> None:
     await world.until_settled()
     await _restart_under_the_rules(world)
+    if dead:
+        world.begin()
+        world.operation.forwards = False
     await world.release()
     require_given(world)
 
@@ -825,17 +812,6 @@ async def test_a_node_that_starts_while_a_dead_appliance_is_released_stays(world
     world.after["stand in"] = lambda: _start_nodes_at_their_own_master(world)
     await world.until_settled()
     _require_nodes_of_their_own_master(world)
-
-
-async def test_a_dead_appliance_gives_back_a_node_that_was_restarted_under_the_rules(
-    world: RobotWorld,
-) -> None:
-    await world.until_settled()
-    await _restart_under_the_rules(world)
-    world.begin()
-    world.operation.forwards = False
-    await world.release()
-    require_given(world)
 
 
 async def test_nothing_waits_for_a_master_that_is_not_there(world: RobotWorld) -> None:
