@@ -36,24 +36,8 @@ STRANGE: dict[str, Any] = {
 NAMES = Names("arm-3", lambda host: f"tablet ({host})")
 LENGTHS = (0, 1, 31, 32, 255, 256, 4000)
 NUMBERS = (
-    0,
-    1,
-    -1,
-    -32,
-    -33,
-    127,
-    128,
-    255,
-    256,
-    65535,
-    65536,
-    2**32 - 1,
-    2**32,
-    2**63 - 1,
-    -128,
-    -129,
-    -(2**31) - 1,
-)
+    0, 1, -1, -32, -33, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**63 - 1, -128, -129, -(2**31) - 1,
+)  # fmt: skip
 
 
 [FETCH] = [kind for kind in get_args(AnyRequest) if kind.__struct_config__.tag == "recording fetch"]
