@@ -5,9 +5,9 @@ for people come from the record, as `rosrv audit why`, REST and the console show
 """
 
 import struct
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -27,6 +27,9 @@ START = 1_900_000_000_000 * MS
 """Later than the present: in shadow mode, specifications read the clock, which must not be ahead of the messages."""
 
 
+EMPTY: Mapping[str, Any] = MappingProxyType({})
+
+
 class Given(NamedTuple):
     at: int
     where: str
@@ -40,10 +43,10 @@ class Row(NamedTuple):
     kind: str
     by: str
     at: str
-    because: list[tuple[str, str]]
+    because: Sequence[tuple[str, str]] = ()
     """The events, with their senders, that explain the verdict, or the verdict whose handler acted."""
-    where: dict[str, dict[str, object]]
-    values: Mapping[str, object] = MappingProxyType({})
+    where: Mapping[str, Mapping[str, object]] = EMPTY
+    values: Mapping[str, object] = EMPTY
     restarted: bool = False
 
 
@@ -104,7 +107,7 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
     assert detail.get("conditions", {}) == where
     assert detail.get("values", {}) == row.values
     named = detail.get("why", {}).get("events", [])
-    assert [(one["event"], one.get("node", "")) for one in named] == row.because
+    assert [(one["event"], one.get("node", "")) for one in named] == [*row.because]
     check_lines(row, found, at, where)
     if named:
         times = {one["time"] for one in named}
@@ -167,6 +170,15 @@ def given(text: str) -> list[Given]:
     return found
 
 
+def row(text: str, words: str, *what: Any, **more: Any) -> Row:
+    return Row(text, given(words), *what, **more)
+
+
+def m(body: str, *what: Any, **more: Any) -> Row:
+    """Return a row of the monitor `m` with this body."""
+    return row(f"m() {{ {body} }}", *what, **more)
+
+
 def logic(formula: str, words: str, because: list[tuple[str, str]], by: str = STICK) -> Row:
     text = f"m() {{ {A} {{ }} {B} {{ }} {CLOCK}\n {formula} {{ }} }}"
     return Row(text, given(words), "verdict", by, formula[: formula.index(":") + 1], because, {})
@@ -213,119 +225,72 @@ SLICED = f"m(int a) {{ event begin(int a) /a {INT % 'a'} {{ }} event end(int a) 
 PAIR = [("begin", ARM), ("end", STICK)]
 
 OUTCOMES = {
-    "a verdict with a guard": Row(
-        f"m() {{ {A} {{ }} {B} {WHEN} {{ }} {ERE} {{ }} }}", given("a1 b7"), "verdict", STICK, "ere:", BOTH,
-        {"(b > 2)"[1:-1]: {"b": 7}},
+    "a verdict with a guard": m(f"{A} {{ }} {B} {WHEN} {{ }} {ERE} {{ }}", "a1 b7", "verdict", STICK, "ere:", BOTH,
+        where={"b > 2": {"b": 7}}),
+    "a drop": m(f"{B} {WHEN} {{ if (b == 7) {{ DROP; }} }}", "b7", "drop", STICK, "DROP;",
+        where={"b > 2": {"b": 7}, "b == 7": {"b": 7}}),
+    "a drop by return": m(f"{B} {{ if (b == 7) {{ return; }} }}", "b7", "drop", STICK, "return;",
+        where={"b == 7": {"b": 7}}),
+    "a drop in a handler": m(f"{A} {{ }} {B} {{ }} {ERE} {{ DROP; }}", "a1 b1", "drop", STICK, "DROP;", BOTH),
+    "a drop by a fault": m(f"{B} {{ int zero = b - 7; b = 1 / zero; }}", "b7", "drop", STICK, "1 / zero",
+        values={"zero": 0}),
+    "a drop by a fault in a handler": m(f"int zero = 0; {A} {{ }} {B} {{ }} {ERE} {{ zero = 1 / zero; }}", "a1 b1",
+        "drop", STICK, "1 / zero", BOTH, values={"zero": 0}),
+    "what is held": row(f"hold m() {{ {B} {{ }} }}", "b1", "drop", STICK, "hold", restarted=True),
+    "what could not begin": m(f"int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ if (b) {{ return; }} }}", "b1",
+        "drop", STICK, "m()"),
+    "a change": m(f"{B} {WHEN} {{ if (b == 7) {{ b = 1; }} }}", "b7", "change", STICK, "b = 1",
+        where={"b > 2": {"b": 7}, "b == 7": {"b": 7}}),
+    "a publication": m(f"{B} {WHEN} {{ if (b == 7) {{ {ALARM} }} }}", "b7", "publish", STICK, "PUBLISH",
+        where={"b > 2": {"b": 7}, "b == 7": {"b": 7}}),
+    "a publication of a function": m(f"warn(int level) {{ if (level == 7) {{ {ALARM} }} }} {B} {{ warn(b); }}", "b7",
+        "publish", STICK, "PUBLISH", where={"level == 7": {"level": 7}}),
+    "a publication in a handler": m(f"{A} {{ }} {B} {{ }} {ERE} {{ {ALARM} }}", "a1 b1", "publish", STICK, "PUBLISH",
+        BOTH),
+    "a publication that is enforced": m(
+        f"warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
+        f" {DONE} pattern: globally: a causes done within 20ms enforced by warn @violation {{ }}",
+        "b1 a1 . . . c0", "publish", "", "PUBLISH", [("a", ARM)],
     ),
-    "a drop": Row(
-        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ DROP; }} }} }}", given("b7"), "drop", STICK, "DROP;", [],
-        {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
+    "a verdict of what is enforced": m(
+        f"warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
+        f" {DONE} pattern: globally: a causes done within 20ms enforced by warn @violation {{ }}",
+        "b1 a1 . . . c0", "verdict", "", "pattern:", [("a", ARM)],
     ),
-    "a drop by return": Row(
-        f"m() {{ {B} {{ if (b == 7) {{ return; }} }} }}", given("b7"), "drop", STICK, "return;", [],
-        {"b == 7": {"b": 7}},
+    "a fault": m(f"{B} {WHEN} {{ int zero = b - 7; b = 1 / zero; }}", "b7", "fault", STICK, "1 / zero",
+        where={"b > 2": {"b": 7}}, values={"zero": 0}),
+    "a publication of a tick": m(
+        f"int seen = 0; {B} {{ seen = b; }} {CLOCK}\n"
+        f" event tick() every 10ms {{ if (seen == 7) {{ {ALARM} }} }}",
+        "b7 . . c0", "publish", "", "PUBLISH", where={"seen == 7": {"seen": 7}},
     ),
-    "a drop in a handler": Row(
-        f"m() {{ {A} {{ }} {B} {{ }} {ERE} {{ DROP; }} }}", given("a1 b1"), "drop", STICK, "DROP;", BOTH, {}
-    ),
-    "a drop by a fault": Row(
-        f"m() {{ {B} {{ int zero = b - 7; b = 1 / zero; }} }}", given("b7"), "drop", STICK, "1 / zero", [], {},
-        {"zero": 0},
-    ),
-    "a drop by a fault in a handler": Row(
-        f"m() {{ int zero = 0; {A} {{ }} {B} {{ }} {ERE} {{ zero = 1 / zero; }} }}", given("a1 b1"), "drop", STICK,
-        "1 / zero", BOTH, {}, {"zero": 0},
-    ),
-    "what is held": Row(
-        f"hold m() {{ {B} {{ }} }}", given("b1"), "drop", STICK, "hold", [], {}, restarted=True
-    ),
-    "what could not begin": Row(
-        f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ if (b) {{ return; }} }} }}", given("b1"), "drop",
-        STICK, "m()", [], {}
-    ),
-    "a change": Row(
-        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ b = 1; }} }} }}", given("b7"), "change", STICK, "b = 1", [],
-        {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
-    ),
-    "a publication": Row(
-        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ {ALARM} }} }} }}", given("b7"), "publish", STICK, "PUBLISH", [],
-        {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
-    ),
-    "a publication of a function": Row(
-        f"m() {{ warn(int level) {{ if (level == 7) {{ {ALARM} }} }} {B} {{ warn(b); }} }}", given("b7"), "publish",
-        STICK, "PUBLISH", [], {"level == 7": {"level": 7}},
-    ),
-    "a publication in a handler": Row(
-        f"m() {{ {A} {{ }} {B} {{ }} {ERE} {{ {ALARM} }} }}", given("a1 b1"), "publish", STICK, "PUBLISH", BOTH, {}
-    ),
-    "a publication that is enforced": Row(
-        f"m() {{ warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
-        f" {DONE} pattern: globally: a causes done within 20ms enforced by warn @violation {{ }} }}",
-        given("b1 a1 . . . c0"), "publish", "", "PUBLISH", [("a", ARM)], {},
-    ),
-    "a verdict of what is enforced": Row(
-        f"m() {{ warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
-        f" {DONE} pattern: globally: a causes done within 20ms enforced by warn @violation {{ }} }}",
-        given("b1 a1 . . . c0"), "verdict", "", "pattern:", [("a", ARM)], {},
-    ),
-    "a fault": Row(
-        f"m() {{ {B} {WHEN} {{ int zero = b - 7; b = 1 / zero; }} }}", given("b7"), "fault", STICK, "1 / zero", [],
-        {"b > 2": {"b": 7}}, {"zero": 0},
-    ),
-    "a publication of a tick": Row(
-        f"m() {{ int seen = 0; {B} {{ seen = b; }} {CLOCK}\n"
-        f" event tick() every 10ms {{ if (seen == 7) {{ {ALARM} }} }} }}",
-        given("b7 . . c0"), "publish", "", "PUBLISH", [], {"seen == 7": {"seen": 7}},
-    ),
-    "a verdict of a tick": Row(
-        f"m() {{ {B} {{ }} event tick() every 10ms {{ }} {CLOCK}\n ptltl: tick -> !(<*> b) @violation {{ }} }}",
-        given("b7 . . c0"), "verdict", "", "ptltl:", [("b", STICK), ("tick", "")], {},
-    ),
-    "a fault of a tick": Row(
-        f"m() {{ int zero = 0; {B} {{ }} event tick() every 10ms {{ zero = 1 / zero; }} {CLOCK} }}",
-        given("b7 . . c0"), "fault", "", "1 / zero", [], {}, {"zero": 0},
-    ),
-    "a verdict of a request": Row(
-        f"m() {{ {A} {{ }} {ASK} when (on) {{ }} ere: a q @match {{ }} }}", given("a1 q1"), "verdict", "/client",
-        "ere:", [("a", ARM), ("q", "/client")], {"on) {": {"on": True}},
-    ),
-    "a verdict of a reply": Row(
-        f"m() {{ {ASK} {{ }} {REPLY} {{ }} ere: q r @match {{ }} }}", given("q1 r1"), "verdict", "/server", "ere:",
-        [("q", "/client"), ("r", "/server")], {},
-    ),
-    "a request that is refused": Row(
-        f"m() {{ {ASK} {{ if (on) {{ DROP; }} }} }}", given("q1"), "drop", "/client", "DROP;", [],
-        {"on) { D": {"on": True}},
-    ),
-    "a request that a handler refuses": Row(
-        f"m() {{ {A} {{ }} {ASK} {{ }} ere: a q @match {{ DROP; }} }}", given("a1 q1"), "drop", "/client", "DROP;",
-        [("a", ARM), ("q", "/client")], {},
-    ),
-    "a reply that is refused": Row(
-        f"m() {{ {REPLY} {{ if (ok) {{ DROP; }} }} }}", given("r1"), "drop", "/server", "DROP;", [],
-        {"ok) { D": {"ok": True}},
-    ),
-    "a request that is changed": Row(
-        f"m() {{ {ASK} {{ if (on) {{ on = false; }} }} }}", given("q1"), "change", "/client", "on = false", [],
-        {"on) { o": {"on": True}},
-    ),
-    "a reply that is changed": Row(
-        f"m() {{ {REPLY} {{ if (ok) {{ ok = false; }} }} }}", given("r1"), "change", "/server", "ok = false", [],
-        {"ok) { o": {"ok": True}},
-    ),
-    "a fault of a request": Row(
-        f"m() {{ {ASK} {{ int zero = 0; zero = 1 / zero; }} }}", given("q1"), "fault", "/client", "1 / zero", [], {},
-        {"zero": 0},
-    ),
-    "a verdict of a slice": Row(
-        f"{SLICED} ere: begin end @match {{ }} }}", given("a1 a2 b2"), "verdict", STICK, "ere:", PAIR, {}
-    ),
-    "a drop in a handler of a slice": Row(
-        f"{SLICED} ere: begin end @match {{ DROP; }} }}", given("a1 a2 b2"), "drop", STICK, "DROP;", PAIR, {}
-    ),
-    "a publication in a handler of a slice": Row(
-        f"{SLICED} ere: begin end @match {{ {ALARM} }} }}", given("a1 a2 b2"), "publish", STICK, "PUBLISH", PAIR, {}
-    ),
+    "a verdict of a tick": m(
+        f"{B} {{ }} event tick() every 10ms {{ }} {CLOCK}\n ptltl: tick -> !(<*> b) @violation {{ }}", "b7 . . c0",
+        "verdict", "", "ptltl:", [("b", STICK), ("tick", "")]),
+    "a fault of a tick": m(f"int zero = 0; {B} {{ }} event tick() every 10ms {{ zero = 1 / zero; }} {CLOCK}",
+        "b7 . . c0", "fault", "", "1 / zero", values={"zero": 0}),
+    "a verdict of a request": m(f"{A} {{ }} {ASK} when (on) {{ }} ere: a q @match {{ }}", "a1 q1", "verdict",
+        "/client", "ere:", [("a", ARM), ("q", "/client")], where={"on) {": {"on": True}}),
+    "a verdict of a reply": m(f"{ASK} {{ }} {REPLY} {{ }} ere: q r @match {{ }}", "q1 r1", "verdict", "/server",
+        "ere:", [("q", "/client"), ("r", "/server")]),
+    "a request that is refused": m(f"{ASK} {{ if (on) {{ DROP; }} }}", "q1", "drop", "/client", "DROP;",
+        where={"on) { D": {"on": True}}),
+    "a request that a handler refuses": m(f"{A} {{ }} {ASK} {{ }} ere: a q @match {{ DROP; }}", "a1 q1", "drop",
+        "/client", "DROP;", [("a", ARM), ("q", "/client")]),
+    "a reply that is refused": m(f"{REPLY} {{ if (ok) {{ DROP; }} }}", "r1", "drop", "/server", "DROP;",
+        where={"ok) { D": {"ok": True}}),
+    "a request that is changed": m(f"{ASK} {{ if (on) {{ on = false; }} }}", "q1", "change", "/client", "on = false",
+        where={"on) { o": {"on": True}}),
+    "a reply that is changed": m(f"{REPLY} {{ if (ok) {{ ok = false; }} }}", "r1", "change", "/server", "ok = false",
+        where={"ok) { o": {"ok": True}}),
+    "a fault of a request": m(f"{ASK} {{ int zero = 0; zero = 1 / zero; }}", "q1", "fault", "/client", "1 / zero",
+        values={"zero": 0}),
+    "a verdict of a slice": row(f"{SLICED} ere: begin end @match {{ }} }}", "a1 a2 b2", "verdict", STICK, "ere:",
+        PAIR),
+    "a drop in a handler of a slice": row(f"{SLICED} ere: begin end @match {{ DROP; }} }}", "a1 a2 b2", "drop", STICK,
+        "DROP;", PAIR),
+    "a publication in a handler of a slice": row(f"{SLICED} ere: begin end @match {{ {ALARM} }} }}", "a1 a2 b2",
+        "publish", STICK, "PUBLISH", PAIR),
 }  # fmt: skip
 
 

@@ -224,13 +224,9 @@ def test_failing_cases_are_reported() -> None:
 
 
 TOOLS = (
-    "/rostopic",
-    "/rosnode",
-    "/rosservice",
-    "/rosparam-47",
-    "/record_1700000000000000000",
+    "/rostopic", "/rosnode", "/rosservice", "/rosparam-47", "/record_1700000000000000000",
     "/play_1700000000000000000",
-)
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))

@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.features.policy_tools.learn import (
-    LearnedPolicy,
-    Observation,
-    covered,
-    learn,
-    needed_rights,
-)
+from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn, needed_rights
 from appliance.master.calls.call import RosCall
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
@@ -30,19 +24,9 @@ from tests.unit.features.policy_tools.test_rights import KEY_GIVEN, NAME, ROWS, 
 ROBOT = ipaddress.ip_address("192.0.2.10")
 HOSTS = [ipaddress.ip_address(text) for text in ("10.0.0.1", "10.0.0.2", "fd00::5", "192.0.2.10")]
 NAMES = [
-    "/a",
-    "/a/b",
-    "/a/b/c",
-    "/cmd_vel",
-    "/a_1",
-    "/tool_4711_1700000000000",
-    "/tool_99_1700000000001/x",
-    "/tool_1",
-    "/tool_99_1700000000001/x/y",
-    "/tool_1/x_4_1700000000001/b",
-    "/tool_1/x_a",
-    "/roslaunch/uris/host_a__1",
-]
+    "/a", "/a/b", "/a/b/c", "/cmd_vel", "/a_1", "/tool_4711_1700000000000", "/tool_99_1700000000001/x", "/tool_1",
+    "/tool_99_1700000000001/x/y", "/tool_1/x_4_1700000000001/b", "/tool_1/x_a", "/roslaunch/uris/host_a__1",
+]  # fmt: skip
 
 
 def seen(

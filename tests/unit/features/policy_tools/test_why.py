@@ -5,14 +5,8 @@ from appliance.features.policy_tools.explanations import lines_of
 
 def test_a_verdict_is_explained() -> None:
     event = {
-        "event": "go",
-        "time": "12:00",
-        "node": "/a",
-        "host": "10.0.0.1",
-        "on": "/t",
-        "seq": 7,
-        "state": "bad",
-    }
+        "event": "go", "time": "12:00", "node": "/a", "host": "10.0.0.1", "on": "/t", "seq": 7, "state": "bad",
+    }  # fmt: skip
     why = {"events": [event], "fewest": False, "since": "11:00", "decided": ["a is true"]}
     detail = {"number": 3, "at": ["x.rv:1:2"], "conditions": {"x.rv:3:4": {"x": 2}}, "why": why}
     record = AuditRecord(
