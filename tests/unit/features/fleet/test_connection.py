@@ -34,79 +34,53 @@ _SECONDS = 0.4
 Client = Callable[[str], str]
 
 
-def drips_the_handshake(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"\x16\x03\x03\x40\x00")
-    visitor.repeat(b"\x02", 0.02)
+def sends(data: bytes, more: bytes = b"", pause: float = 0.02) -> Lie:
+    """Send this, and then more of it until the end, with pauses in seconds."""
+
+    def lie(visitor: Visitor) -> None:
+        visitor.stream.sendall(data)
+        if more:
+            visitor.repeat(more, pause)
+
+    return lie
 
 
 def closes(visitor: Visitor) -> None:
     visitor.stream.close()
 
 
-def drips_the_head(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nX: ")
-    visitor.repeat(b"x", 0.02)
-
-
-def sends_interim_answers(visitor: Visitor) -> None:
-    visitor.repeat(b"HTTP/1.1 100 Continue\r\n\r\n", 0.001)
-
-
-def sends_an_endless_head(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nX: ")
-    visitor.repeat(b"x" * 65_536, 0)
-
-
-def drips_the_body(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n")
-    visitor.repeat(b"x", 0.02)
-
-
-def sends_an_endless_body(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
-    visitor.repeat(bytes(1 << 16), 0)
-
-
 def closes_midway(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n{")
+    sends(WITH_LENGTH + b"{")(visitor)
     visitor.stream.close()
-
-
-def redirects(visitor: Visitor) -> None:
-    visitor.give(b"", "307 Temporary Redirect", "Location: https://127.0.0.1:1/")
-
-
-def compresses(visitor: Visitor) -> None:
-    visitor.give(b"\x1f\x8b\x08", "200 OK", "Content-Encoding: gzip")
-
-
-def is_not_http(visitor: Visitor) -> None:
-    visitor.stream.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
 
 
 def demands_a_login(visitor: Visitor) -> None:
     visitor.give(b"\x1b[2Jno", "401 Unauthorized", "Retry-After: 99999999999999999999")
 
 
+HEAD = b"HTTP/1.1 200 OK\r\n"
+WITH_LENGTH = HEAD + b"Content-Length: 500\r\n\r\n"
 IN_HANDSHAKE = {
-    "drips the handshake": (drips_the_handshake, "takes more than"),
+    "drips the handshake": (sends(b"\x16\x03\x03\x40\x00", b"\x02"), "takes more than"),
     "is silent in the handshake": (Visitor.wait, "takes more than"),
     "closes in the handshake": (closes, "EOF|reset|ended"),
 }
-IN_ANSWER = {
+IN_ANSWER: dict[str, tuple[Lie, str]] = {
     "is silent": (Visitor.wait, "takes more than"),
     "closes": (closes, "disconnected|reset|EOF|ended"),
-    "drips the head": (drips_the_head, "takes more than"),
-    "sends interim answers": (sends_interim_answers, "takes more than"),
-    "sends an endless head": (sends_an_endless_head, "too long|exceed"),
-    "drips the body": (drips_the_body, "takes more than"),
-    "sends an endless body": (sends_an_endless_body, "more than .* bytes|exceed"),
+    "drips the head": (sends(HEAD + b"X: ", b"x"), "takes more than"),
+    "sends interim answers": (sends(b"", b"HTTP/1.1 100 Continue\r\n\r\n", 0.001), "takes more than"),
+    "sends an endless head": (sends(HEAD + b"X: ", b"x" * 65_536, 0), "too long|exceed"),
+    "drips the body": (sends(WITH_LENGTH, b"x"), "takes more than"),
+    "sends an endless body": (sends(HEAD + b"\r\n", bytes(1 << 16), 0), "more than .* bytes|exceed"),
     "closes midway": (closes_midway, "closed connection|incomplete|EOF|violation"),
-    "redirects": (redirects, "307"),
-    "compresses": (compresses, "the answer is compressed"),
-    "is not HTTP": (is_not_http, "illegal|disconnected"),
+    "redirects": (lambda one: one.give(b"", "307 Temporary Redirect", "Location: https://127.0.0.1:1/"), "307"),
+    "compresses": (
+        lambda one: one.give(b"\x1f\x8b\x08", "200 OK", "Content-Encoding: gzip"), "the answer is compressed"
+    ),
+    "is not HTTP": (sends(b"SSH-2.0-OpenSSH_9.2\r\n"), "illegal|disconnected"),
     "demands a login": (demands_a_login, r"401: \\x1b\[2Jno"),
-}
+}  # fmt: skip
 
 
 @pytest.fixture

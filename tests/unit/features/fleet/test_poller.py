@@ -36,13 +36,7 @@ class Site:
         vars(bundles).update(selected=self._select, get=self._get)
         vars(connection).update(put=self._put)
         self.poller = Poller(
-            bundles,
-            connection,
-            (PATH.site, PATH.group),
-            60.0,
-            lambda: self.stated,
-            self._offer,
-            lambda: TIME,
+            bundles, connection, (PATH.site, PATH.group), 60.0, lambda: self.stated, self._offer, lambda: TIME
         )
 
     def _select(self) -> SelectedBundle:

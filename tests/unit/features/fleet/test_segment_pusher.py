@@ -87,6 +87,13 @@ def make(collector: Collector, path: Path, tmp_path: Path) -> Callable[[], Segme
 Make = Callable[[], SegmentPusher]
 
 
+def pushed(pusher: SegmentPusher) -> SegmentPusher:
+    """Let it push all that it can."""
+    while pusher.step() == 0:
+        pass
+    return pusher
+
+
 @pytest.mark.parametrize(
     "number", [10**18, 10**19, 10**400, 4000, -1], ids=["1e18", "1e19", "1e400", "4000", "-1"]
 )
@@ -117,8 +124,7 @@ def test_a_head_without_a_receipt_does_not_count(collector: Collector, make: Mak
     pusher.step()
     assert (pusher.progress.sent, pusher.progress.sequence) == (0, 0)
     collector.changes = {}
-    while pusher.step() == 0:
-        pass
+    pushed(pusher)
     assert set(collector.pushed) == {newest.number}
     assert pusher.progress.sequence == newest.sequence
 
@@ -152,9 +158,7 @@ def test_a_kill_between_receipt_and_position(
         with pytest.raises(SystemExit):
             make().step()
     receipts.write_bytes(receipts.read_bytes()[:-40])  # and the disk kept a part of the line
-    pusher = make()
-    while pusher.step() == 0:
-        pass
+    pusher = pushed(make())
     assert collector.pushed[:3] == [1, 1, 2]
     assert pusher.progress.missed == 0
     torn, *lines = receipts.read_bytes().splitlines()
@@ -176,8 +180,7 @@ def test_a_full_disk_is_reported_and_passes(
         assert pusher.step() > 0
     assert "No space left" in pusher.progress.trouble
     assert not (tmp_path / "state" / "segment.gz").exists()
-    while pusher.step() == 0:
-        pass
+    pushed(pusher)
     assert pusher.progress.trouble == ""
     assert (pusher.progress.missed, pusher.progress.behind) == (0, 0)
 
@@ -189,9 +192,7 @@ def test_a_wait_of_a_year_is_an_hour(collector: Collector, make: Make) -> None:
 
 
 def test_a_replaced_log_counts_from_its_beginning(collector: Collector, make: Make, path: Path) -> None:
-    pusher = make()
-    while pusher.step() == 0:
-        pass
+    pusher = pushed(make())
     assert pusher.progress.sequence >= 30
     collector.refusal = CollectorError("gone")
     with closing(sqlite3.connect(path)) as log, log:
@@ -221,8 +222,7 @@ def test_a_robot_without_records_is_present(collector: Collector, make: Make) ->
     pusher.step()
     assert (pusher.progress.trouble != "", collector.idle) == (True, [])
     collector.changes = {}
-    while pusher.step() == 0:
-        pass
+    pushed(pusher)
     assert len(collector.idle) == 1
     pusher.step()
     assert len(collector.idle) == 1
@@ -232,14 +232,11 @@ def test_a_robot_without_records_is_present(collector: Collector, make: Make) ->
 
 
 def test_a_collector_that_lost_segments_gets_them_again(collector: Collector, make: Make) -> None:
-    pusher = make()
-    while pusher.step() == 0:
-        pass
+    pusher = pushed(make())
     del collector.pushed[1:]
     with using(VirtualClock(now=now() + 60)):
         pusher.step()
-        while pusher.step() == 0:
-            pass
+        pushed(pusher)
     assert collector.pushed[-2:] == [2, 3]
 
 
@@ -256,9 +253,7 @@ def test_a_standby_without_a_log_is_present(collector: Collector, make: Make, pa
 
 def test_a_robot_that_is_switched_off_reports_it(collector: Collector, make: Make) -> None:
     """The end of the process alone does not mean this: the supervisor may have been killed."""
-    pusher = make()
-    while pusher.step() == 0:
-        pass
+    pusher = pushed(make())
     pusher.close()
     assert collector.off == []
     pusher.close(stopped=True)

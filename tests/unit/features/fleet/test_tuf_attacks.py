@@ -30,6 +30,10 @@ pytestmark = pytest.mark.nightly
 METADATA = "/v1/bundles/metadata"
 
 
+def in_days(days: float) -> datetime.datetime:
+    return (datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)).replace(microsecond=0)
+
+
 class Field:
     def __init__(self, folder: Path, url: str, site: RobotSite) -> None:
         self.site, self.url, self.folder = site, url, folder
@@ -47,9 +51,7 @@ class Field:
     def timestamp(self, snapshot: int, version: int | None = None, days: float = 1.0) -> bytes:
         signed = Timestamp(
             version=version or int(time.time()) + 1000,
-            expires=(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)).replace(
-                microsecond=0
-            ),
+            expires=in_days(days),
             snapshot_meta=MetaFile(snapshot),
         )
         document = Metadata(signed)
@@ -67,6 +69,13 @@ def field(tmp_path: Path) -> Iterator[Field]:
         yield made
 
 
+def given(field: Field, robot: VerifiedBundles | None = None) -> VerifiedBundle:
+    """Return the bundle that the robot takes."""
+    taken = field.poll(robot)
+    assert taken is not None
+    return taken
+
+
 def refused(field: Field, word: str, robot: VerifiedBundles | None = None) -> None:
     with pytest.raises(BundleRejectedError, match=word):
         field.poll(robot)
@@ -75,8 +84,7 @@ def refused(field: Field, word: str, robot: VerifiedBundles | None = None) -> No
 def test_an_honest_collector_serves_each_new_bundle(field: Field) -> None:
     files = bundle_files(monitors__a_dot_rv="monitor", policy_dot_ini_dot_tests_dot_yaml="cases: []")
     path = field.site.add(files)
-    taken = field.poll()
-    assert taken is not None
+    taken = given(field)
     assert taken.path == path
     assert taken.contents.files == {"a.rv": "monitor"}
     assert taken.contents.cases == "cases: []"
@@ -115,9 +123,7 @@ def test_the_former_bundle_may_be_selected_while_it_is_signed(field: Field) -> N
     field.site.add(keep=2)
     assert field.poll() is not None
     field.site.selection = first
-    taken = field.poll()
-    assert taken is not None
-    assert str(taken.path) == first
+    assert str(given(field).path) == first
 
 
 def test_freeze_ends_with_the_timestamp(field: Field) -> None:
@@ -126,7 +132,7 @@ def test_freeze_ends_with_the_timestamp(field: Field) -> None:
 
 
 def test_freeze_by_a_stolen_timestamp_key_ends_with_the_snapshot(tmp_path: Path) -> None:
-    months_ago = datetime.datetime.now(datetime.UTC).replace(microsecond=0) - datetime.timedelta(days=70)
+    months_ago = in_days(-70)
     site = RobotSite(tmp_path / "site", now=lambda: months_ago)
     site.repository.add(SITE, GROUP, bundle_files(), everywhere())
     with site.served() as url:
@@ -144,9 +150,7 @@ def test_fast_forward_is_undone_by_new_keys(field: Field) -> None:
     field.site.repository.rotate("timestamp")
     field.site.timestamp = None
     field.site.publish()
-    taken = field.poll()
-    assert taken is not None
-    assert taken.path.version == 2
+    assert given(field).path.version == 2
 
 
 def test_mix_and_match_is_rejected(field: Field) -> None:
@@ -202,8 +206,7 @@ def test_the_wrong_target_is_rejected(field: Field) -> None:
 
 
 def test_arbitrary_software_is_rejected(field: Field) -> None:
-    expires = datetime.datetime.now(datetime.UTC).replace(microsecond=0) + datetime.timedelta(days=1)
-    forged = Metadata(Timestamp(int(time.time()) + 9, expires=expires, snapshot_meta=MetaFile(9)))
+    forged = Metadata(Timestamp(int(time.time()) + 9, expires=in_days(1), snapshot_meta=MetaFile(9)))
     field.give(f"{METADATA}/timestamp.json", forged.to_bytes())
     refused(field, "signed")
     forged.sign(CryptoSigner.generate_ed25519())
@@ -262,9 +265,7 @@ def test_a_later_ring_does_not_take_a_bundle_early(field: Field) -> None:
     with pytest.raises(BundleTooEarlyError):
         field.poll()
     canary = field.site.robot(field.url, field.folder / "canary", "canary-1")
-    taken = field.poll(canary)
-    assert taken is not None
-    assert taken.path == path
+    assert given(field, canary).path == path
     later = field.site.robot(field.url, field.folder / "later", ROBOT, lambda: time.time() + 3601)
     assert field.poll(later) is not None
 
@@ -277,13 +278,9 @@ def test_a_compromised_root_key_is_replaced(field: Field) -> None:
     for role in ("root", "targets", "snapshot", f"{SITE}.{GROUP}"):
         repository.rotate(role)
     path = site.add()
-    taken = field.poll()
-    assert taken is not None
-    assert taken.path == path
+    assert given(field).path == path
     stolen = Metadata(Snapshot(version=50, meta={"targets.json": MetaFile(50)}))
-    stolen.signed.expires = datetime.datetime.now(datetime.UTC).replace(microsecond=0) + datetime.timedelta(
-        days=1
-    )
+    stolen.signed.expires = in_days(1)
     stolen.sign(old["snapshot"][0])
     field.give(f"{METADATA}/50.snapshot.json", stolen.to_bytes())
     field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=50))

@@ -14,6 +14,12 @@ pytestmark = pytest.mark.anyio
 _CONFIRM_SECONDS = FLEET.bundles.confirm_seconds
 
 
+async def polled(robot: BundleRobot, seconds: float, *, offered: bool = True) -> None:
+    """Let a poll offer a bundle, or none, and time pass."""
+    robot.poll(offered=offered)
+    await asyncio.sleep(seconds)
+
+
 @pytest.fixture
 async def robot(tmp_path: Path) -> BundleRobot:
     return BundleRobot(tmp_path)
@@ -29,8 +35,7 @@ async def test_a_change_by_an_operator_during_commit_confirm_only_delays_the_bun
     robot: BundleRobot,
 ) -> None:
     async with robot.running():
-        robot.poll(offered=True)
-        await asyncio.sleep(5)
+        await polled(robot, 5)
         assert robot.state.trying == OFFER.path
         robot.policies.change("olga")
         await asyncio.sleep(5)
@@ -38,8 +43,7 @@ async def test_a_change_by_an_operator_during_commit_confirm_only_delays_the_bun
         assert robot.monitors.in_force.text == BEFORE
         assert "an operator changed" in robot.state.trouble
         assert robot.stated[-1].refused is None
-        robot.poll(offered=True)
-        await asyncio.sleep(_CONFIRM_SECONDS + 5)
+        await polled(robot, _CONFIRM_SECONDS + 5)
         assert robot.stated[-1].in_force == OFFER.path
         assert not robot.state.trouble
         assert robot.trail.events == ["bundle in force"]
@@ -47,8 +51,7 @@ async def test_a_change_by_an_operator_during_commit_confirm_only_delays_the_bun
 
 async def test_a_change_that_a_rollback_waits_for_stays(robot: BundleRobot) -> None:
     async with robot.running():
-        robot.poll(offered=True)
-        await asyncio.sleep(5)
+        await polled(robot, 5)
         robot.monitors.change("olga")
         robot.policies.meanwhile = lambda: robot.policies.change("olga")
         await asyncio.sleep(_CONFIRM_SECONDS)
@@ -63,14 +66,12 @@ async def test_a_change_while_a_part_is_prepared_only_delays_the_bundle(
     parts = {"monitors": robot.monitors, "policies": robot.policies}
     parts[waiting].meanwhile = lambda: parts[changed].change("olga")
     async with robot.running():
-        robot.poll(offered=True)
-        await asyncio.sleep(5)
+        await polled(robot, 5)
         assert parts.pop(changed).in_force.text == OF_OPERATOR
         assert [part.in_force.text for part in parts.values()] == [BEFORE]
         assert robot.stated[-1].refused is None
         assert "an operator changed" in robot.state.trouble
-        robot.poll(offered=True)
-        await asyncio.sleep(_CONFIRM_SECONDS + 5)
+        await polled(robot, _CONFIRM_SECONDS + 5)
         assert robot.stated[-1].in_force == OFFER.path
 
 
@@ -78,8 +79,7 @@ async def test_a_change_while_a_part_is_prepared_only_delays_the_bundle(
 async def test_a_bundle_waits_no_longer_than_its_reason(ends: str, robot: BundleRobot) -> None:
     async with robot.running():
         robot.policies.confirm_by = 100.0
-        robot.poll(offered=True)
-        await asyncio.sleep(2)
+        await polled(robot, 2)
         assert "waits for its confirmation" in robot.state.trouble
         assert robot.stated[-1].waits == robot.state.trouble
         if ends == "change":
@@ -94,15 +94,13 @@ async def test_a_bundle_waits_no_longer_than_its_reason(ends: str, robot: Bundle
 async def test_a_bundle_that_would_hold_moving_topics_tells_the_collector_so(robot: BundleRobot) -> None:
     async with robot.running():
         robot.monitors.would_hold = ["/cmd_vel"]
-        robot.poll(offered=True)
-        await asyncio.sleep(2)
+        await polled(robot, 2)
         assert "waits until no message passes for a minute: /cmd_vel" in robot.stated[-1].waits
 
 
 async def test_a_bundle_waits_for_an_order_and_each_try_needs_one(ordered: BundleRobot) -> None:
     async with ordered.running():
-        ordered.poll(offered=True)
-        await asyncio.sleep(_CONFIRM_SECONDS)
+        await polled(ordered, _CONFIRM_SECONDS)
         assert ordered.state.for_order == OFFER.path
         assert "waits for an order: rosrv fleet take" in ordered.stated[-1].waits
         assert not ordered.gate.order("site-a/arms/1.tar", "olga")
@@ -111,8 +109,7 @@ async def test_a_bundle_waits_for_an_order_and_each_try_needs_one(ordered: Bundl
         assert ordered.state.trying == OFFER.path
         ordered.policies.change("olga")  # ends this try
         await asyncio.sleep(5)
-        ordered.poll(offered=True)
-        await asyncio.sleep(5)
+        await polled(ordered, 5)
         assert (ordered.state.trying, ordered.state.for_order) == ("", OFFER.path)
         assert ordered.gate.order(OFFER.path, "olga")
         await asyncio.sleep(_CONFIRM_SECONDS + 5)
@@ -123,10 +120,8 @@ async def test_a_bundle_waits_for_an_order_and_each_try_needs_one(ordered: Bundl
 
 async def test_a_bundle_that_is_withdrawn_waits_for_no_order(ordered: BundleRobot) -> None:
     async with ordered.running():
-        ordered.poll(offered=True)
-        await asyncio.sleep(2)
-        ordered.poll(offered=False)  # the collector withdraws it
-        await asyncio.sleep(2)
+        await polled(ordered, 2)
+        await polled(ordered, 2, offered=False)  # the collector withdraws it
         assert not ordered.state.for_order
         assert not ordered.gate.order(OFFER.path, "olga")
 
@@ -134,13 +129,11 @@ async def test_a_bundle_that_is_withdrawn_waits_for_no_order(ordered: BundleRobo
 async def test_a_bundle_that_would_hold_moving_topics_does_not_wait_for_an_order_yet(
     ordered: BundleRobot,
 ) -> None:
-    robot = ordered
-    async with robot.running():
-        robot.monitors.would_hold = ["/cmd_vel"]
-        robot.poll(offered=True)
-        await asyncio.sleep(2)
-        assert not robot.state.for_order
-        assert "no message passes for a minute" in robot.state.trouble
+    async with ordered.running():
+        ordered.monitors.would_hold = ["/cmd_vel"]
+        await polled(ordered, 2)
+        assert not ordered.state.for_order
+        assert "no message passes for a minute" in ordered.state.trouble
 
 
 @pytest.mark.parametrize("again", [True, False], ids=["the same bundle", "another bundle"])
@@ -154,8 +147,7 @@ async def test_the_bundle_that_waits_can_be_ordered_while_a_poll_offers(
         await checked.wait()
 
     async with ordered.running():
-        ordered.poll(offered=True)
-        await asyncio.sleep(2)
+        await polled(ordered, 2)
         assert ordered.state.for_order == OFFER.path
         monkeypatch.setattr(ordered.policies, "attempt", check)
         offer = OFFER if again else structs.replace(OFFER, path="site-a/arms/3.tar", sha256="3" * 64)
@@ -172,16 +164,16 @@ async def test_the_bundle_that_waits_can_be_ordered_while_a_poll_offers(
         assert ordered.trail.events == (["bundle ordered", "bundle in force"] if again else [])
 
 
+async def refuse(*_content: object) -> None:
+    raise PolicyRefusedError([])
+
+
 @pytest.mark.parametrize("reason", ["unconfirmed", "refused", "held"])
 async def test_a_bundle_that_may_no_longer_be_taken_waits_for_no_order(
     reason: str, ordered: BundleRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def refuse(*_content: object) -> None:
-        raise PolicyRefusedError([])
-
     async with ordered.running():
-        ordered.poll(offered=True)
-        await asyncio.sleep(2)
+        await polled(ordered, 2)
         assert ordered.state.for_order == OFFER.path
         match reason:
             case "unconfirmed":
@@ -190,8 +182,7 @@ async def test_a_bundle_that_may_no_longer_be_taken_waits_for_no_order(
                 monkeypatch.setattr(ordered.policies, "attempt", refuse)
             case _:
                 ordered.monitors.would_hold = ["/cmd_vel"]
-        ordered.poll(offered=True)
-        await asyncio.sleep(2)
+        await polled(ordered, 2)
         assert not ordered.state.for_order
         assert not ordered.gate.order(OFFER.path, "olga")
 
@@ -201,14 +192,9 @@ async def test_an_order_is_tried_or_the_state_has_the_reason(
     reason: str, ordered: BundleRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only a check after the order finds that topics would be held, or that the bundle is refused."""
-
-    async def refuse(*_content: object) -> None:
-        raise PolicyRefusedError([])
-
     revisions = {"policies": ordered.policies, "monitors": ordered.monitors}.get(reason)
     async with ordered.running():
-        ordered.poll(offered=True)
-        await asyncio.sleep(2)
+        await polled(ordered, 2)
         if revisions is not None:
             revisions.confirm_by = 100.0
         elif reason == "held":
@@ -225,8 +211,7 @@ async def test_an_order_is_tried_or_the_state_has_the_reason(
             assert "waits until no message passes for a minute: /cmd_vel" in ordered.state.trouble
             assert "needs another order" in ordered.state.trouble
             ordered.monitors.would_hold = []
-            ordered.poll(offered=True)
-            await asyncio.sleep(2)
+            await polled(ordered, 2)
         elif revisions is not None:
             assert ordered.stated[-1].waits == ordered.state.trouble
             assert "waits for its confirmation" in ordered.state.trouble
