@@ -36,9 +36,8 @@ class Robot:
     def events(self) -> list[str]:
         return [f"{row['event']} by {row['who']}: {row['reason']}" for row in self.core.trail.rows]
 
-    def alarm(self) -> Alarm | None:
-        alarms = asyncio.run(self.orders.listed(AlarmsWanted())).alarms
-        return alarms[0] if alarms else None
+    def alarms(self) -> list[Alarm]:
+        return asyncio.run(self.orders.listed(AlarmsWanted())).alarms
 
     def silence(self, seconds: float | None) -> None:
         asyncio.run(self.orders.silence(AlarmSilence("rosmaster", seconds), "ann"))
@@ -55,16 +54,13 @@ def robot_of(tmp_path: Path) -> Robot:
 def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
     robot.acknowledge()
     robot.restart()
-    alarm = robot.alarm()
-    assert alarm is not None
+    [alarm] = robot.alarms()
     assert (alarm.severity, alarm.handled) == ("warning", "acknowledged by ann: spare part")
     assert alarm.text.endswith("(acknowledged by ann: spare part)")
     robot.fields = GOOD
-    assert robot.alarm() is None
+    assert robot.alarms() == []
     robot.fields = BAD
-    alarm = robot.alarm()
-    assert alarm is not None
-    assert alarm.handled == ""
+    assert [one.handled for one in robot.alarms()] == [""]
     assert robot.events == ["alarm acknowledged by ann: rosmaster is acknowledged: spare part"]
 
 
@@ -82,18 +78,14 @@ def test_an_acknowledgement_survives_a_restart_until_its_alarm_returns(
             robot.fields = GOOD
             robot.restart()
             for _second in range(round(after)):
-                assert robot.alarm() is None
+                assert robot.alarms() == []
                 clock.advance(1)
             robot.fields = BAD
-            alarm = robot.alarm()
-            assert alarm is not None
-            assert bool(alarm.handled) == handled, start
+            assert [bool(one.handled) for one in robot.alarms()] == [handled], start
         robot.fields = GOOD
-        assert robot.alarm() is None
+        assert robot.alarms() == []
         robot.fields = BAD
-        alarm = robot.alarm()
-        assert alarm is not None
-        assert alarm.handled == "", "it was present since the start, and ended"
+        assert [one.handled for one in robot.alarms()] == [""], "it was present since the start, and ended"
 
 
 @pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "notice")])
@@ -102,13 +94,11 @@ def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, 
     with using(clock):
         robot.silence(3600)
         robot.fields = GOOD
-        robot.alarm()
+        robot.alarms()
         robot.fields = BAD
         clock.set_wall(clock.wall_ns() / 1e9 + passed)
         robot.restart()
-        alarm = robot.alarm()
-    assert alarm is not None
-    assert alarm.severity == severity
+        assert [one.severity for one in robot.alarms()] == [severity]
 
 
 @pytest.mark.parametrize(("left", "severity"), [(1, "notice"), (-1, "warning")])
@@ -119,17 +109,13 @@ def test_a_clock_that_is_set_back_does_not_extend_a_silence(robot: Robot, left: 
         clock.advance(5400)
         clock.set_wall(clock.wall_ns() / 1e9 - 3600)
         clock.advance(1800 - left)
-        alarm = robot.alarm()
-    assert alarm is not None
-    assert alarm.severity == severity
+        assert [one.severity for one in robot.alarms()] == [severity]
 
 
 def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
     robot.silence(3600)
     robot.silence(None)
-    alarm = robot.alarm()
-    assert alarm is not None
-    assert alarm.severity == "warning"
+    assert [one.severity for one in robot.alarms()] == ["warning"]
     assert [event.partition(":")[0] for event in robot.events] == [
         "alarm silenced by ann",
         "alarm sounds again by ann",
@@ -147,8 +133,7 @@ def test_an_order_with_the_name_alone_is_for_the_alarms_that_are_present(robot: 
     robot.fields = failing("hook", "signer")
     assert order(3600.0) == {"hook": True, "signer": True}
     robot.fields = failing("hook", "recorder")
-    alarms = asyncio.run(robot.orders.listed(AlarmsWanted())).alarms
-    assert [(one.severity, one.kind) for one in alarms] == [
+    assert [(one.severity, one.kind) for one in robot.alarms()] == [
         ("alarm", "process-failing:recorder"), ("notice", "process-failing:hook"),
     ]  # fmt: skip
     body = asyncio.run(robot.orders.acknowledge(AlarmAcknowledge("process-failing:recorder"), "ann"))
