@@ -60,17 +60,11 @@ HOSTILE: dict[str, tuple[Callable[[], str], str]] = {
         lambda: _unsigned({"alg": "RS256", "kid": "short"}, b"s" * 128),
         "less than 2048 bits",
     ),
-    "a key of another curve": (
-        lambda: _unsigned({"alg": "ES256", "kid": "p384"}, b"s" * 64),
-        "0 keys that fit",
-    ),
+    "a key of another curve": (lambda: _unsigned({"alg": "ES256", "kid": "p384"}, b"s" * 64), "0 keys that fit"),
     "RSA header, EC key": (lambda: _unsigned({"alg": "RS256", "kid": "ec"}, b"s" * 256), "0 keys that fit"),
     "a changed payload": (_changed_payload, "bad_signature"),
     "no signature": (lambda: _signed().rpartition(".")[0] + ".", "bad_signature"),
-    "an ECDSA signature of zeros": (
-        lambda: _unsigned({"alg": "ES256", "kid": "ec"}, b"\0" * 64),
-        "bad_signature",
-    ),
+    "an ECDSA signature of zeros": (lambda: _unsigned({"alg": "ES256", "kid": "ec"}, b"\0" * 64), "bad_signature"),
     "an extension that must be understood": (
         lambda: _unsigned({"alg": "RS256", "kid": "one", "crit": ["x"], "x": 1}),
         "crit",
@@ -105,7 +99,7 @@ HOSTILE: dict[str, tuple[Callable[[], str], str]] = {
     "no subject": (lambda: _signed(sub=None), "sub"),
     "an empty subject": (lambda: _signed(sub=""), "sub"),
     "a subject that is a number": (lambda: _signed(sub=7), "sub"),
-}
+}  # fmt: skip
 
 
 def _keys() -> list[dict[str, Any]]:

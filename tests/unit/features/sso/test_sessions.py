@@ -171,15 +171,11 @@ def test_a_person_and_all_people_have_a_quota_of_sessions(tmp_path: Path) -> Non
     ("answer", "error", "reason"),
     [
         (SignOnFailed(1, "no role", refused=True), TokenRefusedError, "no role"),
-        (
-            SignOnFailed(1, "https://id/token: no answer", refused=False),
-            UnavailableError,
-            "tokens remain valid",
-        ),
+        (SignOnFailed(1, "https://id/token: no answer", refused=False), UnavailableError, "tokens remain valid"),
         (TimeoutError(), UnavailableError, "sign in with a token"),
     ],
     ids=["refused", "provider down", "process down"],
-)
+)  # fmt: skip
 async def test_a_failure_is_answered_and_recorded(
     world: World, answer: Any, error: type[Exception], reason: str
 ) -> None:

@@ -96,11 +96,7 @@ async def test_a_hostile_discovery_document_is_refused(
 @pytest.mark.parametrize(
     ("answer", "error", "reason"),
     [
-        (
-            ProviderAnswer(400, b'{"error": "invalid_grant"}'),
-            SignOnRefusedError,
-            "invalid_grant; sign in again",
-        ),
+        (ProviderAnswer(400, b'{"error": "invalid_grant"}'), SignOnRefusedError, "invalid_grant; sign in again"),
         (ProviderAnswer(401, b'{"error": "invalid_client"}'), ProviderError, "answers 401: invalid_client"),
         (ProviderAnswer(302, b""), ProviderError, "answers 302"),
         (ProviderAnswer(500, b'{"error": "\x1b[2J"}'), ProviderError, "answers 500: $"),
@@ -110,7 +106,7 @@ async def test_a_hostile_discovery_document_is_refused(
         (ProviderAnswer(200, b'{"id_token": "a.b.c"}'), SignOnRefusedError, "its header is not JSON"),
     ],
     ids=lambda value: str(value)[:60],
-)
+)  # fmt: skip
 async def test_a_hostile_answer_for_the_code_is_refused(
     answer: ProviderAnswer, error: type[Exception], reason: str
 ) -> None:
@@ -220,18 +216,13 @@ async def test_a_person_without_a_right_is_refused(
         ({}, {"groups": ["staff", "audit"]}, "u-1", "investigator", 1),
         ({"roles_claim": "a.b"}, {"a": {"b": "staff"}}, "u-1", "viewer", 1),
         ({"roles_claim": "https://x/y.z"}, {"https://x/y.z": ["staff"]}, "u-1", "viewer", 1),
-        (
-            {"name_claim": "email", "domains": ["example.org"]},
-            {"email": "Alice@Example.org", "email_verified": True},
-            "alice@example.org",
-            "operator",
-            1,
-        ),
+        ({"name_claim": "email", "domains": ["example.org"]}, {"email": "Alice@Example.org", "email_verified": True},
+         "alice@example.org", "operator", 1),
         ({"session_hours": 0.5}, {}, "u-1", "operator", 0.5),
         ({"session_hours": 8, "outlives_id_token": True}, {}, "u-1", "operator", 8),
     ],
     ids=str,
-)
+)  # fmt: skip
 async def test_claims_give_name_role_and_end(
     given: dict[str, Any], payload: dict[str, Any], name: str, role: str, hours: float
 ) -> None:
