@@ -62,6 +62,12 @@ def state(tmp_path: Path) -> Path:
     return state
 
 
+def require_refused(state: Path, folder: Path, why: str) -> None:
+    with pytest.raises(BackupError, match=why):
+        back_up(state, folder / "backup.tar.gz")
+    assert not (folder / "backup.tar.gz").exists()
+
+
 def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
     file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
     assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
@@ -283,25 +289,19 @@ def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
         os.chown(path, 61014, 61014)
     (tmp_path / "shadow").write_text("root's")
     os.link(tmp_path / "shadow", state / "api" / "mine")
-    with pytest.raises(BackupError, match="api/mine belongs to user id 0"):
-        back_up(state, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    require_refused(state, tmp_path, "api/mine belongs to user id 0")
 
 
 def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
     with (state / "api" / "hole").open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):
-        back_up(state, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    require_refused(state, tmp_path, "api/hole has 1099511627776 bytes")
 
 
 @pytest.mark.parametrize("name", ["\x1b[2J", "x" * 97])
 def test_a_name_that_cannot_be_restored_is_refused(state: Path, tmp_path: Path, name: str) -> None:
     (state / "api" / name).touch()
-    with pytest.raises(BackupError, match="find out its origin"):
-        back_up(state, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    require_refused(state, tmp_path, "find out its origin")
 
 
 def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,18 +316,14 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
         return descriptor
 
     monkeypatch.setattr(backup, "opened", grown)
-    with pytest.raises(BackupError, match=r"api/growing has more than 999 bytes: find out its origin"):
-        back_up(state, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    require_refused(state, tmp_path, r"api/growing has more than 999 bytes: find out its origin")
 
 
 def test_too_many_files_are_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backup, "MAX_FILES", 5)
-    with pytest.raises(BackupError, match=r"more than 5 files, .* in api"):
-        for number in range(9):
-            (state / "api" / str(number)).touch()
-        back_up(state, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    for number in range(9):
+        (state / "api" / str(number)).touch()
+    require_refused(state, tmp_path, r"more than 5 files, .* in api")
 
 
 def test_an_interrupted_backup_leaves_no_file(
@@ -389,9 +385,7 @@ def test_nohup_protects_a_backup(state: Path, tmp_path: Path, monkeypatch: pytes
 
 def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> None:
     (state / "restoring").touch()
-    with pytest.raises(BackupError, match="a restore did not finish"):
-        back_up(state, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    require_refused(state, tmp_path, "a restore did not finish")
 
 
 @pytest.fixture
@@ -442,7 +436,5 @@ def test_a_database_replaced_by_a_link_reveals_nothing_of_root(
         return descriptor
 
     monkeypatch.setattr(backup, "opened", swapped)
-    with pytest.raises(BackupError, match=r"control/state\.db cannot be read by its owner, user id 61011"):
-        back_up(owned, tmp_path / "backup.tar.gz")
-    assert not (tmp_path / "backup.tar.gz").exists()
+    require_refused(owned, tmp_path, r"control/state\.db cannot be read by its owner, user id 61011")
     assert os.geteuid() == 0
