@@ -12,14 +12,7 @@ from appliance.features.table import NAMES
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1200)]
 ROOT = Path(__file__).parents[3]
-_TESTED = (
-    "configuration",
-    "supervisor",
-    "control",
-    "channel",
-    "test_imports.py",
-    "test_source_rules.py",
-)
+_TESTED = ("configuration", "supervisor", "control", "channel", "test_imports.py", "test_source_rules.py")
 _EVERYTHING = """
 import importlib, pkgutil, appliance
 for module in pkgutil.walk_packages(appliance.__path__, "appliance."):

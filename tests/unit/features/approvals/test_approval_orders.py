@@ -63,18 +63,11 @@ class Site:
         self.replaced = asyncio.Event()  # that relay
         self.bearers = [bearer("1", "ann")]
         self.orders = ApprovalOrders(
-            lambda: self.policy,
-            self.trail,
-            signs or HostSigns(lambda _host: True, lambda _host, _names: self.moved),
-            self.stop,
-            ends,
-            first=17,
-            decide_again=self.decide_again,
-            carried_out=self.carried_out,
-            bearers=lambda: self.bearers,
-            guards=self.guards,
-            held=lambda *_entry: None,
-        )
+            lambda: self.policy, self.trail,
+            signs or HostSigns(lambda _host: True, lambda _host, _names: self.moved), self.stop, ends,
+            first=17, decide_again=self.decide_again, carried_out=self.carried_out,
+            bearers=lambda: self.bearers, guards=self.guards, held=lambda *_entry: None,
+        )  # fmt: skip
         self.decide_again()
 
     def decide_again(self) -> int:

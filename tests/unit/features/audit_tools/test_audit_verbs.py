@@ -50,16 +50,9 @@ def state(tmp_path: Path) -> Path:
 
 def checkpoint(number: int, log: str = "one") -> SignedCheckpoint:
     return SignedCheckpoint(
-        log=log,
-        number=number,
-        sequence=number,
-        hash="",
-        time=0,
-        previous="",
-        signature="",
-        key="",
+        log=log, number=number, sequence=number, hash="", time=0, previous="", signature="", key="",
         removed=None,
-    )
+    )  # fmt: skip
 
 
 def followed(

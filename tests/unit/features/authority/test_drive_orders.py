@@ -12,13 +12,7 @@ from appliance.control.core import RelayOrders
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.features.authority.orders import CHECK_SECONDS, DriveOrders
 from appliance.features.authority.ranked_groups import RankedGroups
-from appliance.features.authority.requests import (
-    DriveAsk,
-    DriveGive,
-    DriveStatus,
-    DriveTake,
-    GroupState,
-)
+from appliance.features.authority.requests import DriveAsk, DriveGive, DriveStatus, DriveTake, GroupState
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.master.endpoints.relay_control import RankStates
 from appliance.policy.model import Address, Category, Request, address_of
@@ -59,15 +53,11 @@ class Site:
             lambda: self.policy, self.trail, relay, self.stop, node="/rosrv", find=lambda _key: ("", None)
         )
         self.orders = DriveOrders(
-            lambda: self.policy,
-            self.trail,
+            lambda: self.policy, self.trail,
             signs or HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
-            self.stop,
-            ranked,
-            decide_again=self.decide_again,
-            carried_out=self.carried_out,
+            self.stop, ranked, decide_again=self.decide_again, carried_out=self.carried_out,
             relays_ready=lambda: self.ready,
-        )
+        )  # fmt: skip
 
     async def stop(self, host: str, topics: Iterable[str], why: str) -> None:
         if not why.endswith("its nodes ended"):  # then it keeps the group for a time

@@ -61,12 +61,7 @@ class Site:
         self.stopped: list[tuple[str, set[str]]] = []
         self.nodes = dict(NODES)
         self.ranked = RankedGroups(
-            lambda: self.policy,
-            self.trail,
-            as_any(self.relay),
-            self.stop,
-            node="/rosrv",
-            find=self.find,
+            lambda: self.policy, self.trail, as_any(self.relay), self.stop, node="/rosrv", find=self.find
         )
         self.ranked.policy_changed()
 

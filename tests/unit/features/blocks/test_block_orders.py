@@ -14,13 +14,7 @@ from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.blocks.orders import BlockOrders, is_own
-from appliance.features.blocks.requests import (
-    BlockEnded,
-    HostBlock,
-    HostBlocked,
-    HostBlocks,
-    HostUnblock,
-)
+from appliance.features.blocks.requests import BlockEnded, HostBlock, HostBlocked, HostBlocks, HostUnblock
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.policy.judgement import PolicyContext

@@ -43,14 +43,9 @@ ALWAYS = Period(0, 1000 * HOUR)
 def entry(hour: float, event: str, resource: str = "", reason: str = "", **detail: Any) -> LogEntry:
     number = round(hour * 100) + 1
     record = AuditRecord(
-        id=f"{number:020x}",
-        time=round(hour * HOUR),
-        event=event,
-        resource=resource or None,
-        host=resource or None,
-        reason=reason,
-        detail=detail,
-    )
+        id=f"{number:020x}", time=round(hour * HOUR), event=event, resource=resource or None,
+        host=resource or None, reason=reason, detail=detail,
+    )  # fmt: skip
     return LogEntry(number, record)
 
 
@@ -461,14 +456,9 @@ def test_the_page_and_the_lines_say_what_is_not_covered_and_not_verified() -> No
 )
 def test_a_verification_says_of_what_it_is(log: str, through: int, words: str) -> None:
     result = VerificationResult(
-        time_utc=rfc3339(HOUR),
-        complete=True,
-        records=9,
-        text="",
-        log=log,
-        through=through,
+        time_utc=rfc3339(HOUR), complete=True, records=9, text="", log=log, through=through,
         verdict="The log is consistent, but nothing is signed yet",
-    )
+    )  # fmt: skip
     known = ReportedLog(name="", id="ab", begins_utc=rfc3339(HOUR), last=9, verification=result)
     assert words in page(report(logs=[known]))
 

@@ -59,15 +59,8 @@ def states(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def test_both_logs_are_one_report(states: dict[str, str], tmp_path: Path) -> None:
     page = tmp_path / "both.html"
     words = (
-        "report",
-        "interventions",
-        "--state",
-        states["b"],
-        "--other",
-        states["a"],
-        "--until",
-        "2030-01-01",
-    )
+        "report", "interventions", "--state", states["b"], "--other", states["a"], "--until", "2030-01-01",
+    )  # fmt: skip
     report = json.loads(rosrv(*words, "--json").stdout)
     assert [(row["appliance"], row["event"]) for row in report["interventions"]] == [
         (name, event) for name, _, event, _, _ in HISTORY

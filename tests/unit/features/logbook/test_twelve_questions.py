@@ -13,14 +13,7 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Token, Tokens
 from appliance.features.logbook import report_verb
-from appliance.formats.machine_report import (
-    MachineReport,
-    Period,
-    Reading,
-    ReportedLog,
-    merged,
-    read_records,
-)
+from appliance.formats.machine_report import MachineReport, Period, Reading, ReportedLog, merged, read_records
 from appliance.formats.report_words import page
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy_compiler import compile_policy
@@ -156,14 +149,9 @@ def found() -> Page:
     period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
     read = read_records(merged({"": entries()}), period)
     result = VerificationResult(
-        time_utc="2026-05-03T04:00:00.000000000Z",
-        complete=True,
-        verdict="The log is complete and unchanged",
-        records=14,
-        text="",
-        log="ab",
-        through=14,
-    )
+        time_utc="2026-05-03T04:00:00.000000000Z", complete=True, verdict="The log is complete and unchanged",
+        records=14, text="", log="ab", through=14,
+    )  # fmt: skip
     log = ReportedLog(
         name="", id="ab", begins_utc="2026-02-20T08:00:00.000000000Z", last=14, verification=result
     )

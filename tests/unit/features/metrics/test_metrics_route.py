@@ -15,9 +15,7 @@ from tests.support.answers import example
 CALLS = {("GET", "200"): 8}
 
 
-def body(
-    processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},),
-) -> Measures:
+def body(processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},)) -> Measures:
     meter = Meter()
     for seconds in (0.0003, 99.0):
         meter.decisions["publish", "deny"] += 1

@@ -82,8 +82,7 @@ def test_a_name_that_is_not_that_of_a_group_is_replaced(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["/a = robot\n[Options]\naudit-only = all", "/a b", "relative", "/ü", "", "/a\n- deny"],
+    "name", ["/a = robot\n[Options]\naudit-only = all", "/a b", "relative", "/ü", "", "/a\n- deny"]
 )
 def test_a_name_that_a_node_made_up_writes_no_rule(name: str) -> None:
     topics = (*inventory().topics, SurveyedTopic(name, "std_msgs/String", ("/base",), ("/teleop",)))
