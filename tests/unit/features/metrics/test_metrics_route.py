@@ -67,12 +67,17 @@ def test_every_metric_is_exported_as_listed() -> None:
             assert set(sample.labels) - {"le"} == set(metric.labels), sample
 
 
-def test_values_are_exported() -> None:
-    samples = {
+def exported() -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
+    """Return the values by name and labels."""
+    return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
         for sample in family.samples
     }
+
+
+def test_values_are_exported() -> None:
+    samples = exported()
     assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
     assert samples["rosrv_decision_seconds_count", ()] == 2
     assert samples["rosrv_monitor_events_total", (("kind", "drop"), ("monitor", "safeTrigger"))] == 4
@@ -101,12 +106,7 @@ def test_values_are_exported() -> None:
 
 
 def test_tunnels_are_measured() -> None:
-    samples = {
-        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
-        for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
-        for sample in family.samples
-        if "tunnel" in sample.name or "host" in sample.name
-    }
+    samples = exported()
     a = (("host", "a"),)
     assert samples["rosrv_tunnel_up", a] == 1
     assert samples["rosrv_tunnel_age_seconds", a] == 7
@@ -118,12 +118,7 @@ def test_tunnels_are_measured() -> None:
 
 
 def test_processes_of_one_role_have_separate_series() -> None:
-    answer = body(
-        [
-            {"role": "relay", "pid": os.getpid(), "restarts": 1},
-            {"role": "relay", "pid": os.getpid(), "restarts": 2},
-        ]
-    )
+    answer = body([{"role": "relay", "pid": os.getpid(), "restarts": restarts} for restarts in (1, 2)])
     lines = [one for one in rendered(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
     assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
     assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines
