@@ -178,12 +178,9 @@ async def test_nodes_that_hang_delay_no_node_of_this_computer(
         host = "base" if where == "here" else f"nuc{number if where == 'many hosts' else 0}"
         if where != "here":
             bare.resolved.setdefault(host, [f"192.168.50.{100 + len(bare.resolved)}"])
+        uri = f"http://{host}:{4100 + number}/"
         bare.add(
-            f"/a_recorder{number}",
-            4100 + number,
-            f"http://{host}:{4100 + number}/",
-            publishes=("/a_diagnosis",),
-            subscribes=subscribed,
+            f"/a_recorder{number}", 4100 + number, uri, publishes=("/a_diagnosis",), subscribes=subscribed
         )
     bare.add_nodes()
     await bare.until_settled()

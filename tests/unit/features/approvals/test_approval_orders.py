@@ -288,6 +288,9 @@ async def test_approvals_are_as_promised_in_any_order(site: Site, seed: int) -> 
         assert sorted(text.partition(": ")[2] for text in texts) == sorted(promised.records)
 
 
+PARTS = {"once": ("", "held for"), "for": ("", ""), "refuse": ("refused",) * 2, "waits": ("held for",) * 2}
+"""By the last answer about a call: a part of what its host gets to hear, twice."""
+
 ANSWERS = [(call, answer) for call in "AB" for answer in ("once", "for", "refuse")]
 
 
@@ -318,15 +321,8 @@ async def test_the_last_answer_about_a_call_decides_it(
                 numbers[one] = number_in(await site.call(one.encode()))
     for call, answer in about.items():
         told = [await site.call(call.encode()) for _again in range(2)]
-        parts = {
-            "once": ("", "held for"),
-            "for": ("", ""),
-            "refuse": ("refused",) * 2,
-            "waits": ("held for",) * 2,
-        }
-        assert all(
-            part in text and bool(part) == bool(text) for part, text in zip(parts[answer], told, strict=True)
-        )
+        for part, text in zip(PARTS[answer], told, strict=True):
+            assert part in text and bool(part) == bool(text)
     assert [one.state for one in await site.held()].count("waits") == site.orders.state().waiting
     await site.pass_time(301)
     given, ended = (

@@ -29,12 +29,8 @@ def test_a_table_of_records_has_the_author_of_a_change(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     show_on_terminal(monkeypatch)
-    authors = (
-        ("policy loaded", "alice"),
-        ("policy loaded", 7),
-        ("rest call", None),
-        ("denials folded", "None"),
-    )
+    loaded = ("policy loaded", "alice"), ("policy loaded", 7)
+    authors = *loaded, ("rest call", None), ("denials folded", "None")
     records = [AuditRecord(id="0" * 20, time=0, event=event, detail={"who": who}) for event, who in authors]
     print_entries([LogEntry(number, record) for number, record in enumerate(records)], str, each=True)
     head, *rows = _STYLE.sub("", capsys.readouterr().out).splitlines()
@@ -79,9 +75,5 @@ def test_equal_records_are_one_row(
         "3 1970-01-01 23:53:23 to 23:53:25Z message dropped monitor speedLimit /cmd_vel 3 times, last: speed 0.5"
     )
     print_entries(entries, str, each=True)
-    assert [_STYLE.sub("", row).split()[0] for row in capsys.readouterr().out.splitlines()] == [
-        "record",
-        "5",
-        "4",
-        "3",
-    ]
+    numbers = [_STYLE.sub("", row).split()[0] for row in capsys.readouterr().out.splitlines()]
+    assert numbers == ["record", "5", "4", "3"]

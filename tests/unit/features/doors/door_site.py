@@ -54,11 +54,9 @@ class DoorSite:
         self.table = DoorTable(self.core.store, Doors())
         self.table.closed = ""
         self.table.save(ALICE)
+        tickets = ["3f9a0c5d17e2"]
         self.processes = DoorProcesses(
-            self.core,
-            self.table,
-            tickets=lambda _door: ["3f9a0c5d17e2"],
-            left=lambda *left: self.left.append(left),
+            self.core, self.table, tickets=lambda _door: tickets, left=lambda *left: self.left.append(left)
         )
         self._monkeypatch = monkeypatch
         monkeypatch.setattr(self.processes, "_given", self._given)

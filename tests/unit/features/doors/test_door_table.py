@@ -85,13 +85,8 @@ def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
         tickets = DoorTickets(store, ends_of(store, tmp_path))
         row, text = tickets.make("alice", 3600.0, "first")
         assert tickets.find("alice", text) == row
-        wrong = (
-            text[:-1] + ("A" if text[-1] != "A" else "B"),
-            row.id,
-            "",
-            text + "A",
-            text.replace(".", "_"),
-        )
+        other = text[:-1] + ("A" if text[-1] != "A" else "B")
+        wrong = (other, row.id, "", text + "A", text.replace(".", "_"))
         assert [tickets.find("alice", one) for one in wrong] == [None] * len(wrong)
         assert tickets.find("bob", text) is None
         assert text.partition(".")[2].encode() not in (tmp_path / "state.db").read_bytes()

@@ -190,22 +190,15 @@ def test_the_page_says_was_any_guard_off_when_and_by_whose_order(found: Page) ->
 
 def test_the_page_says_which_software_ran_on_3_may(found: Page) -> None:
     rows = found.rows("Software that ran")[1:]
-    assert [
-        row[1]
-        for row in rows
-        if row[2] <= "2026-05-03 00:00:00" and (row[3] == "lasts" or row[3] > "2026-05-03")
-    ] == ["0.5.0"]
+    began = [row for row in rows if row[2] <= "2026-05-03 00:00:00"]
+    assert [row[1] for row in began if row[3] == "lasts" or row[3] > "2026-05-03"] == ["0.5.0"]
     assert "appliance.yaml: sso changed" in found.text("Software")
 
 
 def test_the_page_says_which_interfaces_take_commands_and_what_protects_each(found: Page) -> None:
     rows = found.rows("Interfaces now, and what protects each")[1:]
-    assert {row[0] for row in rows} >= {
-        "ROS Master API",
-        "topics and services (relay)",
-        "door agent",
-        "IPsec tunnels",
-    }
+    named = {row[0] for row in rows}
+    assert named >= {"ROS Master API", "topics and services (relay)", "door agent", "IPsec tunnels"}
     assert all(row[3] for row in rows)
     (door,) = (row for row in rows if row[0] == "door agent")
     assert door[1] == "address 10.78.0.1, port 9091, from 10.0.0.20"

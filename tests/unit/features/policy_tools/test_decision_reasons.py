@@ -8,8 +8,8 @@ from tests.unit.policy.test_asking import AGENT
 from tests.unit.policy.test_asking import policy as policy_that_asks
 from tests.unit.policy.test_rate_limits import GUEST, policy
 
-POLICY = compile_policy(
-    """[Groups]
+TEXT = """\
+[Groups]
 ocu = 10.0.0.5
 [Nodes]
 /ocu = ocu
@@ -21,9 +21,8 @@ default = 10.0.0.1
 [Commands]
 default = ocu
 listMethods = 10.0.0.1
-""",
-    file="p.ini",
-)
+"""
+POLICY = compile_policy(TEXT, file="p.ini")
 
 
 def explained(host: str, category: Category, resource: str, node: str = "/ocu") -> DecisionExplanation:
@@ -34,11 +33,8 @@ def test_rules_that_lost_are_named_most_specific_first() -> None:
     found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd")
     assert found.decision.rule is not None
     assert found.decision.rule.key == "/arm/cmd"
-    assert [(lost.rule.key, lost.grants) for lost in found.lost] == [
-        ("/arm/*", True),
-        ("/arm/**", True),
-        ("default", False),
-    ]
+    lost = [(one.rule.key, one.grants) for one in found.lost]
+    assert lost == [("/arm/*", True), ("/arm/**", True), ("default", False)]
     assert found.lost[0].why == "/arm/cmd is more specific"
 
 

@@ -8,8 +8,8 @@ from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 
-POLICY = compile_policy(
-    """[Groups]
+TEXT = """\
+[Groups]
 joystick = 10.0.0.5
 [Nodes]
 default = *
@@ -23,11 +23,9 @@ getParam = joystick
 shutdown =
 [Parameters]
 read /arm/** = joystick
-""",
-    file="p.ini",
-    robot=[ip_address("192.0.2.1")],
-)
+"""
 JOYSTICK, ROBOT = ip_address("10.0.0.5"), ip_address("192.0.2.1")
+POLICY = compile_policy(TEXT, file="p.ini", robot=[ROBOT])
 
 
 def rows(uses: RuleUses, unnamed: str = "", *, removed: bool = False) -> dict[str, RuleUse]:

@@ -106,7 +106,7 @@ def test_before_and_after(scene: Scene) -> None:
     scene.later(20)
     scene.say(TEXT.replace(b"hello", b"alarm"))
     scene.later(1)
-    where = {"host": "10.0.0.1", "caller_id": "/voice", "resource": "/chatter"}
+    where: dict[str, Any] = {"host": "10.0.0.1", "caller_id": "/voice", "resource": "/chatter"}
     dropped = scene.happen(reason="too fast", **where, detail={"monitor": "limit"})
     assert not scene.closed(scene.later(0.2))
     scene.say()

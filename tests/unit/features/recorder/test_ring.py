@@ -25,11 +25,8 @@ from appliance.features.recorder.ring import (
 
 EVER = 0, 1 << 63
 HEADER = {
-    "type": "std_msgs/String",
-    "md5sum": "5" * 32,
-    "message_definition": "string data\n",
-    "callerid": "/talker",
-}
+    "type": "std_msgs/String", "md5sum": "5" * 32, "message_definition": "string data\n", "callerid": "/talker",
+}  # fmt: skip
 
 
 def frame(body: bytes) -> bytes:

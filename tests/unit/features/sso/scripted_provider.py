@@ -21,23 +21,15 @@ KEYS = SessionKeys("0123456789ab", b"r" * 32, b"v" * 32)
 Key = RSAKey | ECKey
 
 
+ROLES = {"viewer": ["staff"], "operator": ["crew"], "admin": ["chiefs"], "investigator": ["audit"]}
+WANTED = {
+    "issuer": ISSUER, "address": "10.0.0.5:443", "client_id": CLIENT, "url": "https://robot.example.org:8443",
+    "roles": ROLES, "doors": {"floor": ["crew", "guests"]},
+}  # fmt: skip
+
+
 def sso(**given: Any) -> Sso:
-    return Sso(
-        **{
-            "issuer": ISSUER,
-            "address": "10.0.0.5:443",
-            "client_id": CLIENT,
-            "url": "https://robot.example.org:8443",
-            "roles": {
-                "viewer": ["staff"],
-                "operator": ["crew"],
-                "admin": ["chiefs"],
-                "investigator": ["audit"],
-            },
-            "doors": {"floor": ["crew", "guests"]},
-            **given,
-        }
-    )
+    return Sso(**{**WANTED, **given})
 
 
 @functools.cache

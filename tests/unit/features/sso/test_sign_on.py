@@ -21,12 +21,8 @@ async def test_a_person_is_identified_with_role_and_groups_of_doors() -> None:
     assert provider.asked["redirect_uri"] == "https://robot.example.org:8443/console"
     assert (provider.asked["prompt"], provider.asked["code_challenge_method"]) == ("login", "S256")
     identity, keys, address = await provider.sign_ons.finish(state, "code", "")
-    assert (identity.subject, identity.name, identity.role, identity.doors) == (
-        "u-1",
-        "u-1",
-        "operator",
-        ("floor",),
-    )
+    found = identity.subject, identity.name, identity.role, identity.doors
+    assert found == ("u-1", "u-1", "operator", ("floor",))
     assert (keys, address) == (KEYS, "10.0.0.9")
     assert identity.ends == pytest.approx(clock.wall() + HOUR, abs=1)  # of the ID token
     pair = base64.b64decode(provider.headers["Authorization"].removeprefix("Basic ")).decode()
