@@ -198,10 +198,8 @@ class RobotWorld:
         self.apart: dict[str, int] = {}  # the ports of services that have one of their own
         self.probed: set[int] = set()  # ports that were asked for a service
         self.devices: set[int] = set()  # ports of programs that say nothing to a probe
-        self.kept_left, self.kept_unasked = (
-            LeftThere(),
-            set[Incarnation](),
-        )  # what control stores after each step
+        # What control stores after each step.
+        self.kept_left, self.kept_unasked = LeftThere(), set[Incarnation]()
         self.orders_until_kill = 0
         self.begin()
 

@@ -104,11 +104,9 @@ class Site:
 
     def publish(self, topic: str, category: Category = Category.PUBLISH) -> str:
         decision = self.policy.decide(Request(AGENT, "/it", category, topic))
-        return (
-            ""
-            if decision.allowed
-            else self.orders.hold_call(decision.asks or Request(AGENT, "", category, "")).text
-        )
+        if decision.allowed:
+            return ""
+        return self.orders.hold_call(decision.asks or Request(AGENT, "", category, "")).text
 
     async def held(self) -> list[Approval]:
         return (await self.orders.listed(ApprovalsWanted())).approvals

@@ -79,11 +79,8 @@ def test_each_path_reports_an_unknown_parameter(world: RestWorld) -> None:
     for path in read:
         answer = world.asked("GET", f"{path}?resourse=/cmd_*")
         errors = answer.json().get("errors") if answer.status_code == 422 else None
-        assert errors and errors[0]["where"] == "query.resourse", (
-            path,
-            answer.status_code,
-            answer.text[:200],
-        )
+        about = path, answer.status_code, answer.text[:200]
+        assert errors and errors[0]["where"] == "query.resourse", about
 
 
 def test_one_record_has_its_neighbours(world: RestWorld) -> None:

@@ -247,11 +247,8 @@ def test_a_hostile_cbor_frame_is_an_error_in_words(frame: bytes, error: str) -> 
 
 
 def test_the_scan_accepts_what_cbor2_writes_for_plain_values() -> None:
-    plain = {
-        "a": [1, -1, 2**64 - 1, 1.5, True, None, "x" * 300, b"y" * 70_000],
-        "b": {"c": []},
-        "d": [0] * 300,
-    }
+    several = [1, -1, 2**64 - 1, 1.5, True, None, "x" * 300, b"y" * 70_000]
+    plain = {"a": several, "b": {"c": []}, "d": [0] * 300}
     assert json_of_cbor(cbor2.dumps(plain)) == msgspec.json.encode(plain)
     assert json_of_cbor(cbor2.dumps({"nan": math.nan})) == b'{"nan":null}'
 
@@ -274,15 +271,9 @@ def test_the_scan_accepts_what_cbor2_writes_for_plain_values() -> None:
     ],
 )
 def test_the_cost_of_a_text_is_an_upper_bound_of_the_memory_that_it_takes(text: str, unit: str) -> None:
-    definitions = standard().extended(
-        Definitions.from_files(
-            {
-                "t/T.msg": text,
-                "t/P.msg": "float64 x\nfloat64 y\nfloat64[9] z\nstring s",
-                "t/L.msg": "int32[] b",
-            }
-        )
-    )
+    point, row = "float64 x\nfloat64 y\nfloat64[9] z\nstring s", "int32[] b"
+    files = {"t/T.msg": text, "t/P.msg": point, "t/L.msg": row}
+    definitions = standard().extended(Definitions.from_files(files))
     writer = MessageCodec(definitions, "t/T", ValueLimits()).writer
     sent = f'{{"a":[{",".join([unit] * min(20_000, 3_000_000 // len(unit)))}]}}'.encode()
     writer.from_json(sent, NOW)

@@ -7,13 +7,8 @@ import pytest
 from appliance.features.evidence.page import Names, Page
 
 KINDS = [
-    ("info", "deny"),
-    ("notice", None),
-    ("notice", "deny"),
-    ("warning", None),
-    ("alarm", None),
-    ("alarm", "deny"),
-]
+    ("info", "deny"), ("notice", None), ("notice", "deny"), ("warning", None), ("alarm", None), ("alarm", "deny"),
+]  # fmt: skip
 SPAN: dict[str, Any] = {"runs": [(1, 5000)], "since": 0, "until": 9, "log": "l", "members": {}, "missing": []}
 
 

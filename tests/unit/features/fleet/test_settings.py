@@ -35,11 +35,8 @@ def test_a_join_gives_the_section_fleet(file: Path, tmp_path: Path) -> None:
     folder = joined(tmp_path / "state")
     state = {"state": tmp_path / "state"}
     fleet = resolve(None, {}, state).of(Fleet)
-    assert (fleet.collector, fleet.robot, fleet.key) == (
-        "https://10.0.0.9:8444",
-        "arm7",
-        folder / "robot.key",
-    )
+    assert (fleet.collector, fleet.robot) == ("https://10.0.0.9:8444", "arm7")
+    assert fleet.key == folder / "robot.key"
     assert (fleet.bundles.site, fleet.bundles.group, fleet.bundles.root) == ("site-a", "arms", None)
     file.write_text(
         "state: state\naudit: {retention_days: 9}\nfleet: {retention_waits: true, bundles: {root: root.json}}\n"

@@ -13,11 +13,8 @@ from tests.unit.features.guards.tracing import Source, Trace, finite, motion, pa
 def sensor(seed: int, events: int = 60) -> None:
     """A scanner that is silent, frozen or blind, and another node on its topic, stop the base."""
     chance = seeded(seed)
-    silent, frozen, least = (
-        chance.choice((100, 500)),
-        chance.choice((0, 2, 5)),
-        chance.choice((0.0, 0.1, 0.5, 1.0)),
-    )
+    silent, frozen = chance.choice((100, 500)), chance.choice((0, 2, 5))
+    least = chance.choice((0.0, 0.1, 0.5, 1.0))
     trace = Trace("sensor", seed, silent=silent / 1000, frozen=frozen, least=least)
     source = Source(silent)
     before: tuple[float, ...] = ()

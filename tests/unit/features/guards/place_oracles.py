@@ -27,11 +27,8 @@ def fence(seed: int, events: int = 50) -> None:  # noqa: PLR0912  one branch for
     The base of the trace does not obey its commands: positions are random, so that each case occurs.
     """
     chance = seeded(seed)
-    margin, ahead, silent = (
-        chance.choice((0.0, 0.2, 0.5)),
-        chance.choice((0.2, 0.5)),
-        chance.choice((200, 500)),
-    )
+    margin, ahead = chance.choice((0.0, 0.2, 0.5)), chance.choice((0.2, 0.5))
+    silent = chance.choice((200, 500))
     inward, world = chance.choice((0.1, 0.3)), chance.random() < 0.5
     trace = Trace(
         "fence", seed, margin=margin, ahead=ahead, silent=silent / 1000, inward=inward, worldFrame=world

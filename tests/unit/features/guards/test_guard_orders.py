@@ -499,14 +499,8 @@ async def test_a_new_guard_is_in_shadow_mode_or_in_force(tmp_path: Path, shadow:
 
 async def test_suggestions_name_the_guards_that_are_loaded(monitors: SpecificationManager) -> None:
     publisher = example(Publisher, node="/a", messages_per_second=10.0)
-    topics = [
-        Topic(name, kind, True, [publisher], ["/base"], [])
-        for name, kind in (
-            ("/cmd_vel", TYPES["command"]),
-            ("/odom", TYPES["by"]),
-            ("/estop_enabled", "std_msgs/Bool"),
-        )
-    ]
+    kinds = {"/cmd_vel": TYPES["command"], "/odom": TYPES["by"], "/estop_enabled": "std_msgs/Bool"}
+    topics = [Topic(name, kind, True, [publisher], ["/base"], []) for name, kind in kinds.items()]
     orders = orders_of(monitors, graph=Graph([], topics, []))
     found = await orders.suggestions(guard_requests.GuardSuggestionsWanted())
     assert [one.name for one in found.loaded] == ["fence"]

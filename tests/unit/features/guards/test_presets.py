@@ -156,11 +156,8 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
     )
     assert len(described(text.replace("/base/cmd", "/arm_controller" * 20))) == NOTE_LENGTH
     made = preset_of(text)
-    assert made is not None and (made.name, made.text, made.version) == (
-        "fence",
-        text,
-        PRESETS["fence"].version,
-    )
+    assert made is not None
+    assert (made.name, made.text, made.version) == ("fence", text, PRESETS["fence"].version)
     assert text.replace("0,0 4,0 0,3.5", "1,1 2,1 2,2") == with_values(text, {"polygon": "1,1 2,1 2,2"})
     [code] = compiled(text).specifications
     assert {event.topic for event in code.events if event.topic} == {"/base/cmd", "/pose"}

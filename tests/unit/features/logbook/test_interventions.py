@@ -144,10 +144,9 @@ def test_a_guard_that_is_removed_while_it_is_off_is_off_no_longer(
 
 
 def test_a_guard_that_was_never_on_is_off_from_its_load() -> None:
+    loaded: dict[str, Any] = {"sha256": "b", "monitors": ["speed"], "off": {"speed": "disabled"}}
     found = off(
-        entry(
-            1, "specifications loaded", sha256="b", who="ann", monitors=["speed"], off={"speed": "disabled"}
-        ),
+        entry(1, "specifications loaded", who="ann", **loaded),
         entry(2, "monitor enabled", "speed", who="bob"),
         entry(4, "appliance started", version="1", off={"fence": "in shadow mode"}),
     )
@@ -275,11 +274,8 @@ def test_a_clock_that_was_set_back_does_not_change_the_order_of_a_log() -> None:
     found = read_records(
         merged({"a": backwards, "b": [entry(3, "host renewed", name="t", replaced="1")]}), ALWAYS
     )
-    assert [row.event for row in found.interventions] == [
-        "host renewed",
-        "monitor disabled",
-        "monitor enabled",
-    ]
+    events = [row.event for row in found.interventions]
+    assert events == ["host renewed", "monitor disabled", "monitor enabled"]
 
 
 @pytest.mark.parametrize(

@@ -54,13 +54,9 @@ def events_of(
     row: Row, given: Iterable[Given], *, together: bool, shadows: Collection[str] = ()
 ) -> list[MonitorEvent]:
     monitored = Monitored(
-        {"x.rv": row.text},
-        definitions(),
-        together=together,
-        shadows=shadows,
-        restarted=row.restarted,
+        {"x.rv": row.text}, definitions(), together=together, shadows=shadows, restarted=row.restarted,
         began=START,
-    )
+    )  # fmt: skip
     try:
         for one in given:
             monitored.time = START + one.at * MS

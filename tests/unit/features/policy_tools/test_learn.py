@@ -164,11 +164,8 @@ def test_a_name_that_lasts_is_its_own_key(name: str) -> None:
 def test_a_name_of_one_run_may_be_beside_names_that_look_alike() -> None:
     anonymous = "/talker_4711_1700000000000"
     topics = (("10.0.0.1", "/talker_1"), ("10.0.0.2", anonymous))
-    keys = (
-        ("10.0.0.1", f"{anonymous}/rate"),
-        ("10.0.0.2", f"{anonymous}/rate/max"),
-        ("10.0.0.1", "/talker_1/rate"),
-    )
+    own = (("10.0.0.1", f"{anonymous}/rate"), ("10.0.0.2", f"{anonymous}/rate/max"))
+    keys = (*own, ("10.0.0.1", "/talker_1/rate"))
     learned = learn([
         *(seen(host, Category.PUBLISH, topic) for host, topic in topics),
         *(seen(host, Category.COMMAND, "getParam", call="getParam", key=key) for host, key in keys),

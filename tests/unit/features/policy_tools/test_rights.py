@@ -124,14 +124,9 @@ def needed(call: RosCall[Any], missing: frozenset[str]) -> list[str]:
 
 
 def deeds(call: RosCall[Any]) -> list[Request]:
-    found = [
-        Request(
-            HOST,
-            NAME,
-            call.row.category,
-            THING if call.row.category is not Category.COMMAND else call.policy_name,
-        )
-    ]
+    category = call.row.category
+    name = call.policy_name if category is Category.COMMAND else THING
+    found = [Request(HOST, NAME, category, name)]
     if call.row.touches is not None:
         found.append(Request(HOST, NAME, call.row.touches, KEY_GIVEN))
     return found

@@ -64,11 +64,8 @@ def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
 
 
 def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> None:
-    path, whole, headers = (
-        tmp_path / "cut.bag",
-        tmp_path / "whole.bag",
-        [HEADER, HEADER | {"topic": "/other"}],
-    )
+    path, whole = tmp_path / "cut.bag", tmp_path / "whole.bag"
+    headers = [HEADER, HEADER | {"topic": "/other"}]
     bag = BagWriter(whole, {})
     numbers = [bag.connect(header) for header in headers]
     sizes = [

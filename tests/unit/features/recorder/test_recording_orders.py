@@ -163,11 +163,8 @@ async def test_a_record_after_a_missed_one_names_what_is_made_instead(scene: Sce
     recorder.send(recorder_link.RecordingMissed(trigger, "it prolonged another", unmade, making))
     await told(scene, lambda: bool(scene.trail.events))
     [row] = scene.trail.rows
-    assert (row["event"], row["recording"], row["reason"]) == (
-        "recording missed",
-        unmade,
-        "it prolonged another",
-    )
+    found = [row[name] for name in ("event", "recording", "reason")]
+    assert found == ["recording missed", unmade, "it prolonged another"]
     assert planned()["recording"] == KEPT.id
 
 

@@ -139,11 +139,8 @@ def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: 
 
 def test_a_flood_displaces_only_itself(memory: memoryview) -> None:
     writer = ring(memory)
-    quiet, busy, flood = (
-        opened(writer, "/quiet"),
-        opened(writer, "/busy"),
-        opened(writer, "/flood", "10.0.0.2"),
-    )
+    quiet, busy = opened(writer, "/quiet"), opened(writer, "/busy")
+    flood = opened(writer, "/flood", "10.0.0.2")
     body = bytes(10_000)
     for number in range(1, 10_001):
         flood.write(memoryview(frame(body)), 1, number)

@@ -30,19 +30,8 @@ from appliance.features.standby.witness.firewall import LeaseFirewall
 from appliance.features.standby.witness.lease_file import LeaseRecord
 from appliance.features.standby.witness.one_file import witness_program
 from appliance.features.standby.witness.protocol import ANSWER, REQUEST, Left, unseal
-from appliance.features.standby.witness.settings import AppliancePeer, WitnessSettings
+from tests.unit.features.standby.witness.robot import BOTH, KEYS, PAIR_SETTINGS
 
-NAMES = ("a", "b")
-KEYS = {name: name.encode() * 32 for name in NAMES}
-SETTINGS = WitnessSettings(
-    ("10.0.0.1", 7411),
-    "10.0.0.100",
-    ("11311",),
-    {"a": AppliancePeer("10.0.0.2", KEYS["a"]), "b": AppliancePeer("10.0.0.3", KEYS["b"])},
-    "/lease",
-    {},
-    "",
-)
 TICK = 0.1
 HEALED = 10.0  # seconds after the last fault
 DRIFT = 0.03
@@ -271,7 +260,7 @@ class SimulatedAppliance(Host):
 class SimulatedRobot(Host):
     def __init__(self, history: "History") -> None:
         super().__init__(history, "witness")
-        self.disk = LeaseRecord(1, "", NAMES, "")
+        self.disk = LeaseRecord(1, "", BOTH, "")
         self.boot = 0
         self.rules = ""
         self.network_up = False
@@ -281,7 +270,7 @@ class SimulatedRobot(Host):
         self.gate: Any = None
         self.answering = False
         self.spent = 0.0  # seconds that programs of the firewall have taken in the present step
-        self.firewall = LeaseFirewall(SETTINGS, "nft", self._nft)
+        self.firewall = LeaseFirewall(PAIR_SETTINGS, "nft", self._nft)
 
     def started(self) -> None:
         """Start the witness. After a boot, the boot rule has run before the network is up."""
@@ -289,7 +278,7 @@ class SimulatedRobot(Host):
         if not self.network_up:
             self.boot += 1
             self.firewall_fails = False
-            self.firewall = product.LeaseFirewall(SETTINGS, "nft", self._nft)
+            self.firewall = product.LeaseFirewall(PAIR_SETTINGS, "nft", self._nft)
             self.firewall.admit("")
             self.network_up = True
         try:
@@ -304,7 +293,7 @@ class SimulatedRobot(Host):
             self.crash()
             return
         nonce = f"{self.history.random.getrandbits(64):x}"
-        self.gate = product.WitnessGate(self.keeper, SETTINGS.appliances, nonce)
+        self.gate = product.WitnessGate(self.keeper, PAIR_SETTINGS.appliances, nonce)
 
     def crash(self) -> None:
         super().crash()
@@ -341,7 +330,7 @@ class SimulatedRobot(Host):
         """Answer. A slow program of the firewall delays its change, the answer, and what comes next."""
         self.answering = True
         try:
-            answer = self.gate.answer(message, SETTINGS.appliances[sender].address)
+            answer = self.gate.answer(message, PAIR_SETTINGS.appliances[sender].address)
         except _PowerLost:
             self.spent = 0.0
             self._lose_power()
@@ -387,9 +376,11 @@ class SimulatedRobot(Host):
 
     def admitted(self) -> set[str]:
         shut = {
-            name for name, one in SETTINGS.appliances.items() if f"ip saddr {one.address} drop" in self.rules
+            name
+            for name, one in PAIR_SETTINGS.appliances.items()
+            if f"ip saddr {one.address} drop" in self.rules
         }
-        return set(NAMES) - shut
+        return set(BOTH) - shut
 
     def translated_to(self) -> set[str]:
         return set(re.findall(r"dnat to (\S+)", self.rules))
@@ -446,16 +437,16 @@ class History:
         self.greatest = 0
         self._healed = False
         self.answered: set[str] = set()
-        self.links = {(one, two): Net() for one in (*NAMES, "witness") for two in (*NAMES, "witness")}
-        self.appliances = {name: SimulatedAppliance(self, name) for name in NAMES}
+        self.links = {(one, two): Net() for one in (*BOTH, "witness") for two in (*BOTH, "witness")}
+        self.appliances = {name: SimulatedAppliance(self, name) for name in BOTH}
         self.robot = SimulatedRobot(self)
-        self._focus = self.random.sample([*NAMES, "witness"], 2)  # a link that fails more often
+        self._focus = self.random.sample([*BOTH, "witness"], 2)  # a link that fails more often
         self.hosts: dict[str, Host] = {**self.appliances, "witness": self.robot}
         self._kinds: dict[str, Callable[[], float]] = {
             "partition": self._partition,
             "link of the appliances": lambda: self._lose_link("a", "b"),
             "witness link": lambda: self._lose_link(
-                self.random.choice([self._active().name, *NAMES]), "witness"
+                self.random.choice([self._active().name, *BOTH]), "witness"
             ),
             "bad link": self._bad_link,
             "flapping": self._flapping,
@@ -527,7 +518,7 @@ class History:
         self._heal(cut)
         self._turn_until(self.now + HEALED)
         active = {name for name, one in self.appliances.items() if one.active}
-        reaching = set(NAMES) - (set(cut) if "witness" in cut else set())
+        reaching = set(BOTH) - (set(cut) if "witness" in cut else set())
         self.require(
             (len(active) == 1 and self.robot.admitted() == active <= reaching)
             or not reaching & set(self.robot.disk.in_sync),
@@ -537,7 +528,7 @@ class History:
             self._require_answered(self.appliances[name])
         if not cut:
             self.require(
-                set(self.robot.disk.in_sync) == set(NAMES), f"only {self.robot.disk.in_sync} is in sync"
+                set(self.robot.disk.in_sync) == set(BOTH), f"only {self.robot.disk.in_sync} is in sync"
             )
         return self
 
@@ -557,7 +548,7 @@ class History:
         if self.robot.network_up:
             admitted = self.robot.admitted()
             self.require(len(admitted) <= 1, "the robot admits both appliances")
-            targets = {SETTINGS.appliances[name].address for name in admitted}
+            targets = {PAIR_SETTINGS.appliances[name].address for name in admitted}
             self.require(
                 self.robot.translated_to() == targets, "the fixed address leads to another appliance"
             )
@@ -571,13 +562,8 @@ class History:
     def _heal(self, cut: tuple[str, ...]) -> None:
         self._healed = True
         for ends, net in self.links.items():
-            net.cut, net.loss, net.duplicates, net.late, net.delay = (
-                int(set(ends) == set(cut)),
-                0.0,
-                0.0,
-                0.0,
-                0.02,
-            )
+            net.cut, net.delay = int(set(ends) == set(cut)), 0.02
+            net.loss = net.duplicates = net.late = 0.0
         self.robot.disk_full = self.robot.firewall_fails = False
         self.robot.save_fault = ""
         for host in self.hosts.values():
@@ -588,7 +574,7 @@ class History:
         return self.random.choice([0.05, 0.1, 0.3, 0.5, 1.0, 1.5, 3.0]) * self.random.uniform(0.5, 1.5)
 
     def _pairs(self) -> list[tuple[str, str]]:
-        one, two = self._focus if self.random.random() < 0.5 else self.random.sample([*NAMES, "witness"], 2)
+        one, two = self._focus if self.random.random() < 0.5 else self.random.sample([*BOTH, "witness"], 2)
         pairs = [(one, two)]
         if self.random.random() < 0.7:
             pairs.append((two, one))
@@ -637,7 +623,7 @@ class History:
 
     def _active(self) -> "SimulatedAppliance":
         found = [one for one in self.appliances.values() if one.lease is not None and one.active]
-        return found[0] if found else self.appliances[self.random.choice(NAMES)]
+        return found[0] if found else self.appliances[self.random.choice(BOTH)]
 
     def _crash(self, host: Host | None = None) -> float:
         host = host or self.hosts[self.random.choice(list(self.hosts))]

@@ -45,11 +45,8 @@ def control_link() -> ControlLink:
 
 @pytest.fixture(scope="module")
 def gate() -> RequestGate:
-    door, control, journal = (
-        TokenAuthenticator(10, lambda _token: None),
-        control_link(),
-        Journal(lambda _call: None),
-    )
+    door, control = TokenAuthenticator(10, lambda _token: None), control_link()
+    journal = Journal(lambda _call: None)
     door.state([TokenKept(ROW.id, ROW.name, ROW.role, ROW.salt, ROW.hash, ROW.expires)])
     history = SampleHistory(lambda: measures_of(control))
     app = build_app(Services(Settings(), control, door, journal, asyncio.Event(), history))

@@ -88,14 +88,9 @@ class Bench:
         self.shared = authority = StoredAuthority(self.authority, self.store.hosts)
         self.appliances = appliances = Appliances(self.store.hosts, self.table.revoked)
         self.tunnels = Tunnels(
-            self.table,
-            self.trail,
-            authority,
-            appliances,
-            listen=(listen, 11311),
-            say=self._said,
+            self.table, self.trail, authority, appliances, listen=(listen, 11311), say=self._said,
             blocked=lambda: self.blocked,
-        )
+        )  # fmt: skip
         self.certification = certification = Certification(
             self.store, self.trail, authority, self.table, self.tunnels, appliances=appliances,
             master_port=11311, rest=RestAddress(8443, "", 8443), ends=ends_of(self.store, directory),

@@ -75,8 +75,5 @@ def test_a_lost_answer_is_not_a_failure(pair: Pair) -> None:
 def test_a_standby_that_does_not_take_over_is_an_error(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_verbs, "_SWITCH_SECONDS", 0.3)
     pair.answers = [state("active", 4, "a"), state("active", 6, "a")]
-    assert pair.promote() == (
-        1,
-        "",
-        f"{BEGINS}rosrv standby: b is not active after 0.3 s; see: rosrv standby status\n",
-    )
+    late = "rosrv standby: b is not active after 0.3 s; see: rosrv standby status\n"
+    assert pair.promote() == (1, "", BEGINS + late)
