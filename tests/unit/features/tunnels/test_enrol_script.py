@@ -75,18 +75,11 @@ class Host:
         values = {"name": "laptop", "url": "https://10.0.0.1:8443", "pin": "sha256//x", "id": token_id}
         script = self._home / f"join-{token_id}.sh"
         script.write_text(filled("enrol.sh", values | {"authority": self._authority}))
+        path = f"{self._programs}:{os.environ['PATH']}"
+        environment = {"PATH": path, "HOME": str(self._home), "ROSRV_FOLDER": str(self.folder)}
+        command = ["sh", str(script), *arguments]
         return subprocess.run(
-            ["sh", str(script), *arguments],
-            env={
-                "PATH": f"{self._programs}:{os.environ['PATH']}",
-                "HOME": str(self._home),
-                "ROSRV_FOLDER": str(self.folder),
-            },
-            input=said,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
+            command, env=environment, input=said, capture_output=True, text=True, timeout=60, check=False
         )
 
     def cut(self, place: str) -> None:

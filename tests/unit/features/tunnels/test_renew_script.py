@@ -36,17 +36,14 @@ class Host:
         for path in (self.swanctl / "x509ca", self.swanctl / "x509", self.swanctl / "private", self.answers,
                      self._programs, folder / "ca", folder / "another"):  # fmt: skip
             path.mkdir(parents=True)
-        self.authority, self.another = (
-            CertificateAuthority(folder / "ca"),
-            CertificateAuthority(folder / "another"),
-        )
+        self.authority = CertificateAuthority(folder / "ca")
+        self.another = CertificateAuthority(folder / "another")
         key = make_key()
         self.key = self.swanctl / "private" / "rosrv.key"
         self.certificate = self.swanctl / "x509" / "rosrv.pem"
         self.key.write_bytes(key)
-        self.certificate.write_bytes(
-            self.authority.issue(signing_request(key, "laptop"), "laptop", 90).certificate
-        )
+        made = self.authority.issue(signing_request(key, "laptop"), "laptop", 90)
+        self.certificate.write_bytes(made.certificate)
         (self.swanctl / "x509ca" / "rosrv-ca.pem").write_bytes(self.authority.certificate)
         self.answer("revocations", self.authority.revocations([]))
         self.answer("renewed", b"")
@@ -68,11 +65,8 @@ class Host:
         (self.answers / name).write_bytes(body)
 
     def renew(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        environment = {
-            "PATH": f"{self._programs}:{os.environ['PATH']}",
-            "SWANCTL_DIR": str(self.swanctl),
-            "ANSWERS": str(self.answers),
-        }
+        path = f"{self._programs}:{os.environ['PATH']}"
+        environment = {"PATH": path, "SWANCTL_DIR": str(self.swanctl), "ANSWERS": str(self.answers)}
         command = ["sh", str(self._script), *arguments]
         return subprocess.run(
             command, env=environment, capture_output=True, text=True, timeout=60, check=False
