@@ -8,7 +8,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from rosmop.batch.ray_cluster import _reason
-from rosmop.batch.replay_job import EVER, Specifications
+from rosmop.batch.replay_job import Specifications
+from rosmop.recordings.replay import EVER
 from rosmop.tests.batch.test_many_recordings import SPECIFICATION, make_bag, rosmop
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.replay_report import ReplayReport
