@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from rosmop.fast.abi import ALTERED, BEYOND, MAX_KEPT, NOW, POSITION, SAID, UNDO, kept_size
+from rosmop.fast.abi import ALTERED, BEYOND, MAX_KEPT, NOW, POSITION, SAID, UNDO, is_kept, kept_size
 from rosmop.fast.batch_codegen import WasmModule
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm import EXPORTED_FUNCTION, section, text, unsigned
@@ -196,7 +196,7 @@ class ConcreteRuns:
         memory[: len(self._before)] = self._before
         for name, address, kind, buffer in self._cells:
             value = state.variables[name]
-            word = entered(memory, value, buffer, kind) if kept_size(kind) else value
+            word = entered(memory, value, buffer, kind) if is_kept(kind) else value
             struct.pack_into("<" + cell_code(kind), memory, address, word)
         for key, address in module.throttles.items():
             _TIME.pack_into(memory, address, state.throttled.get(key, _NEVER))
@@ -219,7 +219,7 @@ class ConcreteRuns:
         variables = {name: self._interpreter.variables[name] for name in self._others}
         for name, address, kind, _ in self._cells:
             (word,) = struct.unpack_from("<" + cell_code(kind), memory, address)
-            variables[name] = self._kept(word, state.variables[name], kind) if kept_size(kind) else word
+            variables[name] = self._kept(word, state.variables[name], kind) if is_kept(kind) else word
         rest = _TIME.unpack_from(memory, module.budgets[context])[0]
         return _Effect(bits, bytes(memory[at:]), variables, self._output(), rest)
 

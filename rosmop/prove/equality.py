@@ -24,7 +24,7 @@ from itertools import islice
 
 import z3
 
-from rosmop.fast.abi import AREA, SENDER, kept_size, most_kept
+from rosmop.fast.abi import AREA, SENDER, is_kept, kept_size, most_kept, room_of
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.specification_groups import groups
@@ -224,10 +224,10 @@ class Validation:
         self._codes = functions_of(module.code)
         self._runs = ConcreteRuns(compiled, module)
         self._kinds = {name: kind for own in module.cells for name, (_, kind) in own.variables.items()}
-        kept = {at: kind for own in module.cells for at, kind in own.variables.values() if kept_size(kind)}
+        kept = {at: kind for own in module.cells for at, kind in own.variables.values() if is_kept(kind)}
         self._strings = [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += [
-            range(begin, begin + 2 * most_kept(kept[at]) * kept_size(kept[at]))
+            range(begin, begin + 2 * room_of(kept[at]))
             for own in module.cells
             for at, begin in own.texts.items()
         ]
@@ -388,7 +388,7 @@ class Validation:
         variables: dict[str, Term | TextTerm] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if kept_size(kind):
+                if is_kept(kind):
                     variables[name] = _text(name, address, cells)
                     continue
                 value = variables[name] = cells[address] = _variable(name, kind)

@@ -146,6 +146,9 @@ PROVED = {
         last = values; } }""",
     "a string that is kept": """s() { std::string last;
         event e(std::string f) /stamped own/Stamped '{frame:f}' { last = f; } }""",
+    "the number of strings that are kept": event(
+        "if (n > seen.size()) { return; } n++;", "double y", "x:y", "std::vector<std::string> seen; int n = 0;"
+    ),
     "a string that is put out": """s() { event e(std::string f) /stamped own/Stamped '{frame:f}' {
         ROS_INFO("from %s", f.c_str()); } }""",
 }  # fmt: skip
