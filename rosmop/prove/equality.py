@@ -24,7 +24,7 @@ from itertools import islice
 
 import z3
 
-from rosmop.fast.abi import AREA, SENDER, is_kept, kept_size, most_kept, room_of
+from rosmop.fast.abi import AREA, SENDER, is_kept, is_texts, kept_size, most_kept, room_of
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.specification_groups import groups
@@ -144,8 +144,8 @@ class _ModelReader:
         if isinstance(kind, value_types.StringType):
             return self.text(term)
         count = self.whole(term.count)
-        if count > most_kept(kind):
-            return [0] * (most_kept(kind) + 1)
+        if is_texts(kind) or count > most_kept(kind):  # no term depends on one of the texts
+            return [b"" if is_texts(kind) else 0] * min(count, most_kept(kind) + 1)
         assert isinstance(kind, value_types.VectorType)  # noqa: S101  only these two are kept
         raw = self.bytes_of(MEMORY, term.place, count * kept_size(kind))
         return [*struct.unpack(f"<{count}{struct_code(kind.element)}", raw)]

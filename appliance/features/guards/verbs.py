@@ -2,6 +2,7 @@
 
 import shlex
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,7 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import time_given
 from appliance.cli.monitor_changes import (
     Hold,
     folder_of,
@@ -238,6 +240,7 @@ def set_values(
     wanted = _pairs(values, "PARAMETER=VALUE")
     if dry_run:
         refuse_beside_dry_run(_VERB, when_standing=when_standing)
+        time_given("--since", since or "1h", _VERB)
     elif since is not None:
         raise usage_error("--since goes with --dry-run: give both, or neither", _VERB)
     loaded, row, text = _guard(appliance, name)
@@ -508,13 +511,8 @@ def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> N
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file
         path.write_text(text, encoding="utf-8")
-        try:
+        with suppress(typer.Exit):  # what is not recorded, or cannot be read, was said: the plan holds
             replay.function(appliance, str(path), since=since)
-        except typer.Exit as end:
-            if (
-                end.exit_code != 1
-            ):  # nothing is recorded, or the recorder is off, and this was said: the plan holds
-                raise
 
 
 def _say_preset(preset: Preset) -> None:

@@ -59,11 +59,12 @@ def span_of(since: str | None, until: str | None) -> Span:
 def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
     for topic, kind in topics.items():
         if not any(fnmatchcase(topic, glob) for glob in known.topics):
-            text = f"{topic} is not recorded: recorder.topics has {', '.join(known.topics)}"
-            raise refused([f"rosrv monitor: {text}"])
+            raise MONITOR.usage_error(
+                f"{topic} is not recorded: recorder.topics has {', '.join(known.topics)}"
+            )
         out = next((glob for glob in known.never for name in (topic, kind) if fnmatchcase(name, glob)), None)
         if out is not None:
-            raise refused([f"rosrv monitor: {topic} ({kind}) is not recorded: recorder.never has {out}"])
+            raise MONITOR.usage_error(f"{topic} ({kind}) is not recorded: recorder.never has {out}")
 
 
 @contextmanager
