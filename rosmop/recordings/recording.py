@@ -82,17 +82,25 @@ def by_size(reader: Reader) -> list[Connection]:
 
 
 def _definitions_of(connections: Iterable[Connection]) -> Definitions:
-    """Return the definitions whose text has its connection's md5sum: small client libraries send none."""
+    """Return the definitions in the texts of connections.
+
+    Those with the md5sum of their connection go before all others: small client libraries send no text, or a wrong one.
+    """
     found: dict[str, MessageDefinition] = {}
+    doubtful: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data, row.digest) for row in connections)
-    for name, text, digest in sorted(sent, key=lambda row: row[2] == "*"):
+    for name, text, digest in sent:
         try:
             own = Definitions.from_full_text(name, text)
-            if digest == own.md5sum(name) or (digest == "*" and text.strip()):
-                found = {part.name: part for part in own.parts(name)} | found
+            parts = {part.name: part for part in own.parts(name)}
+            if digest == own.md5sum(name):
+                found = parts | found
+            elif text.strip():
+                doubtful = parts | doubtful
         except DefinitionError:
             continue
-    return Definitions(found)
+    standard = standard_definitions().message_names
+    return Definitions({name: part for name, part in doubtful.items() if name not in standard} | found)
 
 
 def _md5sum(definitions: Definitions, kind: str, unknown: str) -> str:
