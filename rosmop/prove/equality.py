@@ -94,7 +94,10 @@ def state_of(model: Model, begin: StartTerms, kinds: Mapping[str, Type], context
     return EventState(
         reader.bytes_of(begin.message, integer(0, 32), size),
         reader.whole(begin.now),
-        {name: reader.value(term, kinds[name]) for name, term in begin.variables.items()},
+        {
+            name: reader.value(begin.variables[name], kind) if name in begin.variables else []
+            for name, kind in kinds.items()
+        },
         reader.whole(begin.budgets[context]),
         {key: reader.whole(term) for key, term in begin.throttles.items()},
         (host, caller),
@@ -144,8 +147,8 @@ class _ModelReader:
         if isinstance(kind, value_types.StringType):
             return self.text(term)
         count = self.whole(term.count)
-        if is_texts(kind) or count > most_kept(kind):  # no term depends on one of the texts
-            return [b"" if is_texts(kind) else 0] * min(count, most_kept(kind) + 1)
+        if count > most_kept(kind):
+            return [0] * (most_kept(kind) + 1)
         assert isinstance(kind, value_types.VectorType)  # noqa: S101  only these two are kept
         raw = self.bytes_of(MEMORY, term.place, count * kept_size(kind))
         return [*struct.unpack(f"<{count}{struct_code(kind.element)}", raw)]
@@ -308,10 +311,16 @@ class Validation:
         ).result()
         form_cuts = meant.loops.cuts
         guess = LoopGuess(form_cuts, self._names(context), module.names, unrolled)
-        done = ModuleExecution(
+        execution = ModuleExecution(
             self._codes, event.number, begin.message, begin.size, cells, self._strings, self._routines,
             self._spans(begin), guess,
-        ).done()  # fmt: skip
+        )  # fmt: skip
+        try:
+            done = execution.done()
+        except DiffersError:
+            if meant.unknown and any(map(is_texts, self._kinds.values())):  # `cells` lacks these
+                raise NotProvedError(f"uses {next(iter(meant.unknown))}") from None
+            raise
         self._check_undone(done, event.topic)
         known += assumed(form_cuts)
         going_on = either(meant.loops.again, done.loops.again)
@@ -388,7 +397,9 @@ class Validation:
         variables: dict[str, Term | TextTerm] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if is_kept(kind):
+                if is_texts(kind):  # an event that uses it is not proved
+                    continue
+                if kept_size(kind):
                     variables[name] = _text(name, address, cells)
                     continue
                 value = variables[name] = cells[address] = _variable(name, kind)
