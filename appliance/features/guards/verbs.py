@@ -511,7 +511,7 @@ def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> N
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file
         path.write_text(text, encoding="utf-8")
-        with suppress(typer.Exit):  # what is not recorded, or cannot be read, was said: the plan holds
+        with suppress(typer.Exit):  # the replay has printed why it ended; the plan holds
             replay.function(appliance, str(path), since=since)
 
 

@@ -81,7 +81,7 @@ def test_an_older_lease_on_a_restored_disk_of_the_robot(site: StandbySite, robot
 def test_an_epoch_that_was_never_granted_is_repaired(site: StandbySite, robot: StandbyRobot) -> None:
     until_able(site)
     epoch = site.lease.read().epoch
-    for name in reversed(site.pair()):  # an active one that stops may be followed by the other
+    for name in reversed(site.pair()):  # the standby could take over from an active one that stops
         one = site.appliances[name]
         assert one.process is not None
         one.process.stop()
