@@ -2,8 +2,8 @@
 
 Viewers need a definition before they subscribe. If it is unknown, the door itself subscribes briefly.
 
-1. A result belongs to one topic or service, and is kept until its nodes change. A denial is kept at most until the
-   policy changes.
+1. A result belongs to one topic or service, and is kept until its nodes change. After a change of the policy, it is
+   shown until the next one: so viewers keep what they still may see.
 2. A look asks about at most `_MAX_PROBES` things, in turn for each host, and first about those that wait longest. So
    names that never answer delay only the names of their own host.
 """
@@ -46,11 +46,11 @@ class _Asked(NamedTuple):
     """The nodes that were queried about a topic or service, the answer, and the time of the next query."""
 
     nodes: tuple[str, ...]
+    policy: int  # its number at the query
     at: float
     known: KnownType | str | None = None
     """The type of a topic, or the name of the type of a service."""
     again: float = math.inf
-    denied: int | None = None  # the policy that denied it
 
 
 class Lookout:
@@ -116,12 +116,10 @@ class Lookout:
         }
         nodes |= {("service", service): tuple(names) for service, names in graph.services.items()}
         self._asked = {
-            thing: asked
-            for thing, asked in self._asked.items()
-            if nodes.get(thing) == asked.nodes and asked.denied in (None, self._policy)
+            thing: asked for thing, asked in self._asked.items() if nodes.get(thing) == asked.nodes
         }
         now = asyncio.get_running_loop().time()
-        due = [one for one in things if one not in self._asked or self._asked[one].again <= now]
+        due = [one for one in things if self._is_due(one, now)]
         due.sort(key=lambda one: (self._asked[one].at if one in self._asked else -math.inf, one))
         chosen = due
         if len(due) > _MAX_PROBES:
@@ -132,16 +130,22 @@ class Lookout:
         await asyncio.gather(*(self._ask_one(thing, nodes[thing]) for thing in chosen))
         return len(due) - len(chosen)
 
+    def _is_due(self, thing: _Thing, now: float) -> bool:
+        asked = self._asked.get(thing)
+        return asked is None or asked.policy != self._policy or asked.again <= now
+
     async def _ask_one(self, thing: _Thing, nodes: tuple[str, ...]) -> None:
         kind, name = thing
         policy, now = self._policy, asyncio.get_running_loop().time
         try:
             known = await (self._door.learn(name) if kind == "topic" else self._probe(name))
-            self._asked[thing] = _Asked(nodes, now(), known)
+            self._asked[thing] = _Asked(nodes, policy, now(), known)
         except MasterDenialError:
-            self._asked[thing] = _Asked(nodes, now(), denied=policy)
+            self._asked[thing] = _Asked(nodes, policy, now())
         except RosError:  # a node that is started again has the same name
-            self._asked[thing] = _Asked(nodes, now(), again=now() + _AGAIN_SECONDS)
+            earlier = self._asked.get(thing)
+            kept = earlier and earlier.known
+            self._asked[thing] = _Asked(nodes, policy, now(), kept, again=now() + _AGAIN_SECONDS)
 
     async def _probe(self, service: str) -> str:
         try:
@@ -160,7 +164,7 @@ class Lookout:
             known = asked.known
         elif isinstance(known, KnownType) and topic in graph.publishers:
             now = asyncio.get_running_loop().time()
-            self._asked["topic", topic] = _Asked(tuple(graph.publishers[topic]), now, known)
+            self._asked["topic", topic] = _Asked(tuple(graph.publishers[topic]), self._policy, now, known)
         if isinstance(known, KnownType) and known.name == name:
             return known
         try:

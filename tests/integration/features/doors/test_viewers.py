@@ -1,6 +1,6 @@
 """A viewer that looked before its door's rights changed sees within three seconds what one of a new process sees.
 
-A door keeps the denials of topics with types of their own, and of services.
+A door keeps what it learned of topics with types of their own, and of services.
 """
 
 import contextlib
@@ -112,6 +112,12 @@ def load(site: Site) -> Iterator[set[str]]:
     site.appliance.reload(policy("agent"))
 
 
+def revoke(site: Site) -> Iterator[set[str]]:
+    site.appliance.reload(policy("agent"))
+    yield THINGS
+    site.appliance.reload(policy(""))
+
+
 def rollback(site: Site) -> Iterator[set[str]]:
     site.appliance.reload(policy("agent"))
     site.appliance.reload(policy(""))
@@ -140,7 +146,7 @@ def unblock(site: Site) -> Iterator[set[str]]:
     site.appliance.rosrv("host", "unblock", "door:agent")
 
 
-@pytest.mark.parametrize("way", [load, rollback, hours, block, unblock])
+@pytest.mark.parametrize("way", [load, revoke, rollback, hours, block, unblock])
 def test_a_viewer_that_looked_before_sees_what_a_new_one_sees(site: Site, way: Way) -> None:
     change = way(site)
     before = next(change)
