@@ -176,8 +176,12 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "the base of fence is later than it declares": Fault("L3", "fence", patch=(Base, "order", _late)),
     # L4
-    "estop has one button": Fault("L4", "estop", replaced(r"node = caller\(button\)", 'node = "a button"')),
-    "estop has one hand": Fault("L4", "estop", replaced(r"node = caller\(again\)", 'node = "a hand"')),
+    "estop has one button": Fault(
+        "L4", "estop", replaced(r"index\(buttons, caller\(button\)\)", "buttons.size() - 1")
+    ),
+    "estop has one hand": Fault(
+        "L4", "estop", replaced(r"index\(hands, caller\(again\)\)", "hands.size() - 1")
+    ),
     "estop counts a hand twice": Fault("L4", "estop", replaced(r"&& i != place", "")),
     "estop hears any button": Fault(
         "L4", "estop", replaced(r"!\(now - heard\[i\] <= silent\)", "!(now - heard[0] <= silent)")
@@ -206,7 +210,7 @@ FAULTS: Mapping[str, Fault] = {
     "deadman takes the first command after a silence": Fault("L6", "deadman", replaced(r">= resume", ">= 0")),
     "estop needs no zero": Fault("L6", "estop", replaced(r"zeroFirst\)", "false)")),
     "estop takes the zero of any node": Fault(
-        "L6", "estop", replaced(r"standing == node \|\| standingToo == node", 'standing != ""')
+        "L6", "estop", replaced(r"standing == one \|\| standingToo == one", 'standing != ""')
     ),
     "estop takes a zero from before the stop": Fault(
         "L6", "estop", replaced(r"if \(!released \|\| latched\)", "if (false)")
@@ -247,7 +251,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L2", "mode", "hears no silence", r"silent > 0 && !\(now - heard\[i\] <= silent\)", "false"),
     ("L2", "diagnostics", "hears no silence", r"&& now - oldest <= silent", ""),
     ("L2", "diagnostics", "takes STALE for well", r"level != 0 && \(warnings", "level == 2 && (warnings"),
-    ("L3", "diagnostics", "does not stop at a message", r"tell\(now\); passed = false; STOP;", ""),
+    ("L3", "diagnostics", "does not stop at a message", r"tell\(now, 0\); passed = false; STOP;", ""),
     ("L4", "diagnostics", "has one node", r'caller\(report\) == ""', "true"),
     ("L4", "diagnostics", "asks the first entry alone", r"i < levels.size\(\)", "i < 1"),
     ("L6", "diagnostics", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
@@ -268,24 +272,22 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L2", "agree", "hears no silence", r"since <= silent && sinceOther <= silent", "true"),
     ("L2", "ready", "hears no silence", r"battery <= silent &&", ""),
     ("L2", "sensor", "hears no silence", r"since <= silent &&", ""),
-    ("L3", "hold_to_run", "does not stop at a release",
-     r"(?s)(heard\[place\] = now;\s*\}\s*)if \(judge\(now\)\) \{ STOP; \}", r"\1judge(now);"),
-    ("L3", "mode", "does not stop at a change",
-     r"(?s)(heard\[place\] = now; \}\s*)if \(judge\(now\)\) \{ STOP; \}", r"\1judge(now);"),
+    ("L3", "hold_to_run", "does not stop at a release", r"if \(judge\(now\)\) \{[^}]*\}", "judge(now);"),
+    ("L3", "mode", "does not stop at a change", r"if \(judge\(now\)\) \{[^}]*\}", "judge(now);"),
     ("L3", "overspeed", "does not stop at a measurement", r"(?s)(fast = true;\s*passed = false;\s*)STOP;", r"\1"),
     ("L3", "standstill", "waits twice as long", r"now - since <= settle", "now - since <= 2 * settle"),
     ("L3", "standstill", "stops once", r"pause == 0 && !slow && age\(measure\) <= silent", "false"),
-    ("L3", "zone", "judges no tick", r"(?s)(rays count[^}]*?)STOP;", r"\1"),
+    ("L3", "zone", "judges no tick", r"(lastV = 0;\s+lastW = 0;\s+)STOP;", r"\1"),
     ("L3", "joints", "permits any jump", r"double free = jump -", "double free = 100 -"),
     ("L3", "joints", "grants a jump with each point", r"fmax\(gained\w*\[i\] \+ way - grown\w*, 0\) : 0", "0 : 0"),
-    ("L3", "joints", "stops again within a stop", r"if \(now < stopped\) \{ owed = [^}]*\} else if", "if"),
+    ("L3", "joints", "stops again within a stop", r"if \(now < stopped\) \{\s*if \(good\)[^}]*\}[^}]*\} else if", "if"),
     ("L3", "joints", "stops again after a trajectory", r"stopped = fmax\(stopped, bridged\)", "stopped = bridged"),
     ("L3", "joints", "does not ask where the arm is", r" && fabs\(found\[place\] - starts\[k\]\) <= jump / 2", ""),
     ("L3", "joints", "takes a dropped goal for a stop", r"othersEnd = fmax\(othersEnd, good \? 0 : before\);", ""),
     ("L3", "fence", "judges no tick", r"lastV > 0 && \(!\(age\(pose\)", "false && (!(age(pose)"),
     ("L3", "rate", "drops a stop", r"if \(moves && !slower &&", "if (!slower &&"),
-    ("L4", "hold_to_run", "has one device", r"node = caller\(device\)", 'node = "a device"'),
-    ("L4", "mode", "has one switch", r"node = caller\(change\)", 'node = "a switch"'),
+    ("L4", "hold_to_run", "has one device", r"index\(devices, caller\(device\)\)", "devices.size() - 1"),
+    ("L4", "mode", "has one switch", r"index\(nodes, caller\(change\)\)", "nodes.size() - 1"),
     ("L4", "hold_to_run", "asks the first device alone", r"i < devices.size\(\)", "i < 1"),
     ("L4", "mode", "asks the first switch alone", r"i < nodes.size\(\)", "i < 1"),
     *(
@@ -312,7 +314,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L4", "agree", "takes any node for its second source",
      r'otherSource == "" \|\| caller\(two\) == otherSource', "true"),
     ("L6", "hold_to_run", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
-    ("L6", "hold_to_run", "takes the zero of any node", r"standing == node \|\| standingToo == node", 'standing != ""'),
+    ("L6", "hold_to_run", "takes the zero of any node", r"standing == one \|\| standingToo == one", 'standing != ""'),
     ("L6", "hold_to_run", "takes a zero from before the stop",
      r'if \(!enabled\) \{ standing = ""; standingToo = ""; \}', ""),
     ("L6", "hold_to_run", "takes a device that is tied down", r"else if \(state\[place\] == 1\)", "else"),

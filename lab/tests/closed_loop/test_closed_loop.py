@@ -19,7 +19,7 @@ from lab.closed_loop.worlds import (
     run_one,
 )
 from tests.support.examples import ALL, seeds_of_night
-from tests.support.features.guards.running_guard import Value
+from tests.support.features.guards.running_guard import Value, named
 from tests.support.rows import require_rows
 
 AT_GATE = {"zone": 3, "joints": len(KINDS)}
@@ -180,6 +180,12 @@ def test_a_seed_gives_the_same_world_again(preset: str) -> None:
 )
 def test_a_forgotten_term_is_found_in_the_first_worlds(name: str) -> None:
     assert FAULTS[name].first(4) is not None
+
+
+def test_each_planted_fault_changes_its_preset() -> None:
+    for fault in FAULTS.values():
+        text = named(fault.preset).text
+        assert fault.patch or fault.change(text) != text
 
 
 @pytest.mark.nightly
