@@ -20,6 +20,10 @@ class MayDifferError(Exception):
     """The induction over the iterations of a loop fails for a state that may not occur."""
 
 
+# z3 does not count what it spends before its search: there, a formula with floats took 10 GB.
+z3.set_param("memory_high_watermark_mb", 2000)
+
+
 class Effort:
     """The effort that is left for an event, so that the load of the machine decides nothing.
 
