@@ -27,22 +27,27 @@ from roswire.tcpros import encode_header
 # - Bytes leave in order; a frame whose first byte was sent is sent whole.
 # - The rest of that frame counts as memory of the host.
 # - A buffer is less than `LITTLE` times as large as what waits of it (`own`).
-# - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides that frame.
+# - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides that frame. While more than `_BEHIND`
+#   bytes wait, frames that came `_FRESH` before the newest are dropped: a camera over a slow link stays in the
+#   present, as with a publisher's short queue in plain ROS. A burst that nothing follows is kept.
 
 _VECTORS = 64
 _BEHIND = 1 << 20
+_FRESH = 1.0  # seconds
 _NOTHING = memoryview(b"")
 
 
 class SendQueue:
     """The frames that the socket of one subscriber has not accepted. Queues share the memory of batches."""
 
-    def __init__(self, limits: RelayLimits, share: HostMemory) -> None:
+    def __init__(self, limits: RelayLimits, share: HostMemory, clock: Callable[[], float]) -> None:
+        self._clock = clock
         self._limit_messages = limits.queue_messages
         self._limit_size = limits.queue_bytes
         self._held = HeldBytes(share)
         self._started = _NOTHING
-        self._waiting: deque[tuple[memoryview, int]] = deque()
+        # Frames, their number, and when they came.
+        self._waiting: deque[tuple[memoryview, int, float]] = deque()
         self.messages = 0
         self.size = 0
         """The bytes of the messages, without a frame whose first byte was sent."""
@@ -73,7 +78,7 @@ class SendQueue:
         if end > sent:
             self.begin(rest[: end - sent])
         if batch.messages > gone:
-            self._waiting.append((own(rest[end - sent :]), batch.messages - gone))
+            self._waiting.append((own(rest[end - sent :]), batch.messages - gone, self._clock()))
             self._count(batch.messages - gone, len(batch.view) - end)
 
     def begin(self, rest: memoryview) -> None:
@@ -81,7 +86,7 @@ class SendQueue:
         self._count(0, 0)
 
     def vectors(self) -> list[memoryview]:
-        views = [view for view, _messages in islice(self._waiting, _VECTORS)]
+        views = [view for view, _messages, _came in islice(self._waiting, _VECTORS)]
         return [self._started, *views] if self._started else views
 
     def advance(self, sent: int) -> None:
@@ -97,14 +102,14 @@ class SendQueue:
 
     def trim(self) -> int:
         """Drop the oldest frames, or all if the host's memory is exhausted; return how many."""
-        if not self.full:
-            return 0
         before = self.messages
         limit_messages, limit_size = self._limit_messages, self._limit_size
         if self._held.share.exhausted:
             limit_messages = limit_size = 0
         while self.messages > limit_messages or self.size > limit_size:
             self._remove(self.messages - limit_messages, self.size - limit_size)
+        while self.size > _BEHIND and self._waiting[0][2] < self._waiting[-1][2] - _FRESH:
+            self._remove(0, self.size - _BEHIND)
         return before - self.messages
 
     def clear(self) -> None:
@@ -114,10 +119,10 @@ class SendQueue:
 
     def _remove(self, messages: int, size: int) -> memoryview:
         """Remove the first frames until they are both numbers, or the first batch ends; return them."""
-        view, number = self._waiting.popleft()
+        view, number, came = self._waiting.popleft()
         end, gone, _ = max(walk(view, messages), walk(view, size=size))
         if gone < number:
-            self._waiting.appendleft((own(view[end:]), number - gone))
+            self._waiting.appendleft((own(view[end:]), number - gone, came))
         self._count(-gone, -end)
         return view[:end]
 
@@ -162,7 +167,7 @@ class Subscriber:
         self._refuse = refuse
         self._ended = ended
         self._share = context.memory.queues.of(host)
-        self._queue = SendQueue(context.limits, self._share)
+        self._queue = SendQueue(context.limits, self._share, context.loop.clock)
         self._writing = False  # whether the loop waits for space in the socket's buffer
         self._stall = StallDetector(context.limits.stall_seconds)
         self._number = 0

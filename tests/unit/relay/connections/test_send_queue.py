@@ -54,7 +54,7 @@ steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 @given(steps)
 def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
     budget = share(1 << 30)
-    queue, naive, number = SendQueue(LIMITS, budget), NaiveOutbox(), 0
+    queue, naive, number = SendQueue(LIMITS, budget, float), NaiveOutbox(), 0
     for step in script:
         if step is None:
             assert queue.trim() == naive.trim()
@@ -80,7 +80,7 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | flo
 
 
 def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
-    queue, whole = SendQueue(LIMITS, share(1 << 30)), frame(1 << 20)
+    queue, whole = SendQueue(LIMITS, share(1 << 30), float), frame(1 << 20)
     queue.append(Batch(memoryview(whole), 1, None), 1)
     while queue:
         [view] = queue.vectors()
@@ -90,7 +90,7 @@ def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
 
 
 def test_a_message_that_has_been_started_is_never_dropped() -> None:
-    queue = SendQueue(LIMITS, share(1 << 30))
+    queue = SendQueue(LIMITS, share(1 << 30), float)
     queue.append(Batch(memoryview(b"".join(frame(4, index) for index in range(20))), 20, None), 3)
     assert queue.full
     assert queue.trim() == 14
@@ -98,22 +98,53 @@ def test_a_message_that_has_been_started_is_never_dropped() -> None:
 
 
 def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
-    queue = SendQueue(LIMITS, share(1 << 30))
+    queue = SendQueue(LIMITS, share(1 << 30), float)
     queue.append(Batch(memoryview(frame(500)), 1, None))
     assert queue.trim() == 1
     assert not queue
 
 
+@pytest.mark.parametrize("size", [1000, 30_000, 100_000, 900_000, 6 << 20])
+@pytest.mark.parametrize("rate", [500_000, 1_000_000, 4_000_000])
+def test_a_camera_over_a_slow_link_stays_in_the_present(size: int, rate: int) -> None:
+    """A frame waits a second, and for the last MiB, however long the link is too slow for 30 frames a second."""
+    now, sent, room, longest = 0.0, 0, 0.0, 0.0
+    queue = SendQueue(RelayLimits(), share(1 << 30), lambda: now)
+    one = Batch(memoryview(frame(size)), 1, None)
+    for number in range(30 * 30):
+        now = number / 30
+        queue.append(one)
+        queue.trim()
+        room = min(room, size) + rate / 30
+        while queue.messages and room >= size:
+            room -= size
+            longest = max(longest, now - (number + 1 - queue.messages) / 30)
+            queue.advance(len(one.view))
+            sent += 1
+    assert sent >= min(30 * 30, 25 * rate // size)
+    assert longest <= 1.1 + max(1 << 20, 2 * size) / rate
+
+
+def test_a_burst_that_nothing_follows_is_kept() -> None:
+    now = 0.0
+    queue = SendQueue(RelayLimits(), share(1 << 30), lambda: now)
+    for _number in range(20):
+        queue.append(Batch(memoryview(frame(1 << 20)), 1, None))
+        now += 0.05
+    now = 60.0
+    assert queue.trim() == 0
+
+
 def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
     budget = share(10)
-    queue = SendQueue(LIMITS, budget)
+    queue = SendQueue(LIMITS, budget, float)
     queue.append(Batch(memoryview(frame(4) + frame(4)), 2, None))
     assert queue.trim() == 2
     assert budget.used == 0
 
 
 def test_the_rest_of_a_connection_header_goes_first() -> None:
-    queue = SendQueue(LIMITS, share(1 << 30))
+    queue = SendQueue(LIMITS, share(1 << 30), float)
     queue.begin(memoryview(b"header"))
     queue.append(Batch(memoryview(frame(4)), 1, None))
     assert b"".join(queue.vectors()) == b"header" + frame(4)
@@ -135,7 +166,7 @@ def replayed(batch: Batch) -> list[memoryview]:
 
 
 def queued(batch: Batch, *, sent: int = 0, advanced: int = 0) -> list[memoryview]:
-    queue = SendQueue(replace(RelayLimits(), queue_messages=1000), share())
+    queue = SendQueue(replace(RelayLimits(), queue_messages=1000), share(), float)
     queue.append(batch, sent)
     queue.advance(advanced)
     queue.trim()
