@@ -293,7 +293,8 @@ def _describe(topic: Topic, uncallable: Collection[str] = ()) -> Iterator[str]:
         if node in connected or not topic.mediated or all(one.node == node for one in topic.publishers):
             line = f"  received by {printable(node)}"
         else:
-            line = f"  subscribed by {printable(node)}, which is not connected to a publisher"
+            why = f"rosrv audit search --deny --topic {printable(topic.name)}"
+            line = f"  subscribed by {printable(node)}, which is not connected to a publisher ({why})"
         yield f"{line}; {_UNCALLABLE}" if node in uncallable else line
     if topic.mediated and not topic.subscribers:
         yield "  no node subscribes: messages pass the relay only for monitors, so 0.0 Hz need not be silence"
