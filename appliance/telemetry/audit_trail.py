@@ -78,8 +78,9 @@ class Histogram:
 class Meter:
     """The counters of RVMaster's events since its start, and of the last minute.
 
-    `denied_hosts` has the denials of nodes, those of unknown hosts together, as "". `denied_requests` has each denied
-    host and request, of at most `MAX_REQUESTS` in a second.
+    `denied` has the denied requests, and `denied_requests` each with its host, of at most `MAX_REQUESTS` in a second. A
+    right that ended is neither: no request was denied. `denied_hosts` has both, of nodes: those of unknown hosts
+    together, as "".
     """
 
     def __init__(self) -> None:
@@ -98,9 +99,11 @@ class Meter:
         number, category = repetitions(record.detail), record.category or OTHERS
         self.decisions[category, record.decision] += number
         if record.decision == "deny":
-            self.denied.add(category, number)
             if category != _REST:  # not of a node
                 self.denied_hosts.add("" if record.unknown else record.host or "", number)
+            if record.event == "revoked":
+                return
+            self.denied.add(category, number)
             asked = f"{category} {(record.resource or '')[:_LONGEST_RESOURCE]}".rstrip()
             self.denied_requests.add(f"{record.host or _NO_ADDRESS}\n{asked}", number)
 

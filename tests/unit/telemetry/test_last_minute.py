@@ -30,8 +30,25 @@ def test_a_flood_holds_a_minute_of_seconds() -> None:
 def test_only_denials_count_as_denied() -> None:
     meter = Meter()
     for word in ("deny", "allow", "would deny", "ask", "deny"):
-        record = AuditRecord(
-            id="1", time=0, event="decision", severity=Severity.INFO, decision=word, category="publish"
-        )
-        meter.recorded(record)
+        meter.recorded(_record("decision", word))
     assert meter.denied.counts() == {"publish": 2}
+
+
+def test_a_right_that_ended_does_not_count_as_a_denied_request() -> None:
+    """`rosrv status` counts what `rosrv audit summary` does; a fleet's trial still sees what the robot lost."""
+    meter = Meter()
+    meter.recorded(_record("revoked", "deny"))
+    assert (meter.denied.counts(), meter.most_denied()) == ({}, "")
+    assert (meter.decisions["publish", "deny"], meter.denied_hosts.counts()) == (1, {"10.0.0.5": 1})
+
+
+def _record(event: str, word: str) -> AuditRecord:
+    return AuditRecord(
+        id="1",
+        time=0,
+        event=event,
+        severity=Severity.INFO,
+        decision=word,
+        host="10.0.0.5",
+        category="publish",
+    )
