@@ -89,7 +89,7 @@ class RecordedPeriod:
 
     def _of(self, record: AuditRecord) -> Iterator[Observation]:
         detail, caller = record.detail, record.caller_id or ""
-        if record.reason == _OWN_NODE or caller.startswith(_OWN_TOOLS):
+        if _is_ours(record):
             return
         scope = detail.get("scope", KIND)
         if scope != KIND:
@@ -103,6 +103,11 @@ class RecordedPeriod:
         number = 1 if record.event in ("decision", ADOPTED) else repetitions(detail)
         for name, count in detail.get(PARAMETERS, {detail.get("key", ""): number}).items():
             yield Observation(request, call, str(name), approval, adopted, count)
+
+
+def _is_ours(record: AuditRecord) -> bool:
+    """Return whether the appliance's own node made the request, which no policy decides, or a tool of ours."""
+    return record.reason == _OWN_NODE or (record.caller_id or "").startswith(_OWN_TOOLS)
 
 
 def period_since(read: ReadRecords, since: int | None, now: int) -> RecordedPeriod:
@@ -260,12 +265,14 @@ def recorded_period(appliance: Appliance, since: str | None, host: list[str] | N
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request | Right]:
-    """Yield the decided requests with their rights to parameters, except of records that do not name their requests."""
+    """Yield the decided requests of nodes with their rights to parameters, if their records name them."""
     decided = Filter(decision=("allow", "deny", "would deny", "ask"))
     try:
         for entry in audit_of(appliance.way).export(decided):
             record = entry.record
             if record.host is None or record.category not in set(Category) or record.resource is None:
+                continue
+            if _is_ours(record):
                 continue
             request = request_of(record.host, record.caller_id or "", record.category, record.resource)
             yield request
