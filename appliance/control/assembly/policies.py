@@ -129,6 +129,16 @@ class Policies(Revisions[RevisionRow]):
         except PolicyRefusedError:
             return True
 
+    def look_at_file(self) -> tuple[bool, str]:
+        """Return whether the file differs from the policy in force, and why it is refused.
+
+        A file that has the policy in force again is accepted, unless its test cases were the reason.
+        """
+        differs = self.differs_from_file
+        if not differs and self.file_refused.startswith(f"{self.file}:"):
+            self._note_refused("")
+        return differs, self.file_refused
+
     def start(self, *, restarted: bool) -> None:
         """Bring a policy into force at the start of control. Raises `PolicyRefusedError`.
 

@@ -366,17 +366,18 @@ class Queries:
 
     def _policy(self) -> PolicyState:
         policies = self.policies
+        differs, refused = policies.look_at_file()
         return PolicyState(
             revision=policies.revision,
             file=str(policies.file),
             source=policies.current.file,
             who=policies.in_force.who,
-            differs_from_file=policies.differs_from_file,
+            differs_from_file=differs,
             warnings=len(policies.current.warnings),
             audit_only=[
                 decider.name for decider in DECIDERS if policies.current.audit_only(decider.categories[0])
             ],
             confirm_by=policies.confirm_by,
             loaded=policies.in_force.loaded,
-            file_refused=policies.file_refused,
+            file_refused=refused,
         )

@@ -350,6 +350,27 @@ async def test_a_file_that_a_reload_refuses_is_refused_at_a_start(tmp_path: Path
         assert (policies.revision, policies.current.text, policies.file_refused) == (2, OTHER, "")
 
 
+@pytest.mark.parametrize("reason", REFUSED)
+async def test_a_file_that_has_the_policy_in_force_again_is_not_refused(tmp_path: Path, reason: str) -> None:
+    """Test cases that failed still do: their reason stays until a reload. No later text has an earlier reason."""
+    appliance = Appliance(tmp_path)
+    beside = tmp_path / "policy.ini.sig"
+    beside.write_text(signed(OPEN))
+    with appliance.started(site_keys=[LINE]) as policies:
+        appliance.file.write_text(OTHER)
+        beside.write_text(signed(OTHER))
+        REFUSED[reason](appliance.file)
+        with pytest.raises(PolicyRefusedError) as refused:
+            await policies.reload(PolicyReload(), "operator")
+        assert policies.look_at_file() == (True, refused.value.findings[0])
+        appliance.file.write_text(OPEN)
+        beside.write_text(signed(OPEN))
+        kept = refused.value.findings[0] if (tmp_path / "policy.ini.tests.yaml").exists() else ""
+        assert policies.look_at_file() == (False, kept)
+        appliance.file.write_text(OTHER)
+        assert policies.look_at_file() == (True, kept)
+
+
 async def test_a_refused_file_does_not_end_the_timeout(tmp_path: Path) -> None:
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
