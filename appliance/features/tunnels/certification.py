@@ -16,7 +16,7 @@ from appliance.configuration.sections import is_loopback
 from appliance.configuration.settings import Settings
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
-from appliance.features.tunnels.host_view import outside_the_pool, soon
+from appliance.features.tunnels.host_view import ending, outside_the_pool
 from appliance.features.tunnels.tunnel_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError, StoredAuthority
@@ -130,7 +130,7 @@ class Certification:
         self._master_port = master_port
         # The name that gets a certificate, and its address, until it is revoked; at most one, by `changing`.
         self._begun = ("", "")
-        self._warned: set[str] = set()  # serial numbers of certificates whose end was announced
+        self._warned: set[tuple[str, str]] = set()  # the events that have a record, with serial numbers
         self.served = ServedRest()
 
     def served_by(self, pin: str) -> None:
@@ -272,19 +272,20 @@ class Certification:
             raise HostRefusedError(str(error), ours=True) from error
 
     def each_hour(self) -> None:
-        """Adopt renewed certificates once the earlier ones have ended, and record each certificate that ends soon."""
+        """Adopt renewed certificates once the earlier ones have ended, and record each that ends soon or has ended."""
         now = clock.wall()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():
             if row.expires <= now:
                 self.table.take_next(row.name)
         for row in self.table.enrolled():
-            if soon(self.table, row, now) and row.serial not in self._warned:
-                self._warned.add(row.serial)
+            event = "certificate ends soon" if row.expires > now else "certificate ended"
+            text = ending(self.table, row, now)
+            if text and (event, row.serial) not in self._warned:
+                self._warned.add((event, row.serial))
                 self.trail.happened(
-                    "certificate ends soon" if row.expires > now else "certificate ended",
-                    f"the certificate of {row.name} expires at {row.expires:.0f}; renew it, or run"
-                    f" rosrv host kit {row.name}",
+                    event,
+                    text,
                     name=row.name,
                     serial=row.serial,
                     expires=row.expires,

@@ -21,10 +21,21 @@ _NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
-    """Return whether a certificate ends within 14 days, or within a third of its life if that is shorter."""
+    """Return whether a certificate ends within 14 days, or a third of its life if that is shorter, and has not yet."""
     certificate = table.certificates.get(row.name)
     life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
-    return row.expires - now < min(SOON_SECONDS, life / 3)
+    return 0 < row.expires - now < min(SOON_SECONDS, life / 3)
+
+
+def ending(table: HostTable, row: HostRow, now: float) -> str:
+    """Return in words that the certificate has ended, or ends soon; "" if neither."""
+    if soon(table, row, now):
+        return with_remedy(row, f"expires in {span(row.expires - now)} and was not renewed")
+    return with_remedy(row, "has expired") if row.expires <= now else ""
+
+
+def with_remedy(row: HostRow, why: str) -> str:
+    return f"the certificate of {row.name} {why}: rosrv host kit {row.name}"
 
 
 def outside_the_pool(table: HostTable, row: HostRow) -> str:
@@ -153,19 +164,14 @@ class HostView:
         if self._table.admitted() and not self._tunnels.enclosed:
             found["firewall"] = f"enrolled hosts cannot connect: {self._tunnels.obstacle}"
         for row in self._table.enrolled():
-            left = row.expires - now
             if not self._table.is_for_hosts(row.address):
                 found[f"{row.name}:pool"] = outside_the_pool(self._table, row)
             certificate = self._table.certificates.get(row.name)
-            why = ""
             if certificate is not None and certificate.made > now + _CLOCKS_DIFFER:
-                why = "was made while the clock was ahead, and is not valid yet"
-            elif left <= 0:
-                why = "has expired"
-            elif soon(self._table, row, now):
-                why = f"expires in {span(left)} and was not renewed"
-            if why:
-                text = f"the certificate of {row.name} {why}: rosrv host kit {row.name}"
+                text = with_remedy(row, "was made while the clock was ahead, and is not valid yet")
+            else:
+                text = ending(self._table, row, now)
+            if text:
                 found[f"{row.name}:certificate"] = text
         missing = self._table.missing_as_revoked()
         if missing:
