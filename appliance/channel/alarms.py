@@ -144,7 +144,7 @@ def _system(status: Status) -> Iterator[_Condition]:
     if rebuilt and not status.starting:
         yield "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
     if audit.degraded is not None:
-        yield "audit-degraded", "audit", f"the audit log is behind: {audit.degraded}"
+        yield "audit-degraded", "audit", audit.degraded
 
 
 def _policy(status: Status) -> Iterator[_Condition]:

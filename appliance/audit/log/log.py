@@ -145,8 +145,9 @@ class DiskSpace:
         if self.left is None:
             return None
         return (
-            f"{self._folder}: {self.left} bytes are free, below the reserve of {self._reserve} (audit.reserve_bytes):"
-            " hosts that cause many records are slowed; make room, or let old records go (audit.retention_bytes)"
+            f"the disk of {self._folder} is nearly full: {self.left / 1e6:.1f} MB are free, less than the reserve of"
+            f" {self._reserve / 1e6:.1f} MB (audit.reserve_bytes). Hosts that cause many records are slowed, and soon"
+            " most changes are refused: make room, or let old records go (audit.retention_bytes)"
         )
 
 
@@ -276,7 +277,8 @@ class AuditLog:
     @property
     def degraded(self) -> str | None:
         """Return which work besides writing is behind, or that the disk is nearly full."""
-        return self.housekeeping.degraded or self._room.scarce
+        behind = self.housekeeping.degraded
+        return f"the audit log is behind: {behind}" if behind else self._room.scarce
 
     @property
     def lag(self) -> Lag:

@@ -181,7 +181,10 @@ class AuditState(msgspec.Struct, frozen=True):
         Literal["deny", "allow"], doc("decision on requests while the log cannot be written")
     ]
     degraded: Annotated[
-        str | None, doc("why checkpoints, index or retention are behind, or null if they are not")
+        str | None,
+        doc(
+            "which work (checkpoints, index, retention) is behind, or that the disk is nearly full; null if neither"
+        ),
     ]
     replaced: Annotated[
         str | None, doc("which other logs the signer signed and no operator set aside, in words, or null")

@@ -160,8 +160,8 @@ class Recorder:
             reason = f"the memory has the last {self._rules.before:g} seconds, and none of that period"
             self._answers.append(recorder_link.RecordingRefused(wanted.number, reason, unknown=True))
             return
-        if not self._store.has_room:
-            self._answers.append(recorder_link.RecordingRefused(wanted.number, "the disk is nearly full"))
+        if lacking := self._store.lacking:
+            self._answers.append(recorder_link.RecordingRefused(wanted.number, lacking))
             return
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
         try:
@@ -297,8 +297,8 @@ class Recorder:
                     self._close(making)
                 except OSError as error:
                     self._give_up(making, error)
-        if not self._store.has_room:
-            return None, "the disk is nearly full"
+        if lacking := self._store.lacking:
+            return None, lacking
         if (
             not planned
             and trigger.what != "order"

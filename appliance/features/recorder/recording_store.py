@@ -111,9 +111,15 @@ class RecordingStore:
         return self.free < self._reserve
 
     @property
-    def has_room(self) -> bool:
-        """Whether the largest recording leaves twice the reserve."""
-        return self.free >= 2 * self._reserve + self.largest
+    def lacking(self) -> str:
+        """Why no recording may begin: the largest one must leave twice the reserve. Empty if one may."""
+        needed, free = 2 * self._reserve + self.largest, self.free
+        if free >= needed:
+            return ""
+        return (
+            f"the disk is nearly full: {free / 1e6:.0f} MB are free at {self._folder}, and a recording needs"
+            f" {needed / 1e6:.0f} MB to begin"
+        )
 
     def part(self, recording_id: str) -> Path:
         return self._folder / f".{recording_id}.part"

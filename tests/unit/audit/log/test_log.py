@@ -504,6 +504,7 @@ def test_an_unsigned_log_is_degraded_and_not_flooded(
     assert log.degraded is None
     faulty = True
     work(2)
+    assert (log.degraded or "").startswith("the audit log is behind: ")
     assert words in (log.degraded or "")
     work(60)
     assert words in (log.degraded or "")
