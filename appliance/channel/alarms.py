@@ -1,6 +1,7 @@
 """Derive alarms from the status: for the console, REST, `rosrv status`."""
 
 import datetime
+import shlex
 from collections.abc import Iterable, Iterator
 from itertools import zip_longest
 from typing import Annotated, Literal
@@ -170,7 +171,10 @@ def _policy(status: Status) -> Iterator[_Condition]:
         text = f"revision {policy.revision} stays in force, {policy.file} is rejected: {policy.file_refused}"
         yield "policy-refused", "policy", text
     elif policy.differs_from_file:
-        text = f"revision {policy.revision} differs from {policy.file}"
+        text = (
+            f"revision {policy.revision} differs from {policy.file}; to load the file: rosrv policy reload; to keep the"
+            f" revision: rosrv policy show > {shlex.quote(policy.file)}"
+        )
         yield "policy-differs", "policy", text
 
 
@@ -204,7 +208,10 @@ def _monitors(status: Status) -> Iterator[_Condition]:
         )
         yield "monitors-folder-refused", "monitors", text
     elif monitors.differs_from_folder:
-        text = f"revision {monitors.revision} of the specifications differs from their folder"
+        text = (
+            f"revision {monitors.revision} of the specifications differs from their folder; to load the folder's:"
+            " rosrv monitor reload; to remove all others as well: rosrv monitor reload --prune"
+        )
         yield "monitors-differ", "monitors", text
 
 

@@ -68,6 +68,20 @@ def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severit
     assert len(alarm.text) > 5
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "commands"),
+    [
+        ("policy.differs_from_file", True, ["rosrv policy reload; ", "rosrv policy show > "]),
+        ("monitors.differs_from_folder", True, ["rosrv monitor reload; ", "rosrv monitor reload --prune"]),
+    ],
+)
+def test_a_notice_of_two_texts_has_the_commands_that_choose_one(
+    path: str, value: object, commands: list[str]
+) -> None:
+    (alarm,) = open_alarms(changed(path, value))
+    assert [command for command in commands if command not in alarm.text] == []
+
+
 @pytest.mark.parametrize("cause", ["the disk", "the load", "signer"])
 def test_the_remedy_of_a_degraded_log_has_each_cause(cause: str) -> None:
     assert cause in ALARM_KINDS["audit-degraded"].remedy
