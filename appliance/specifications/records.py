@@ -51,7 +51,11 @@ _BY_TEXT = frozenset({"verdict", "fault", "log", "missed"})
 
 
 class StoppedTopic(msgspec.Struct, frozen=True):
-    """A stop: a monitor that keeps a topic at its safe message. Times are nanoseconds since the epoch."""
+    """A stop: a monitor that keeps a topic at its safe message.
+
+    Times are nanoseconds since the epoch by the clock of monitors, which no step of the system clock changes; that one
+    is `ahead` of it.
+    """
 
     monitor: str
     topic: str
@@ -67,6 +71,12 @@ class StoppedTopic(msgspec.Struct, frozen=True):
     """Host and node of the topic's only publisher, or of the last one that has ended, if a timer led to the stop."""
     present: str = ""
     """The cause that its last report had, while it goes on: that of the begin may have ended."""
+    ahead: int = 0
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Return the times of its first and last action by the system clock, for people."""
+        return self.since + self.ahead, self.until + self.ahead
 
 
 @dataclass(slots=True)
@@ -201,7 +211,7 @@ class Stops:
     def going(self) -> list[StoppedTopic]:
         return [going.stop for going in self._going.values()]
 
-    def take(self, event: MonitorEvent, now: float) -> StoppedTopic | None:
+    def take(self, event: MonitorEvent, now: float, ahead: int) -> StoppedTopic | None:
         """Return the stop if it begins with this event."""
         cause = str(event.detail.get("cause", ""))
         key, last = (event.monitor, event.resource), event.time
@@ -210,7 +220,12 @@ class Stops:
             stop = going.stop
             count, until = stop.count + (event.count or 1), max(stop.until, last)
             going.stop = self.last[event.monitor] = msgspec.structs.replace(
-                stop, count=count, until=until, cause=stop.cause or cause, present=cause or stop.present
+                stop,
+                count=count,
+                until=until,
+                cause=stop.cause or cause,
+                present=cause or stop.present,
+                ahead=ahead,
             )
             going.at = now
             return None
@@ -227,6 +242,7 @@ class Stops:
             event.caller_id,
             publisher=_only(event),
             present=cause,
+            ahead=ahead,
         )
         self._going[key] = _Going(found, now, QUIET if allowance.take(now) else LONG_QUIET)
         self.last[event.monitor] = found
@@ -317,6 +333,7 @@ class MonitorRecords:
             self._say_ended(stop, f"{text}: {stop.cause}" if stop.cause else text, seconds=round(seconds, 3))
 
     def _say_ended(self, stop: StoppedTopic, text: str, **more: Any) -> None:
+        since, until = stop.span
         self.trail.happened(
             "stop ended",
             text,
@@ -325,14 +342,14 @@ class MonitorRecords:
             category="monitor",
             resource=stop.topic,
             monitor=stop.monitor,
-            since=moment(stop.since),
-            until=moment(stop.until),
+            since=moment(since),
+            until=moment(until),
             actions=stop.count,
             begun_in=stop.record,
             more={"cause": stop.cause, **more} if stop.cause else more,
         )
 
-    def reported(self, events: list[MonitorEvent], lost: int) -> None:
+    def reported(self, events: list[MonitorEvent], lost: int, ahead: int) -> None:
         for event in events:
             for monitor in _monitors(event):
                 self.counts[event.kind, monitor] += event.count or 1
@@ -340,7 +357,7 @@ class MonitorRecords:
                     self.trail.meter.dropped.add(monitor, event.count or 1)
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
-            self._take(event)
+            self._take(event, ahead)
             for tell in tuple(self.told):  # one may remove itself
                 tell(event)
         if lost:
@@ -350,14 +367,14 @@ class MonitorRecords:
             )
             self.trail.happened("records lost", text, lost=lost)
 
-    def _take(self, event: MonitorEvent) -> None:
+    def _take(self, event: MonitorEvent, ahead: int) -> None:
         now = clock.now()
         if not event.safe:
             event_now = self.repetitions.take(event, now)
             if event_now is not None:
                 self._record(event_now)
             return
-        stop = self.stops.take(event, now)
+        stop = self.stops.take(event, now, ahead)
         if stop is not None:
             cause = stop.cause or "its conditions are in the record"
             begun = msgspec.structs.replace(event, text=f"{stop.monitor} stops {stop.topic}: {cause}")

@@ -840,7 +840,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     def received(self, message: messages.Message, relay: int = 0) -> None:
         if isinstance(message, messages.MonitorsReported):
-            self.records.reported(message.events, message.lost)
+            self.records.reported(message.events, message.lost, message.ahead)
             if self._ticking is None:
                 self._tick()
         elif isinstance(message, messages.ValuesSeen):

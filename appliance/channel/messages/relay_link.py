@@ -542,11 +542,13 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 class MonitorsReported(Message):
     """Actions of monitors, sent in batches at most a few times a second.
 
-    `lost` is the number of events that were lost while there was no control process.
+    `lost` is the number of events that were lost while there was no control process. `ahead` is how far the system
+    clock is ahead of the clock of monitors, which gives the times of events, in nanoseconds.
     """
 
     events: list[MonitorEvent]
     lost: int = 0
+    ahead: int = 0
 
 
 class MonitorRow(msgspec.Struct, array_like=True):

@@ -496,9 +496,10 @@ class GuardOrders:
         stop = stops.last.get(name)
         if stop is None:
             return None
-        until = None if stops.goes_on(name) else stop.until / 1e9
+        since, last = (time / 1e9 for time in stop.span)
+        until = None if stops.goes_on(name) else last
         return LastStop(
-            stop.since / 1e9,
+            since,
             until,
             stop.count,
             stop.present if until is None else stop.cause,

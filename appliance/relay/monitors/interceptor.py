@@ -162,7 +162,7 @@ class Interceptor:
         self._timer: LoopTimer | None = None
         self._due: int | None = None
         self._loader = Loader(loop, self.loaded, self.holder_of)
-        self.observations = Observations(loop, reporter, self._rows)
+        self.observations = Observations(loop, reporter, self._rows, lambda: clock.wall_ns() - self.now())
         self._changed = changed
         self._holder = holder
         self.senders = Senders()

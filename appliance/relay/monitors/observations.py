@@ -74,14 +74,24 @@ class _Repeated:
 
 
 class Observations:
-    """The events of monitors, sent in batches; `rows()` returns the counters of all monitors."""
+    """The events of monitors, sent in batches.
 
-    def __init__(self, loop: EventLoop, reporter: Reporter, rows: Callable[[], Iterable[MonitorRow]]) -> None:
+    `rows()` returns the counters of all monitors, and `ahead()` how far the system clock is ahead of that of monitors.
+    """
+
+    def __init__(
+        self,
+        loop: EventLoop,
+        reporter: Reporter,
+        rows: Callable[[], Iterable[MonitorRow]],
+        ahead: Callable[[], int] = lambda: 0,
+    ) -> None:
         self.unfit, self.acting = "", 0
         """Why this relay's part of the heartbeat is off."""
         self._loop = loop
         self._reporter = reporter
         self._rows = rows
+        self._ahead = ahead
         self._told: dict[_Key, _Repeated] = {}
         self._distinct: dict[tuple[str, str], int] = {}
         self._waiting: deque[MonitorEvent] = deque()
@@ -216,7 +226,7 @@ class Observations:
         self._timer = None
         while self._reporter.attached and self._waiting:
             events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]
-            self._reporter.send(MonitorsReported(events, self._lost))
+            self._reporter.send(MonitorsReported(events, self._lost, self._ahead()))
             self._lost = 0
         self.tell_counters()  # so that a reported drop is also counted
 

@@ -35,7 +35,7 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     event = MonitorEvent(
         kind, "gun", "key", "/trigger", 10**18, "told", detail, host="10.0.0.7", caller_id="/joystick"
     )
-    records.reported([event] * 2, lost=0)
+    records.reported([event] * 2, lost=0, ahead=0)
     settle(log)
     assert records.counts == {(kind, "gun"): 2}
     assert records.trail.meter.dropped.counts() == ({"gun": 2} if kind == "drop" else {})

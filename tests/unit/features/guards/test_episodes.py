@@ -65,7 +65,7 @@ class Site:
 
     def second(self, events: list[MonitorEvent]) -> None:
         shifted = [_at(event, self.time.wall_ns()) for event in events]
-        self.records.reported(shifted, 0)
+        self.records.reported(shifted, 0, 0)
         self.time.advance(1)
         self.records.tick()
 
@@ -285,9 +285,10 @@ def test_no_report_of_another_relay_ends_the_record_of_stops(site: Site) -> None
             row[fields["detail"]] = {name: value}
         plain = [*row]
         plain[fields["safe"]] = False
-        hostile = {"message": "MonitorsReported", "events": [row, row, plain]}
+        hostile = {"message": "MonitorsReported", "events": [row, row, plain], "ahead": (1 << 64) - 1}
         with contextlib.suppress(Exception):  # the event loop logs it
-            site.records.reported(decoder.decode(msgspec.msgpack.encode(hostile)).events, 0)
+            report = decoder.decode(msgspec.msgpack.encode(hostile))
+            site.records.reported(report.events, 0, report.ahead)
     for _ in range(2):
         site.second([stop()])
         for _ in range(130):
@@ -328,7 +329,7 @@ def test_a_stop_that_was_open_when_control_ended_is_closed_with_an_unknown_end(s
 def test_a_clock_that_is_set_changes_no_duration(site: Site) -> None:
     events = [msgspec.structs.replace(stop(), time=SECOND * number) for number in range(5)]
     for number, event in enumerate(events):
-        site.records.reported([event], 0)
+        site.records.reported([event], 0, 0)
         site.time.set_wall(1.7e9 + (1e6 if number % 2 else -1e6))
         site.time.advance(1)
         site.records.tick()

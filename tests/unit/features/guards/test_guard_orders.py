@@ -110,13 +110,13 @@ async def set_shadow(monitors: SpecificationManager) -> None:
     await monitors.shadow(admin.MonitorShadow(["fence"], True), "eve")
 
 
-def act(monitors: SpecificationManager, kind: str = "change", second: int = 0) -> None:
-    """Report an action of the fence."""
+def act(monitors: SpecificationManager, kind: str = "change", second: int = 0, ahead: int = 0) -> None:
+    """Report an action of the fence. The system clock is `ahead` of that of monitors, in seconds."""
     event = MonitorEvent(
         kind, "fence", "k", "/cmd_vel", second * 10**9, "", {"cause": "at the edge"}, host="10.0.0.7",
         caller_id="/teleop", safe=True,
     )  # fmt: skip
-    monitors.received(MonitorsReported([event]))
+    monitors.received(MonitorsReported([event], ahead=ahead * 10**9))
 
 
 def given(monitors: SpecificationManager) -> dict[str, object]:
@@ -187,16 +187,20 @@ async def test_a_guard_whose_file_has_an_error_says_so_in_each_state(tmp_path: P
     desk.close()
 
 
-async def test_a_guard_has_its_last_stop(monitors: SpecificationManager, orders: GuardOrders) -> None:
+@pytest.mark.parametrize("ahead", [0, 86_400])
+async def test_a_guard_has_its_last_stop(
+    monitors: SpecificationManager, orders: GuardOrders, ahead: int
+) -> None:
+    """A clock that was set since the start of the relay shows in its times, and not in its length."""
     assert (await row(orders)).last_stop is None
     for second in (5, 7):
-        act(monitors, second=second)
+        act(monitors, second=second, ahead=ahead if second == 7 else 0)
     record = monitors.records.stops.last["fence"].record
-    going_on = LastStop(5, None, 2, "at the edge", "10.0.0.7", "/teleop", record)
+    going_on = LastStop(5 + ahead, None, 2, "at the edge", "10.0.0.7", "/teleop", record)
     assert record and (await row(orders)).last_stop == going_on
     let_time_pass(10.0)
     monitors.records.tick()
-    assert (await row(orders)).last_stop == msgspec.structs.replace(going_on, until=7)
+    assert (await row(orders)).last_stop == msgspec.structs.replace(going_on, until=7 + ahead)
 
 
 async def test_a_guard_is_withholding_and_names_the_nodes_that_it_awaits_as_its_relay_says(

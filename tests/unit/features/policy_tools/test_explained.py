@@ -118,7 +118,7 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
 def check_lines(row: Row, found: MonitorEvent, at: str, where: Mapping[str, Mapping[str, object]]) -> None:
     """Check the explanation that people read."""
     trail = FakeTrail()
-    MonitorRecords(trail, lambda _topic, _data: None, []).reported([found], 0)
+    MonitorRecords(trail, lambda _topic, _data: None, []).reported([found], 0, 0)
     (record,) = trail.records
     lines = list(lines_of(record))
     assert lines[0] == record.reason

@@ -3,13 +3,16 @@ from typing import Any
 
 import pytest
 
+from appliance.base import clock
 from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
 from appliance.relay.monitors import observations
 from appliance.relay.monitors.observation_points import ObservationPoint
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import definitions
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.relay.monitors.test_batch_progress import Monitored, traffic_of
 
+DAY, WALL = 86_400, 1_800_000_000
 COMMAND = "geometry_msgs/Twist"
 STOP = """stop() { std_msgs::String s; event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {
     if (v > 1) { v = 1; ROS_WARN("too fast"); PUBLISH(/alarm, std_msgs/String, s); } } }"""
@@ -128,6 +131,22 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
     assert sum(change.count or 1 for change in changes) == 256
     assert len(changes) <= 102
     monitored.close()
+
+
+def test_a_report_says_how_far_the_system_clock_is_ahead_of_that_of_monitors() -> None:
+    with clock.using(machine := VirtualClock()):
+        told = Told(together=False)
+        ahead = []
+        for days in (0, 1, -1):
+            machine.set_wall(WALL + days * DAY)
+            told.send((1, 5, 0))
+            told.monitored.interceptor.tick()
+            told.monitored.interceptor.observations.flush()
+            (report,) = (one for one in told.monitored.heard.sent if isinstance(one, MonitorsReported))
+            ahead.append(report.ahead)
+            told.monitored.heard.sent.clear()
+        told.monitored.close()
+    assert [one - ahead[0] for one in ahead] == [0, DAY * 10**9, -DAY * 10**9]
 
 
 def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
