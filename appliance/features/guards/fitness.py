@@ -123,7 +123,7 @@ class GuardFitness:
         limit = f"{self._limit * 1e3:g} ms"
         return (
             f"acted late {counted(times, 'time')} in the last minute (limit {limit}, longest since its relay began"
-            f" {latest * 1e3:.0f} ms)"
+            f" {latest * 1e3:.1f} ms)"
         )
 
     def _record(self, name: str) -> None:

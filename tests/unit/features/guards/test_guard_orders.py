@@ -320,7 +320,7 @@ async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: S
         timed(monitors, 100 + second, late=second, latest=0.04 + second / 1000)
         found = alarms_of(orders)
     assert found == [
-        "the guard fence acted late 3 times in the last minute (limit 20 ms, longest since its relay began 43 ms):"
+        "the guard fence acted late 3 times in the last minute (limit 20 ms, longest since its relay began 43.0 ms):"
         " rosrv guard list"
     ]
     assert [record.event for record in trail.records].count("guard late") == 1
