@@ -284,7 +284,8 @@ class IsolationWatchdog:
         at = self._intact_at
         ended = await self._end_once()
         self._begin(self._end_later())
-        since = f"for {seconds:.2g} s" if reported else f"for at most {math.ceil(seconds)} s"
+        moment = clock.utc_now().isoformat(timespec="seconds")
+        since = f"until {moment}, for {f'{seconds:.2g}' if reported else f'at most {math.ceil(seconds)}'} s"
         self._removed = at, (
             f"{by or 'another program'} removed {counted(len(missing), 'rule')} of the firewall {since}, now in"
             f" force again; {counted(ended, 'connection')} of that time ended. Other machines could reach the robot:"
