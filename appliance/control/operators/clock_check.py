@@ -81,8 +81,8 @@ class ClockCheck:
         """Record that the clock ended a thing before the time that the appliance counted."""
         self._trail.happened(
             "ended by the clock",
-            f"{kind} {name}: the machine's clock shows a time after its end, and the appliance has counted"
-            f" {seconds:.0f} s less: the clock was set, or the appliance was off",
+            f"{kind} {name} has ended, and the appliance has counted {seconds:.0f} s less: the machine's clock was set,"
+            " or the appliance was off",
             resource=name,
             kind=kind,
             seconds=round(seconds, 3),

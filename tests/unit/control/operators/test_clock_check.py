@@ -69,6 +69,7 @@ def test_a_right_that_the_clock_ended_is_recorded(trail: FakeTrail) -> None:
         "door ticket",
         3600.0,
     )
+    assert row["reason"].startswith("door ticket 1f has ended, and the appliance has counted 3600 s less: ")
 
 
 @pytest.mark.parametrize(
