@@ -101,7 +101,8 @@ class ReportPage:
         yield "Who changed a guard's value, from what to what?", _last(values), _title("guards and monitors")
         yield "Who changed the policy?", _last(loads), _title("policy")
         yield "Was a guard off, when, by whose order?", _states(report.switched_off, self._in_words), _OFF
-        yield "Who drove, and when?", _states(report.drivers, self._in_words), _DRIVERS
+        drove = _states(report.drivers, self._in_words) if report.drivers else _NO_HOLDER
+        yield "Who drove, and when?", drove, _DRIVERS
         yield "Which hosts were blocked?", _states(report.blocks, self._in_words), _BLOCKED
         yield (
             "Who approved calls of agents?",
@@ -160,6 +161,7 @@ _OFF, _BLOCKED, _DRIVERS, _SOFTWARE = (
 _INTERFACES, _RIGHTS = "Interfaces now, and what protects each", "Rights on the machine now"
 _GAPS, _VERIFICATION = "Completeness of the log", "Verification"
 _NO_GAP = "The log has no record of a gap in this period."
+_NO_HOLDER = "no record that a host held a group of [Authority] in this period"
 
 
 def page(report: MachineReport, in_words: InWords = str) -> str:
@@ -235,7 +237,7 @@ def _spans(report: MachineReport) -> Iterable[tuple[str, Sequence[LastingState],
     return (
         (_OFF, report.switched_off, "none in this period"),
         (_BLOCKED, report.blocks, "none in this period"),
-        (_DRIVERS, report.drivers, "no record that a host held a group of [Authority] in this period"),
+        (_DRIVERS, report.drivers, _NO_HOLDER),
         (_SOFTWARE, report.software, "no start in the log"),
     )
 

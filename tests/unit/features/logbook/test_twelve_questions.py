@@ -4,6 +4,7 @@ import ipaddress
 from html.parser import HTMLParser
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.audit.log.record import AuditRecord
@@ -144,7 +145,7 @@ IN_FORCE = PolicyInForce(
 
 
 @pytest.fixture(scope="module")
-def found() -> Page:
+def report() -> MachineReport:
     policy = compile_policy(POLICY, file="robot.ini", robot=[ipaddress.ip_address("10.0.0.2")])
     period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
     read = read_records(merged({"": entries()}), period)
@@ -155,7 +156,7 @@ def found() -> Page:
     log = ReportedLog(
         name="", id="ab", begins_utc="2026-02-20T08:00:00.000000000Z", last=14, verification=result
     )
-    made = MachineReport(
+    return MachineReport(
         robot="arm7", logs=[log], since_utc="2026-03-01T00:00:00.000000000Z",
         until_utc="2026-05-04T00:00:00.000000000Z",
         made_utc="2026-05-04T08:00:00.000000000Z", version="0.5.0", verify="rosrv audit verify",
@@ -163,7 +164,11 @@ def found() -> Page:
         drivers=read.drivers, interfaces=list(report_verb.interfaces(STATUS, IN_FORCE, TOKENS, read)),
         rights=list(report_verb.rights(policy, IN_FORCE, TOKENS, read)), live_reason="", gaps=read.gaps,
     )  # fmt: skip
-    return Page(page(made))
+
+
+@pytest.fixture(scope="module")
+def found(report: MachineReport) -> Page:
+    return Page(page(report))
 
 
 def test_the_page_runs_nothing(found: Page) -> None:
@@ -255,6 +260,12 @@ def test_the_page_says_who_drove_at_14_03(found: Page) -> None:
     at = "2026-03-06 14:03:00"
     rows = [row for row in found.rows("Drivers")[1:] if row[2] <= at < row[3]]
     assert [row[:2] for row in rows] == [["base", "tablet (10.77.0.5)"]]
+
+
+def test_a_log_without_holders_leaves_open_who_drove(report: MachineReport) -> None:
+    shown = Page(page(msgspec.structs.replace(report, drivers=[])))
+    (answer,) = (row[1] for row in shown.rows("Answers") if row[0].startswith("Who drove"))
+    assert answer == "no record that a host held a group of [Authority] in this period"
 
 
 def test_the_page_says_who_approved_the_agents_arm_motion(found: Page) -> None:
