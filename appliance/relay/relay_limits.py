@@ -82,7 +82,7 @@ class RelayLimits:
     """The seconds between two `TrafficReported`, in which equal refusals are counted together."""
 
     refusals: int = 100
-    """The number of different refusals that are reported one by one in that time; the rest are counted together."""
+    """The number of different refusals that are reported one by one in that time; the rest are counted by host."""
 
     def __post_init__(self) -> None:
         if self.message_bytes < MIB:

@@ -1,8 +1,9 @@
 """Reports to control: connections, refusals, lost publishers, traffic. A new control gets the counts so far.
 
-- Equal refusals within `report_every` become one message with a count, and at most `refusals` different ones are
-  sent, so a flood of unknown hosts can neither grow the relay nor fill the link.
-- Without a link, at most `_KEPT` limits and `_KEPT` ended connections are kept; the rest are only counted.
+- Equal refusals within `report_every` become one message with a count, and `refusals` different ones are divided
+  among hosts: a flood can neither grow the relay nor fill the link, nor hide the refusals of another host.
+- Without a link, at most `_KEPT` ended connections are kept; the rest are only counted.
+  Limits are divided like refusals.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +18,7 @@ from appliance.channel.messages import (
     TopicTraffic,
     TrafficReported,
 )
+from appliance.quotas.peers import ReportShares
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.transport.loop_channel import LoopLink
 from appliance.relay.transport.rate_limit import Part
@@ -38,11 +40,13 @@ class Reporter:
         self._open: dict[int, ConnectionOpened] = {}
         self._number = 0
         self._refused: dict[_Refusal, int] = {}
+        self._refusals = ReportShares(limits.refusals)
         self._ended: list[tuple[ConnectionOpened, str]] = []  # connections that ended without a link
         self._unrecorded = 0
         self._silent = 0  # ticks without a link
         self._memory: dict[str, int] = {}  # as last reported
         self._limited: dict[_Limited, list[int]] = {}
+        self._limitations = ReportShares(_KEPT)
 
     def attach(self, link: LoopLink | None) -> None:
         self._link = link
@@ -88,16 +92,16 @@ class Reporter:
         refusal = (key, kind, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
         if refusal in self._refused:
             self._refused[refusal] += 1
-        elif len(self._refused) < self._limits.refusals:
+        elif (rest := self._refusals.rest_of(host)) is None:
             self._refused[refusal] = int(self._link is None)
             self.send(ConnectionRefused(*refusal, 1))
         else:
-            folded = ("", "", "", "", "", "further rejections of other peers, not reported individually")
+            folded = ("", "", "", rest, "", "further rejections, not reported individually")
             self._refused[folded] = self._refused.get(folded, 0) + 1
 
     def limited(self, what: _Limited, messages: int, size: int) -> None:
-        if what not in self._limited and len(self._limited) >= _KEPT:
-            what = ("", "", what[2], "", "")
+        if what not in self._limited and (rest := self._limitations.rest_of(what[3])) is not None:
+            what = ("", "", what[2], rest, "")
         row = self._limited.setdefault(what, [0, 0])
         row[0] += messages
         row[1] += size
@@ -114,6 +118,7 @@ class Reporter:
             if count:
                 self.send(ConnectionRefused(*refusal, count))
         self._refused.clear()
+        self._refusals.clear()
         rows = traffic()
         if rows or self._unrecorded or memory != self._memory:
             self._memory = dict(memory)
@@ -122,4 +127,5 @@ class Reporter:
         if self._limited:
             self.send(MessagesLimited([LimitedRow(*what, *row) for what, row in self._limited.items()]))
             self._limited.clear()
+            self._limitations.clear()
         self._silent = self._unrecorded = 0

@@ -77,7 +77,7 @@ CELLS: dict[str, dict[str, str]] = {
         f" {_REST}test_access.py::test_an_expired_token_is_refused",
         "unknown": f"{_REST}test_listener.py::test_a_known_peer_is_opened_before_waiting_unknown_hosts",
         "folding": f"{_REST}test_journal.py::test_equal_reads_are_reported_once_and_counted"
-        f" {_REST}test_journal.py::test_a_flood_of_kinds_is_bounded",
+        f" {_REST}test_journal.py::test_a_flood_of_kinds_is_bounded_and_hides_no_other_host",
         "share": f"{_REST}test_listener.py::test_connections_of_one_host_are_limited"
         f" {_REST}test_streams.py::test_a_viewer_with_many_requests_leaves_turns_to_an_admin",
         "binding": f"{_FIREWALL}test_the_rest_port_is_limited_before_its_networks_pass",

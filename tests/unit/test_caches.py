@@ -151,6 +151,8 @@ BY_HAND = {
     "appliance/policy/groups.py::_kept": TEXT,
     "appliance/policy/host_sets.py::_networks": TEXT,
     "appliance/policy/policy.py::standings": "if len(self.standings) >= _KEPT_HOSTS",
+    "appliance/quotas/peers.py::_first": "if len(self._rows) >= self._most",
+    "appliance/quotas/peers.py::_rows": "if len(self._rows) >= self._most",
     "appliance/relay/data_plane.py::topics": OPEN,
     "appliance/relay/loop.py::_payers": "if len(self._payers) >= _PAYERS",
     "appliance/relay/monitors/interceptor.py::_known": "if len(self._known) >= _MAX_KNOWN",
@@ -224,6 +226,8 @@ KEYED = {
     "appliance/master/endpoints/delivery.py::_used": WHOLE,  # the address that is called
     "appliance/master/endpoints/node_ports.py::_routes": HOST,
     "appliance/policy/policy.py::standings": HOST,
+    "appliance/quotas/peers.py::_first": COUNTED,
+    "appliance/quotas/peers.py::_rows": COUNTED,
     "appliance/relay/loop.py::_payers": HOST,
     "appliance/relay/monitors/interceptor.py::_known": WHOLE,
     "appliance/relay/monitors/observation_points.py::_numbers": WHOLE,

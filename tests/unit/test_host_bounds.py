@@ -21,6 +21,7 @@ SHARES = {
     "features/sso/sign_on.py::_pending": "held.update(peer_key(one.address)",
     "master/endpoints/delivery.py::Semaphore": "self._turns.setdefault(node.host",
     "master/endpoints/traffic.py::_hosts": "self._named[host] < self._most - self._most // 4",
+    "quotas/peers.py::_rows": "self._rows[peer] >= self._most - self._most // 4",
     "relay/loop.py::_payers": "self._payers[name] = _Payer(name",
     "rpc/graph_reader.py::gather": "lambda place: self._node(place, counts)",  # the master itself answers the others
     "rpc/host_shares.py::gather": "map(serve_host, hosts.values())",
@@ -46,13 +47,12 @@ REASONS = {
         relay/monitors/interceptor.py::_known
     """,
     "beyond it reports are shortened or counted as one, and each act is decided without them": """
-        api/front/control.py::_kept api/front/journal.py::_repeated features/doors/heard_topic.py::told
-        features/doors/known_types.py::_differing features/doors/process.py::_changes
+        api/front/control.py::_kept features/doors/heard_topic.py::told
+        features/doors/known_types.py::_differing
         features/recorder/recorder.py::_told features/tunnels/process.py::_packets
         features/tunnels/refusals.py::_rest master/endpoints/traffic.py::_limited_topics
         relay/monitors/observation_points.py::_points relay/monitors/observations.py::_waiting
         relay/monitors/observer.py::_stopping relay/monitors/shadow.py::waiting relay/report.py::_ended
-        relay/report.py::_limited relay/report.py::_refused
     """,
     "only operators, people who sign on, and programs with their tokens fill it": """
         api/front/access.py::_shown api/front/listener.py::gather api/front/services.py::Semaphore

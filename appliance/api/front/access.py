@@ -18,11 +18,12 @@ from dataclasses import dataclass, field
 from typing import cast
 
 from appliance.api.front.problems import ProblemError, too_many
-from appliance.api.front.rates import Buckets, peer_key
+from appliance.api.front.rates import Buckets
 from appliance.base import clock
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
 from appliance.configuration.sections import is_loopback
+from appliance.quotas.peers import peer_key
 from appliance.quotas.pool import QuotaClass
 from appliance.signing.bearer_secrets import is_hash_of
 from appliance.signing.request_signing import reading_id

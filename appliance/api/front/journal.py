@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from appliance.channel.messages.api import RestCalled
+from appliance.quotas.peers import ReportShares
 
 FOLD_SECONDS = 10.0
 _METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
@@ -18,7 +19,7 @@ class Journal:
 
     def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
         self._tell = tell
-        self._kinds = kinds
+        self._shares = ReportShares(kinds)
         self._repeated: dict[_Kind, int] = {}
         self.calls: Counter[tuple[str, str]] = Counter()  # number by method and status, for the metrics
 
@@ -43,15 +44,16 @@ class Journal:
         kind = (host, who, method, path, status, reason)
         if kind in self._repeated:
             self._repeated[kind] += 1
-        elif len(self._repeated) < self._kinds:
+        elif (shared := self._shares.rest_of(host)) is None:
             self._repeated[kind] = 0
             self._tell(RestCalled(*kind, duration_us))
         else:
-            rest = ("", "", "", "", status, "further calls, not reported separately")
+            rest = (shared, "", "", "", status, "further calls, not reported separately")
             self._repeated[rest] = self._repeated.get(rest, 0) + 1
 
     def flush(self) -> None:
         repeated, self._repeated = self._repeated, {}
+        self._shares.clear()
         for kind, count in repeated.items():
             if count:
                 self._tell(RestCalled(*kind, 0, count))

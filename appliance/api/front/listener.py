@@ -23,11 +23,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.config import Config
 from uvicorn.server import ServerState
 
-from appliance.api.front.rates import peer_key
 from appliance.api.front.websockets import PREFIX, WebSocketHandover, WebSocketPassage
 from appliance.configuration.settings import ApiLimits
 from appliance.policy.model import Address
 from appliance.quotas.descriptors import connections_within
+from appliance.quotas.peers import peer_key
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import REST_CONNECTIONS
 from appliance.rpc.acceptor import Acceptor

@@ -1,25 +1,11 @@
 """Limit the rate of each peer with token buckets. No I/O; the time is a parameter.
 
-A new bucket replaces the least recently used one, so a flood from many addresses gains at most one burst for each. An
-IPv6 peer counts by its /64 network, because one host can use all addresses of that network.
+A new bucket replaces the least recently used one, so a flood from many addresses gains at most one burst for each.
 """
 
-import ipaddress
 from collections import OrderedDict
 
-_V6_PREFIX = 64
-
-
-def peer_key(host: str) -> str:
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return host
-    if address.version == 4 or address.is_loopback:
-        return host
-    if address.ipv4_mapped is not None:
-        return str(address.ipv4_mapped)
-    return str(ipaddress.ip_network((address, _V6_PREFIX), strict=False))
+from appliance.quotas.peers import peer_key
 
 
 class Buckets:

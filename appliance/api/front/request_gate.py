@@ -23,12 +23,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from appliance.api.front.access import Bearer, TokenAuthenticator
 from appliance.api.front.journal import Journal
 from appliance.api.front.problems import REASON, ProblemError, defect, too_many
-from appliance.api.front.rates import Buckets, peer_key
+from appliance.api.front.rates import Buckets
 from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest, LongRequest
 from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
+from appliance.quotas.peers import peer_key
 from appliance.signing.request_signing import HEADER
 
 _log = structlog.get_logger()

@@ -17,7 +17,6 @@ import structlog
 import uvloop
 from msgspec import Raw
 
-from appliance.api.front.rates import peer_key
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -39,6 +38,7 @@ from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue
+from appliance.quotas.peers import ReportShares, peer_key
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.node import NodeLimits, RosNode
@@ -240,6 +240,7 @@ class DoorProcess:
         self._tickets: Counter[str] = Counter()  # connections that control passed on, until they end
         self._shown: list[door_link.ClientShown] = []
         self._changes: dict[tuple[str, str], _Change] = {}
+        self._shares = ReportShares(_MAX_PEERS)
         self._totals = Counter[str]()
         self._counted = door_link.DoorCounted()
         self._tasks = OwnedTasks()
@@ -467,8 +468,8 @@ class DoorProcess:
         self, peer: str, ticket: str, *, began: int = 0, ended: int = 0, refused: int = 0, reason: str = ""
     ) -> None:
         key = (peer, ticket)
-        if key not in self._changes and len(self._changes) >= _MAX_PEERS:
-            key = ("", "")
+        if key not in self._changes and (rest := self._shares.rest_of(peer)) is not None:
+            key = (rest, "")
         change = self._changes.setdefault(key, _Change())
         change.began += began
         change.ended += ended
@@ -478,13 +479,15 @@ class DoorProcess:
     async def _report(self) -> None:
         for second in range(1 << 62):
             await asyncio.sleep(_REPORT_SECONDS)
-            changes, self._changes = self._changes, {}
-            for (peer, ticket), one in changes.items():
+            changes = [*self._changes.items()]
+            for (peer, ticket), one in changes:
                 message = door_link.ConnectionsChanged(
                     peer, ticket, one.began, one.ended, one.refused, one.reason[:300]
                 )
-                if not self._child.tell(message):
-                    self._changes.setdefault((peer, ticket), one)
+                if self._child.tell(message):
+                    del self._changes[peer, ticket]
+            if not self._changes:
+                self._shares.clear()
             for found in self._types.take_differing():
                 self._child.tell(door_link.DefinitionsDiffer(*found))
             counted = self._counts()

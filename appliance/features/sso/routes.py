@@ -15,7 +15,7 @@ import msgspec
 from fastapi import Request
 
 from appliance.api.front.problems import ProblemError, too_many
-from appliance.api.front.rates import Buckets, peer_key
+from appliance.api.front.rates import Buckets
 from appliance.api.front.route_roles import answered
 from appliance.api.front.routing import Responses, Routes, body
 from appliance.api.front.services import Services
@@ -26,6 +26,7 @@ from appliance.channel.answers.token_answers import SignedOn
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.sso.link import SessionKeys
 from appliance.features.sso.requests import SignOnBegin, SignOnComplete, SignOnPlace
+from appliance.quotas.peers import peer_key
 
 # Limit the sign-ons of each address, and those that run at once.
 #

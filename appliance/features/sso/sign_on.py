@@ -22,7 +22,6 @@ from joserfc.errors import ClaimError, JoseError
 from joserfc.jwk import ECKey, RSAKey
 from joserfc.jws import JWSRegistry
 
-from appliance.api.front.rates import peer_key
 from appliance.base import clock
 from appliance.features.sso.errors import ProviderError, SignOnRefusedError
 from appliance.features.sso.identity import identity_of
@@ -30,6 +29,7 @@ from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.provider import Provider, ProviderEndpoints
 from appliance.features.sso.quotas import SIGN_ONS
 from appliance.features.sso.settings import Sso
+from appliance.quotas.peers import peer_key
 
 # Verify an ID token (OpenID Connect Core 1.0, 3.1.3.7). No I/O; the time is a parameter.
 #

@@ -10,6 +10,7 @@ from appliance.channel.messages import (
     ConnectionClosed,
     ConnectionOpened,
     ConnectionRefused,
+    MessagesLimited,
     RelayLink,
     TopicTraffic,
     TrafficReported,
@@ -72,6 +73,23 @@ def test_many_different_refusals_are_bounded(control: Control, reporter: Reporte
     heard = control.heard()
     assert len(heard) == 4
     assert sum(message.count for message in heard) == 1000
+
+
+def test_a_flood_of_a_host_hides_no_other_host(control: Control, reporter: Reporter) -> None:
+    for number in range(1100):
+        reporter.refused("k", ("topic", "/chatter"), "10.0.0.66", f"/x{number}", "no grant")
+        reporter.limited(("k", f"/t{number}", "publisher", "10.0.0.66", "/x"), 1, 8)
+    reporter.refused("k", ("topic", "/chatter"), "10.0.0.7", "/y", "no grant")
+    reporter.limited(("k", "/chatter", "publisher", "10.0.0.7", "/y"), 1, 8)
+    reporter.tick(list, {})
+    heard = control.heard()
+    refused = [one for one in heard if isinstance(one, ConnectionRefused)]
+    (limited,) = [one.rows for one in heard if isinstance(one, MessagesLimited)]
+    assert [(one.caller_id, one.count) for one in refused if one.host == "10.0.0.7"] == [("/y", 1)]
+    assert sum(one.count for one in refused if one.host == "10.0.0.66") == 1100
+    assert [(one.topic, one.messages) for one in limited if one.host == "10.0.0.7"] == [("/chatter", 1)]
+    assert sum(one.messages for one in limited if one.host == "10.0.0.66") == 1100
+    assert len(limited) < 1000
 
 
 def test_long_claims_are_cut(control: Control, reporter: Reporter) -> None:

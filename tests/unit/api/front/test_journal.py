@@ -37,15 +37,17 @@ def test_changes_are_never_folded() -> None:
     assert len(told) == 4
 
 
-def test_a_flood_of_kinds_is_bounded() -> None:
+def test_a_flood_of_kinds_is_bounded_and_hides_no_other_host() -> None:
     told: list[RestCalled] = []
     journal = Journal(told.append, kinds=10)
     for number in range(1000):
         answered(journal, who="", path=f"/{number}", status=401)
-    assert len(told) == 10
+    answered(journal, host="other", path="/q")
+    assert len(told) == 9
     journal.flush()
-    assert sum(one.count for one in told) == 1000
-    assert len(told) == 11
+    assert [one.path for one in told if one.host == "other"] == ["/q"]
+    assert sum(one.count for one in told if one.host == "h") == 1000
+    assert len(told) == 10
 
 
 def test_unknown_methods_share_one_label() -> None:

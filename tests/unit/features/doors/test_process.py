@@ -88,6 +88,23 @@ async def test_viewers_that_wait_for_the_node_are_bounded_like_connections(
     await control.end()
 
 
+async def test_a_network_full_of_addresses_hides_no_other_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """IPv6 gives one host as many addresses as it likes."""
+    control = Control(monkeypatch)
+    monkeypatch.setattr("appliance.features.doors.process.os.close", lambda _fd: None)
+    control.say(GIVEN)
+    hosts = [*(f"2001:db8::{number:x}" for number in range(1, 400)), "10.0.0.7"]
+    control.say(door_link.BlocksGiven(hosts))
+    for host in hosts:
+        control.give(door_link.ViewerGiven(host, "ticket"), (3,))
+    await asyncio.sleep(3)
+    changes = [report for report in control.reports if isinstance(report, door_link.ConnectionsChanged)]
+    assert [one.refused for one in changes if one.peer == "10.0.0.7"] == [1]
+    assert sum(one.refused for one in changes if one.peer.startswith("2001:db8::")) == 399
+    assert len(changes) < 300
+    await control.end()
+
+
 @pytest.mark.parametrize("when", ["before", "while it waits"])
 async def test_a_blocked_host_is_not_served(monkeypatch: pytest.MonkeyPatch, when: str) -> None:
     control, closed = Control(monkeypatch), list[int]()
