@@ -45,6 +45,8 @@ class TcpSocket(NamedTuple):
     established: bool
     inode: str
     half_open: bool = False
+    uid: int = 0
+    """The user of this end."""
 
     @property
     def peer_address(self) -> str:
@@ -60,7 +62,7 @@ def tcp_sockets() -> list[TcpSocket]:
     return [
         TcpSocket(
             6 if name == "tcp6" else 4, _address(row.address), row.port, _address(peer), int(peer_port, 16),
-            row.state == _TCP_LISTEN, row.state == _TCP_ESTABLISHED, row.inode, row.state == _TCP_SYN_RECV,
+            row.state == _TCP_LISTEN, row.state == _TCP_ESTABLISHED, row.inode, row.state == _TCP_SYN_RECV, row.uid,
         )
         for name in ("tcp", "tcp6")
         for row in _rows(name)
@@ -73,6 +75,7 @@ class _Row(NamedTuple):
     port: int
     peer: str
     state: str
+    uid: int
     inode: str
 
 
@@ -87,7 +90,7 @@ def _rows(*names: str) -> Iterator[_Row]:
             for line in table.read_text(encoding="ascii").splitlines()[1:]:
                 fields = line.split()
                 address, _, port = fields[1].partition(":")
-                yield _Row(address, int(port, 16), fields[2], fields[3], fields[9])
+                yield _Row(address, int(port, 16), fields[2], fields[3], int(fields[7]), fields[9])
 
 
 def _address(text: str) -> str:

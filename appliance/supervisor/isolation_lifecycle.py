@@ -37,10 +37,12 @@ from appliance.network.firewall.firewall_rules import (
     OwnNodeAccess,
     PeerAccess,
     PortRange,
+    appliance_rules,
 )
 from appliance.network.firewall.rule_watch import RuleWatch, subscribed
 from appliance.network.isolation import Isolation, IsolationSettings
-from appliance.network.listening_sockets import tcp_inodes
+from appliance.network.listening_sockets import TcpSocket, listening_ports, tcp_inodes
+from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import (
     Namespace,
     NetworkError,
@@ -353,22 +355,19 @@ class ContainerIsolation(NoIsolation):
         self._before, self._last = self._last, self._namespace.run(tcp_inodes) - {NO_INODE}
 
     def end_connections(self) -> int:
-        """End those that began without the rules at ports that these close to most: permitted programs connect again.
+        """End those that began without the rules, and that one of them refuses: permitted programs connect again.
 
         The rules refuse only new connections, so these would last.
         """
-        settings = self._settings()
-        node, peer = settings.own_node, settings.peer
-        ports = {settings.rosmaster_port, settings.inner_port, settings.api_port}
-        ports |= {node.master_port} if node else set()
-        ports |= {peer.port} if peer else set()
-        spans = (*settings.own_ports, *((node.ports,) if node else ()))
+        rules, before = appliance_rules(self._settings()), self._before
+        listening, own = self._namespace.run(lambda: (listening_ports(), machine_addresses()))
 
-        def is_closed(port: int) -> bool:
-            return port in ports or any(span.first <= port <= span.last for span in spans)
+        def is_refused(one: TcpSocket) -> bool:
+            peer, accepted = one.peer_address, one.port in listening
+            near = peer in own or peer == one.local_address or ipaddress.ip_address(peer).is_loopback
+            return any(rule.refuses(one, accepted=accepted, near=near) for rule in rules)
 
-        before = self._before
-        return end_connections(self._namespace, lambda one: one.inode not in before and is_closed(one.port))
+        return end_connections(self._namespace, lambda one: one.inode not in before and is_refused(one))
 
     def report(self) -> FirewallState:
         with self._standing():

@@ -13,6 +13,8 @@ from enum import StrEnum
 from functools import partial
 from typing import Literal, NamedTuple
 
+from appliance.network.listening_sockets import TcpSocket
+
 Family = Literal[4, 6]
 MAX_PORT = 65535
 
@@ -84,6 +86,9 @@ class PortRange:
     @classmethod
     def one(cls, port: int) -> "PortRange":
         return cls(port, port)
+
+    def __contains__(self, port: int) -> bool:
+        return self.first <= port <= self.last
 
     def overlaps(self, other: "PortRange") -> bool:
         return self.first <= other.last and other.first <= self.last
@@ -170,6 +175,27 @@ class PacketRule:
     def is_tcp(self) -> bool:
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
+    def refuses(self, one: TcpSocket, *, accepted: bool, near: bool) -> bool:
+        """Return whether it keeps such a connection from beginning, though perhaps an earlier rule permits it.
+
+        `accepted`: this end did not open it. `near`: the other end is also on this machine.
+        """
+        interface = self.arrives_on or self.leaves_on
+        here, there = (one.local_address, one.port), (one.peer_address, one.peer_port)
+        source, destination = (there, here) if self.chain is Chain.IN else (here, there)
+        return (
+            self.verdict in (PacketVerdict.RESET, PacketVerdict.DROP)
+            and (self.opening or self.accepting)
+            and not self.distant
+            and accepted == (self.accepting or self.chain is Chain.IN)
+            and (interface is None or near != interface.other)
+            and (self.source is None or _is_in(source[0], self.source))
+            and (self.destination is None or _is_in(destination[0], self.destination))
+            and (self.from_ports is None or source[1] in self.from_ports)
+            and (self.tcp_ports is None or destination[1] in self.tcp_ports)
+            and self.uid in (None, one.uid)
+        )
+
     def families(self) -> tuple[Family, ...]:
         given = self.source or self.destination or self.to
         if given is not None:
@@ -206,6 +232,10 @@ class PacketRule:
         }
         words += [name for name, is_held in flags.items() if is_held]
         return f"{', '.join(words) or 'all'} -> {self.verdict}{f' to {self.to}' if self.to else ''}"
+
+
+def _is_in(address: str, network: str) -> bool:
+    return ipaddress.ip_address(address) in ipaddress.ip_network(network)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from appliance.network.firewall.firewall_rules import (
     family_of,
     inner_port,
 )
+from appliance.network.listening_sockets import TcpSocket
 
 OWN_NODE = OwnNodeAccess(
     uid=61018, relay_uid=61013, address="127.87.79.1", ports=PortRange(900, 963), master_port=5555
@@ -55,6 +56,55 @@ def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
     passed = next(rule for rule in rules if rule.verdict is PacketVerdict.RETURN and rule.chain is Chain.IN)
     assert rules.index(passed) > rules.index(second)
     assert any(rule.above for rule in added if rule.tcp_ports == PortRange.one(9091))
+
+
+OUTSIDE, BOX, DOOR, ANY = "10.0.0.66", "10.0.0.2", "198.19.240.2", 61000
+OPENED = {
+    "a door's node": (BOX, 40001, DOOR, 40002, ANY),
+    "as a door": (DOOR, 40001, BOX, 11311, ANY),
+    "ROS master": ("127.0.0.1", 40001, "127.0.0.1", 11312, ANY),
+    "the own node's API": ("127.0.0.1", 40001, OWN_NODE.address, 40002, ANY),
+    "RVMaster, from the own node": (BOX, 40001, BOX, 11311, OWN_NODE.uid),
+}
+ACCEPTED = {
+    "REST": (BOX, 8443, OUTSIDE, 40001, ANY),
+    "ROS master, from outside": (BOX, 11312, OUTSIDE, 40001, ANY),
+    "a port of the kernel's choice": (BOX, 40002, OUTSIDE, 40001, ANY),
+    "the own node, by another address": ("127.0.0.1", 40002, "127.0.0.1", 40001, OWN_NODE.uid),
+    "a listener as a door": (DOOR, 40002, BOX, 40001, ANY),
+    "the other appliance": (BOX, 7100, OUTSIDE, 40001, ANY),
+}
+PERMITTED = {
+    "RVMaster": (True, (BOX, 11311, OUTSIDE, 40001, ANY)),
+    "a relay": (True, (BOX, 20001, OUTSIDE, 40001, ANY)),
+    "a door": (True, (BOX, 9091, OUTSIDE, 40001, ANY)),
+    "a node of this machine": (True, ("127.0.0.1", 40002, "127.0.0.1", 40001, ANY)),
+    "a node of another one": (False, (BOX, 40001, OUTSIDE, 40002, FULL.control_uid)),
+    "the port of ROS master elsewhere": (False, (BOX, 40001, OUTSIDE, 11312, ANY)),
+}
+ENDS = [
+    *((name, False, True, ends) for name, ends in OPENED.items()),
+    *((name, True, True, ends) for name, ends in ACCEPTED.items()),
+    *((name, accepted, False, ends) for name, (accepted, ends) in PERMITTED.items()),
+]
+
+
+@pytest.mark.parametrize(
+    ("accepted", "refused", "ends"), [row[1:] for row in ENDS], ids=[row[0] for row in ENDS]
+)
+def test_a_connection_that_begins_without_the_rules_is_known_by_them(
+    accepted: bool, refused: bool, ends: tuple[str, int, str, int, int]
+) -> None:
+    settings = replace(
+        FULL, own_network=DOORS, own_ports=(PortRange.one(9091),), client_ports=PortRange(32768, 60999),
+        peer=PeerAccess("10.0.0.3", 7100),
+    )  # fmt: skip
+    address, port, peer, peer_port, uid = ends
+    one = TcpSocket(4, address, port, peer, peer_port, False, True, "7", uid=uid)
+    near = peer != OUTSIDE
+    assert (
+        any(rule.refuses(one, accepted=accepted, near=near) for rule in appliance_rules(settings)) is refused
+    )
 
 
 def test_the_addresses_of_doors_are_bound_to_control() -> None:
