@@ -66,7 +66,9 @@ def row_of(preset: str, found: Mapping[str, str]) -> str:
 def test_the_page_has_what_is_proved_of_each_preset(path: Path) -> None:
     """Where the page says that z3 does not decide, it tries only for a short time again."""
     rows = ASSURANCE.read_text().splitlines()
-    patience = 600 if any(row.startswith(f"| `{path.stem}` ") and UNDECIDED not in row for row in rows) else 30
+    patience = (
+        600 if any(row.startswith(f"| `{path.stem}` ") and UNDECIDED not in row for row in rows) else 30
+    )
     found = answers(path.read_text(), patience=patience)
     assert row_of(path.stem, {name.partition(".")[2]: answer for name, answer in found.items()}) in rows
 
